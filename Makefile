@@ -1,0 +1,29 @@
+# `make fly` and `make test` do everything: each makes .venv on first use and again when what is built has changed.
+
+PYTHON ?= $(shell for python in python3.12 python3.13 python3 python; do \
+	$$python -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null && echo $$python && break; done)
+BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
+FLYSPLAT := .venv/bin/flysplat
+
+.PHONY: fly test lint clean
+
+fly: .venv/installed
+	$(FLYSPLAT) fly --out out/fly
+
+test: lint
+	.venv/bin/python -m pytest
+
+lint: .venv/installed
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/pyright
+
+clean:
+	rm -rf .venv build out
+
+.venv/installed: $(BUILT_FROM)
+	@test -n "$(PYTHON)" || { echo "No Python 3.12 or newer found; install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+	.venv/bin/python -m pip install --quiet uv
+	.venv/bin/uv pip install --python .venv/bin/python --editable '.[dev]'
+	touch $@

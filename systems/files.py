@@ -1,0 +1,40 @@
+"""Files that appear whole or not at all."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def written_atomically(path: Path) -> Iterator[Path]:
+    """
+    Yields a temporary path beside `path` to write to, which becomes `path` when the block ends.
+
+    An exception in the block removes the temporary file and leaves what stood at `path`. The
+    temporary name keeps the suffix, because many writers choose their format by it.
+    """
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def require_writable_folder(path: Path) -> None:
+    """
+    Makes the folder `path` if need be.
+
+    Raises:
+        OSError: if it cannot be made or written to; the message says which and what to do.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".{os.getpid()}.probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OSError(
+            f"cannot write to the output folder {path}: {error.strerror}; choose another with --out"
+        ) from None
