@@ -1,0 +1,85 @@
+"""A distance field as a Drake system: how near a vehicle is to the obstacles."""
+
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import LeafSystem, ValueProducer
+
+from flysplat.systems.collision.distance_field import DistanceField
+from flysplat.systems.collision.soft_barrier import in_collision, soft_barrier
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+
+class EsdfCollision(LeafSystem):
+    """Distance to the nearest obstacle and the collision signals of a vehicle in a distance field.
+
+    .. pydrake_system::
+
+        name: EsdfCollision
+        input_ports:
+        - state
+        output_ports:
+        - distance
+        - gradient
+        - clearance
+        - in_collision
+        - barrier
+        - field_state
+
+    `state` is (p_WB, v_WB, q_WB, w_WB_B) (13), of which the position p_WB [m] in the world is
+    read. `distance` is the signed distance of p_WB to occupied surfaces [m], `gradient` (3) its
+    derivative by p_WB in W [-], `clearance` = distance - radius [m]. `in_collision` is 1 where the
+    clearance is negative, else 0; `barrier` is equation 3 [m], see `soft_barrier`. `field_state` is
+    the `FieldState` as a number: outside the field's bounds (3) the distance, the clearance and the
+    barrier are NaN, the gradient zero and no collision is claimed. The system has no state; all
+    outputs share one query of the field, which is held by reference.
+
+    Args:
+      field: the truth about obstacles.
+      radius: of the vehicle [m].
+      beta: sharpness of the barrier [1/m].
+      margin: of the barrier [m].
+
+    Raises:
+      ValueError: if the radius is negative or beta not positive.
+    """
+
+    def __init__(
+        self,
+        field: DistanceField,
+        radius: float = VEHICLE_RADIUS,
+        beta: float = 4.0,
+        margin: float = 1.0,
+    ) -> None:
+        super().__init__()
+        if not radius >= 0.0:
+            raise ValueError(f"EsdfCollision: the radius is {radius} m; it must not be negative.")
+        if not beta > 0.0:
+            raise ValueError(f"EsdfCollision: beta is {beta} 1/m; it must be positive.")
+        self._field = field
+        state = self.DeclareVectorInputPort("state", 13)
+        cache = self.DeclareCacheEntry(
+            description="sample of the distance field at p_WB",
+            value_producer=ValueProducer(
+                allocate=lambda: AbstractValue.Make(object()), calc=self._sample
+            ),
+            prerequisites_of_calc={self.input_port_ticket(state.get_index())},
+        )
+
+        def declare(name, size, value_of):
+            def calc(context, output):
+                output.SetFromVector(np.atleast_1d(value_of(cache.Eval(context))))
+
+            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={cache.ticket()})
+
+        declare("distance", 1, lambda sample: sample.distance)
+        declare("gradient", 3, lambda sample: sample.gradient)
+        declare("clearance", 1, lambda sample: sample.distance - radius)
+        declare("in_collision", 1, lambda sample: float(in_collision(sample.distance, radius)))
+        declare("barrier", 1, lambda sample: soft_barrier(sample.distance, radius, beta, margin))
+        declare("field_state", 1, lambda sample: float(sample.state))
+
+    def _sample(self, context: Any, sample: Any) -> None:
+        p_WB = np.asarray(self.get_input_port().Eval(context))[:3]
+        sample.set_value(self._field.query(p_WB))

@@ -1,0 +1,95 @@
+"""The file format `esdf.npz`: a compressed numpy archive with a version number."""
+
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT_VERSION = 1
+
+# Name, number of dimensions and kinds of dtype of every entry.
+_ENTRIES = {
+    "version": (0, "iu"),
+    "distances": (3, "f"),
+    "states": (3, "u"),
+    "lower_W": (1, "f"),
+    "voxel_size": (0, "f"),
+    "occupied_outside": (0, "b"),
+}
+
+
+def write_esdf_arrays(
+    path: str | Path,
+    *,
+    distances: np.ndarray,
+    states: np.ndarray,
+    lower_W: np.ndarray,
+    voxel_size: float,
+    occupied_outside: bool,
+) -> None:
+    """Write the arrays of an `Esdf`; a temporary file beside `path` is renamed at the end.
+
+    Raises:
+      OSError: if the folder is missing or not writable.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            np.savez_compressed(
+                file,
+                version=np.int64(FORMAT_VERSION),
+                distances=distances,
+                states=states,
+                lower_W=lower_W,
+                voxel_size=np.float64(voxel_size),
+                occupied_outside=np.bool_(occupied_outside),
+            )
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_esdf_arrays(path: str | Path) -> dict[str, Any]:
+    """The constructor arguments of an `Esdf` from a file that `write_esdf_arrays` wrote.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is no numpy archive, is damaged, lacks an entry, holds one of another type
+        or was written by a newer version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such distance field file (esdf.npz).")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in _ENTRIES if name in archive}
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError) as error:
+        raise ValueError(f"{path}: not a readable numpy archive (.npz): {error}") from error
+    missing = [name for name in _ENTRIES if name not in arrays]
+    if missing:
+        raise ValueError(
+            f"{path}: not a distance field; the entries {missing} are missing. Write one with "
+            "Esdf.save."
+        )
+    for name, (ndim, kinds) in _ENTRIES.items():
+        array = arrays[name]
+        if array.ndim != ndim or array.dtype.kind not in kinds:
+            raise ValueError(
+                f"{path}: the entry {name!r} is {array.dtype} of shape {array.shape}; needed is an "
+                f"array of {ndim} dimensions and a dtype of kind {' or '.join(kinds)}."
+            )
+    version = int(arrays.pop("version"))
+    if version != FORMAT_VERSION:
+        raise ValueError(
+            f"{path}: distance field format {version}; this program reads format "
+            f"{FORMAT_VERSION}. Build the field anew."
+        )
+    return {
+        **arrays,
+        "voxel_size": float(arrays["voxel_size"]),
+        "occupied_outside": bool(arrays["occupied_outside"]),
+    }

@@ -1,0 +1,116 @@
+"""Distance fields from occupancy grids."""
+
+import numpy as np
+
+from flysplat.systems.collision.distance_field import FieldState
+from flysplat.systems.collision.distance_transform import distances_from_band, occupancy_distances
+from flysplat.systems.collision.esdf import Esdf
+
+# Voxels a field may have: its arrays and those of its construction stay below about 8 GB.
+MAX_VOXELS = 250_000_000
+
+
+def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> tuple[int, int, int]:
+    """Voxels along each axis that cover the box [lower_W, upper_W]; the last may reach beyond it.
+
+    Raises:
+      ValueError: if the box is empty or not finite, the voxel size is not positive, or the grid
+        would have fewer than 2 voxels along an axis or more than `MAX_VOXELS`.
+    """
+    extent = np.asarray(upper_W, dtype=float) - np.asarray(lower_W, dtype=float)
+    if extent.shape != (3,) or not np.isfinite(extent).all() or (extent <= 0.0).any():
+        raise ValueError(
+            f"distance field: the box from {lower_W} to {upper_W} m is empty or not finite; "
+            "upper_W must exceed lower_W along each axis."
+        )
+    if not (np.isfinite(voxel_size) and voxel_size > 0.0):
+        raise ValueError(f"distance field: the voxel size is {voxel_size} m; it must be positive.")
+    # The slack keeps 36 m / 0.1 m at 360 voxels in spite of rounding.
+    count = np.ceil(extent / voxel_size - 1e-6)
+    if count.min() < 2:
+        raise ValueError(
+            f"distance field: a box of {extent} m has fewer than 2 voxels of {voxel_size} m along "
+            "an axis; use a smaller voxel size."
+        )
+    if count.prod() > MAX_VOXELS:
+        raise ValueError(
+            f"distance field: a box of {extent} m has {count.prod():.3g} voxels of {voxel_size} m; "
+            f"the limit is {MAX_VOXELS:.3g}. Use a larger voxel size or smaller bounds."
+        )
+    nx, ny, nz = count.astype(int)
+    return int(nx), int(ny), int(nz)
+
+
+def esdf_from_occupancy(
+    occupied: np.ndarray,
+    unknown: np.ndarray | None,
+    lower_W: np.ndarray,
+    voxel_size: float,
+    surface_offset: np.ndarray | None = None,
+) -> Esdf:
+    """The signed distance field of an occupancy grid.
+
+    Without `surface_offset` the surface is the faces of the occupied voxels: biased near, the safe
+    side, see `occupancy_distances`. With it the surface is known to a fraction of a voxel and the
+    field follows it: against analytic solids the error outside them is 0.03 to 0.13 voxel on
+    average (far) and 0.07 to 0.2 rms, and near zero within a voxel of the surface.
+
+    Args:
+      occupied: (nx, ny, nz) bool.
+      unknown: (nx, ny, nz) bool, voxels never observed, none of them occupied; None for none.
+      lower_W: (3,) [m], lower corner of the grid.
+      voxel_size: [m].
+      surface_offset: (nx, ny, nz) [m], signed distance of a voxel's centre from the surface, not
+        positive in occupied voxels and not negative in others; NaN where it is not known. Values
+        beyond one voxel are not used. Where a surface has no value on either side of it, it is the
+        faces of its voxels.
+
+    Raises:
+      ValueError: for arrays of different shapes, voxels both occupied and unknown, or offsets whose
+        sign contradicts the occupancy.
+    """
+    occupied = np.asarray(occupied, dtype=bool)
+    unknown = np.zeros_like(occupied) if unknown is None else np.asarray(unknown, dtype=bool)
+    if occupied.ndim != 3 or unknown.shape != occupied.shape:
+        raise ValueError(
+            f"esdf_from_occupancy: occupied has shape {occupied.shape} and unknown "
+            f"{unknown.shape}; both must be (nx, ny, nz)."
+        )
+    both = np.count_nonzero(occupied & unknown)
+    if both:
+        raise ValueError(f"esdf_from_occupancy: {both} voxels are both occupied and unknown.")
+    if surface_offset is None:
+        distances = occupancy_distances(occupied, voxel_size)
+    else:
+        band = _band(occupied, np.asarray(surface_offset, dtype=np.float32), voxel_size)
+        distances = distances_from_band(occupied, band, voxel_size)
+    states = occupied.astype(np.uint8) * np.uint8(FieldState.OCCUPIED)
+    states[unknown] = FieldState.UNKNOWN
+    return Esdf(distances, states, lower_W, voxel_size)
+
+
+def _band(occupied: np.ndarray, offset: np.ndarray, voxel_size: float) -> np.ndarray:
+    """The known signed distances within one voxel of the surface, NaN elsewhere."""
+    if offset.shape != occupied.shape:
+        raise ValueError(
+            f"esdf_from_occupancy: surface_offset has shape {offset.shape}; needed is that of "
+            f"occupied, {occupied.shape}."
+        )
+    contradicting = np.count_nonzero(np.where(occupied, offset > 0.0, offset < 0.0))
+    if contradicting:
+        raise ValueError(
+            f"esdf_from_occupancy: the sign of surface_offset contradicts the occupancy in "
+            f"{contradicting} voxels; it must be <= 0 in occupied voxels and >= 0 in others."
+        )
+    with np.errstate(invalid="ignore"):
+        band = np.where(np.abs(offset) < voxel_size, offset, np.float32(np.nan))
+    # A face between occupied and other voxels where neither side knows its offset.
+    known = np.isfinite(band)
+    half = np.float32(0.5 * voxel_size)
+    for axis in range(3):
+        a = tuple(slice(None, -1) if i == axis else slice(None) for i in range(3))
+        b = tuple(slice(1, None) if i == axis else slice(None) for i in range(3))
+        bare = (occupied[a] != occupied[b]) & ~known[a] & ~known[b]
+        for side in (a, b):
+            np.copyto(band[side], np.where(occupied[side], -half, half), where=bare)
+    return band

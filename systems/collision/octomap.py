@@ -1,0 +1,218 @@
+"""Reads OctoMap's binary trees (.bt) and turns them into distance fields.
+
+The format: header lines `id OcTree`, `size` (nodes), `res` (edge of the smallest voxel [m]), then
+`data` and the tree. Each inner node is 16 bits, two for each of its eight children, lowest child in
+the lowest bits: 00 unknown, 01 a free leaf, 10 an occupied leaf, 11 an inner node. The inner nodes
+follow each other depth first. Child c of a cube is its half towards +x (c & 1), +y (c & 2), +z
+(c & 4); the root spans 2^16 voxels an edge about the origin.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flysplat.systems.collision.distance_field import FieldState
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.collision.esdf_from_occupancy import MAX_VOXELS, esdf_from_occupancy
+
+_DEPTH = 16  # levels of children below the root
+_FREE, _OCCUPIED, _INNER = 1, 2, 3  # the two bits of a child
+
+
+@dataclass(frozen=True, eq=False)
+class Octomap:
+    """The leaves of an occupancy octree: cubes of known space.
+
+    Attributes:
+      resolution: edge length of the smallest voxel [m].
+      corners: (N, 3) int, lower corner of each leaf in voxels from the world's origin.
+      sizes: (N,) int, edge length of each leaf in voxels, a power of two.
+      occupied: (N,) bool, the others are free.
+    """
+
+    resolution: float
+    corners: np.ndarray
+    sizes: np.ndarray
+    occupied: np.ndarray
+
+    @property
+    def lower_W(self) -> np.ndarray:
+        """Lower corner of the known space, (3,) [m]."""
+        return self.resolution * self.corners.min(axis=0)
+
+    @property
+    def upper_W(self) -> np.ndarray:
+        """Upper corner of the known space, (3,) [m]."""
+        return self.resolution * (self.corners + self.sizes[:, None]).max(axis=0)
+
+    def states(
+        self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A grid of the map's smallest voxels over a box, by default all the known space.
+
+        Returns:
+          states (nx, ny, nz) uint8 `FieldState`, and the grid's lower corner (3,) [m], the box's
+          rounded outwards to a voxel.
+
+        Raises:
+          ValueError: if the box is empty or the grid would be too large.
+        """
+        lower_W = self.lower_W if lower_W is None else np.asarray(lower_W, dtype=float)
+        upper_W = self.upper_W if upper_W is None else np.asarray(upper_W, dtype=float)
+        lower = np.floor(lower_W / self.resolution + 1e-6).astype(int)
+        shape = np.ceil(upper_W / self.resolution - 1e-6).astype(int) - lower
+        if (shape <= 0).any():
+            raise ValueError(f"octomap: the box from {lower_W} to {upper_W} m is empty.")
+        if np.prod(shape.astype(float)) > MAX_VOXELS:
+            raise ValueError(
+                f"octomap: a box of {upper_W - lower_W} m has {np.prod(shape.astype(float)):.3g} "
+                f"voxels of {self.resolution} m; the limit is {MAX_VOXELS:.3g}. Give smaller "
+                "bounds."
+            )
+        states = np.full(shape, FieldState.UNKNOWN, dtype=np.uint8)
+        value = np.where(self.occupied, FieldState.OCCUPIED, FieldState.FREE).astype(np.uint8)
+        for size in np.unique(self.sizes):
+            of_size = self.sizes == size
+            start = np.maximum(self.corners[of_size] - lower, 0)
+            stop = np.minimum(self.corners[of_size] - lower + size, shape)
+            inside = (start < stop).all(axis=1)
+            start, stop, of_size = start[inside], stop[inside], value[of_size][inside]
+            if size == 1:
+                states[tuple(start.T)] = of_size
+                continue
+            for (i0, j0, k0), (i1, j1, k1), leaf in zip(
+                start.tolist(), stop.tolist(), of_size.tolist(), strict=True
+            ):
+                states[i0:i1, j0:j1, k0:k1] = leaf
+        return states, self.resolution * lower
+
+
+def read_octomap(path: str | Path) -> Octomap:
+    """Reads a binary OctoMap (.bt) file.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if the file is no binary OctoMap, or is truncated, damaged or empty.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such OctoMap file (.bt).")
+    content = path.read_bytes()
+    header, separator, tree = content.partition(b"\ndata\n")
+    lines = header.split(b"\n")
+    if not separator or not lines[0].startswith(b"# Octomap OcTree binary file"):
+        raise ValueError(
+            f"{path}: not a binary OctoMap; a .bt file starts with '# Octomap OcTree binary file'."
+        )
+    entries = dict(
+        line.decode("ascii", "replace").split(maxsplit=1)
+        for line in lines
+        if not line.startswith(b"#") and len(line.split()) >= 2
+    )
+    try:
+        kind, count, resolution = entries["id"], int(entries["size"]), float(entries["res"])
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: the header needs id, size and res; {error} is wrong.") from error
+    if kind.strip() != "OcTree" or not (np.isfinite(resolution) and resolution > 0.0):
+        raise ValueError(
+            f"{path}: an octree of kind {kind!r} and resolution {resolution} m; readable are trees "
+            "of kind 'OcTree' with a positive resolution."
+        )
+    if not tree:
+        raise ValueError(f"{path}: the octree is empty.")
+    masks = np.frombuffer(tree, dtype="<u2", count=len(tree) // 2)
+    links = _links(path, masks, len(tree))
+    corners, sizes, occupied = _leaves(masks, links)
+    nodes = len(masks) + len(sizes)
+    if nodes != count:
+        raise ValueError(
+            f"{path}: the header promises {count} nodes, the tree has {nodes}; the file is damaged."
+        )
+    return Octomap(resolution, corners, sizes, occupied)
+
+
+def esdf_from_octomap(
+    path: str | Path,
+    lower_W: np.ndarray | None = None,
+    upper_W: np.ndarray | None = None,
+) -> Esdf:
+    """The distance field of a binary OctoMap, at the map's resolution.
+
+    The surface is the faces of occupied voxels, see `esdf_from_occupancy`: the map knows no better.
+
+    Args:
+      path: of the .bt file.
+      lower_W, upper_W: (3,) [m], the part of the map wanted, by default all known space.
+
+    Raises:
+      FileNotFoundError, ValueError: see `read_octomap` and `Octomap.states`.
+    """
+    octomap = read_octomap(path)
+    states, lower_W = octomap.states(lower_W, upper_W)
+    return esdf_from_occupancy(
+        states == FieldState.OCCUPIED,
+        states == FieldState.UNKNOWN,
+        lower_W,
+        octomap.resolution,
+    )
+
+
+def _links(path: Path, masks: np.ndarray, num_bytes: int) -> np.ndarray:
+    """For each inner node in file order 8 * its parent's index + its number as a child; root -1.
+
+    This is the one part that has to follow the file node by node.
+    """
+    children_of = {}
+    for mask in np.unique(masks).tolist():
+        # Last child first: the stack gives them back in order.
+        children_of[mask] = tuple(c for c in range(7, -1, -1) if mask >> 2 * c & 3 == _INNER)
+    links = []
+    stack = [-1]
+    for index, mask in enumerate(masks.tolist()):
+        if not stack:
+            break
+        links.append(stack.pop())
+        for child in children_of[mask]:
+            stack.append(8 * index + child)
+    if stack:
+        raise ValueError(
+            f"{path}: the octree is truncated after {num_bytes} bytes; {len(stack)} inner nodes "
+            "are missing at least."
+        )
+    if 2 * len(links) != num_bytes:
+        raise ValueError(
+            f"{path}: the octree ends after {2 * len(links)} of {num_bytes} bytes; the file is "
+            "damaged."
+        )
+    return np.array(links)
+
+
+def _leaves(masks: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners (N, 3), sizes (N,) and occupancy (N,) of the leaves."""
+    parent, number = links >> 3, links & 7
+    corner = np.zeros((len(masks), 3), dtype=np.int64)
+    corner[0] = -(2 ** (_DEPTH - 1))
+    level = np.zeros(len(masks), dtype=np.int64)
+    bits = np.array([0, 1, 2])
+    of_level = np.array([0])
+    by_parent = 1 + np.argsort(parent[1:], kind="stable")
+    for depth in range(1, _DEPTH):
+        first = np.searchsorted(parent[by_parent], of_level, "left")
+        last = np.searchsorted(parent[by_parent], of_level, "right")
+        counts = last - first
+        if not counts.any():
+            break
+        of_level = by_parent[
+            np.repeat(first - np.concatenate([[0], counts.cumsum()[:-1]]), counts)
+            + np.arange(counts.sum())
+        ]
+        level[of_level] = depth
+        half = 2 ** (_DEPTH - depth)
+        step = half * (number[of_level, None] >> bits & 1)
+        corner[of_level] = corner[parent[of_level]] + step
+    child = masks[:, None] >> (2 * np.arange(8)) & 3  # (inner nodes, 8)
+    node, octant = np.nonzero((child == _FREE) | (child == _OCCUPIED))
+    size = 2 ** (_DEPTH - 1 - level[node])
+    corners = corner[node] + size[:, None] * (octant[:, None] >> bits & 1)
+    return corners, size, child[node, octant] == _OCCUPIED

@@ -1,0 +1,120 @@
+"""The collision system."""
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from flysplat.systems.collision.distance_field import FieldState
+from flysplat.systems.collision.esdf_collision import EsdfCollision
+from flysplat.systems.collision.shapes import AnalyticDistanceField, Sphere
+from flysplat.systems.collision.soft_barrier import soft_barrier
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+SIZES = {
+    "distance": 1,
+    "gradient": 3,
+    "clearance": 1,
+    "in_collision": 1,
+    "barrier": 1,
+    "field_state": 1,
+}
+
+
+class CountingField(AnalyticDistanceField):
+    """A ball of radius 1 at the origin that counts its queries."""
+
+    def __init__(self):
+        super().__init__([Sphere(np.zeros(3), 1.0)], np.full(3, -5.0), np.full(3, 5.0))
+        self.queries = 0
+
+    def query(self, p_WQ):
+        self.queries += 1
+        return super().query(p_WQ)
+
+
+def value_of(system, name, context) -> np.ndarray:
+    return np.asarray(system.GetOutputPort(name).Eval(context))
+
+
+def outputs_at(system, p_WB):
+    context = system.CreateDefaultContext()
+    system.GetInputPort("state").FixValue(context, np.r_[p_WB, np.zeros(3), 1.0, np.zeros(6)])
+    return {name: value_of(system, name, context) for name in SIZES}
+
+
+def test_outputs_beside_an_obstacle():
+    """2.5 m from the centre of a ball of radius 1 every output has its hand-computed value."""
+    out = outputs_at(EsdfCollision(CountingField()), [0.0, 0.0, 2.5])
+    assert {name: len(value) for name, value in out.items()} == SIZES
+    assert out["distance"][0] == pytest.approx(1.5)
+    np.testing.assert_allclose(out["gradient"], [0.0, 0.0, 1.0])
+    assert out["clearance"][0] == pytest.approx(1.5 - VEHICLE_RADIUS)
+    assert out["in_collision"][0] == 0.0
+    assert out["barrier"][0] == pytest.approx(float(soft_barrier(1.5, VEHICLE_RADIUS)))
+    assert out["field_state"][0] == FieldState.FREE
+
+
+def test_collision_begins_at_the_radius():
+    """in_collision turns to 1 where the distance falls below the vehicle's radius."""
+    system = EsdfCollision(CountingField(), radius=0.5)
+    assert outputs_at(system, [1.49, 0.0, 0.0])["in_collision"][0] == 1.0
+    assert outputs_at(system, [1.51, 0.0, 0.0])["in_collision"][0] == 0.0
+    assert outputs_at(system, [0.2, 0.0, 0.0])["field_state"][0] == FieldState.OCCUPIED
+
+
+def test_outside_the_field_no_collision_is_claimed():
+    """Beyond the bounds the numbers are NaN, the gradient zero and the state says so."""
+    out = outputs_at(EsdfCollision(CountingField()), [0.0, 0.0, 5.1])
+    for name in ("distance", "clearance", "barrier"):
+        assert np.isnan(out[name][0])
+    np.testing.assert_array_equal(out["gradient"], 0.0)
+    assert out["in_collision"][0] == 0.0
+    assert out["field_state"][0] == FieldState.OUTSIDE
+
+
+def test_all_outputs_share_one_query_and_follow_the_state():
+    """One query serves all ports until the state changes; time alone changes nothing."""
+    field = CountingField()
+    system = EsdfCollision(field)
+    context = system.CreateDefaultContext()
+    port = system.GetInputPort("state")
+    port.FixValue(context, np.r_[0.0, 0.0, 2.0, np.zeros(10)])
+    for name in SIZES:
+        system.GetOutputPort(name).Eval(context)
+    context.SetTime(1.0)
+    system.GetOutputPort("distance").Eval(context)
+    assert field.queries == 1
+    port.FixValue(context, np.r_[0.0, 0.0, 3.0, np.zeros(10)])
+    assert value_of(system, "distance", context)[0] == pytest.approx(2.0)
+    assert field.queries == 2
+
+
+def test_works_in_a_diagram_and_in_several_contexts():
+    """Two contexts of one diagram keep their answers apart."""
+    builder = DiagramBuilder()
+    source = ConstantVectorSource(np.r_[0.0, 0.0, 2.0, np.zeros(10)])
+    builder.AddSystem(source)
+    system = builder.AddNamedSystem("collision", EsdfCollision(CountingField()))
+    builder.Connect(source.get_output_port(), system.GetInputPort("state"))
+    builder.ExportOutput(system.GetOutputPort("distance"), "distance")
+    diagram = builder.Build()
+    first, second = diagram.CreateDefaultContext(), diagram.CreateDefaultContext()
+    source.get_mutable_source_value(source.GetMyMutableContextFromRoot(second)).set_value(
+        np.r_[0.0, 3.0, 0.0, np.zeros(10)]
+    )
+    distances = [value_of(diagram, "distance", c)[0] for c in (first, second, first)]
+    assert distances == pytest.approx([1.0, 2.0, 1.0])
+    assert value_of(diagram, "distance", second.Clone())[0] == pytest.approx(2.0)
+
+
+def test_no_direct_feedthrough_is_hidden():
+    """Every output depends on the state, so Drake finds algebraic loops through it."""
+    assert EsdfCollision(CountingField()).HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize(("name", "value"), [("radius", -0.1), ("beta", 0.0)])
+def test_bad_parameters_are_refused(name, value):
+    """A negative radius or a barrier without sharpness ends in a message with the value."""
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        EsdfCollision(CountingField(), **{name: value})

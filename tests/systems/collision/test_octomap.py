@@ -1,0 +1,166 @@
+"""Binary OctoMaps, written by hand and real."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flysplat.systems.collision.distance_field import FieldState
+from flysplat.systems.collision.octomap import esdf_from_octomap, read_octomap
+
+FREE, OCCUPIED, UNKNOWN, _ = FieldState
+FREE_LEAF, OCCUPIED_LEAF, INNER = 1, 2, 3
+
+
+def node(**children: int) -> int:
+    """The 16 bits of an inner node with children given as c0=..., c7=..."""
+    return sum(kind << 2 * int(name[1]) for name, kind in children.items())
+
+
+def content(masks, count, resolution=0.5, kind="OcTree") -> bytes:
+    header = f"# Octomap OcTree binary file\n# a comment\nid {kind}\nsize {count}\n"
+    header += f"res {resolution}\ndata\n"
+    return header.encode() + np.array(masks, "<u2").tobytes()
+
+
+def deep_tree() -> bytes:
+    """A tree with an occupied voxel at (0, 0, 0), a free one at (1, 0, 0), a free cube of 2 voxels
+    an edge at (2, 0, 0) and one of 2^15 at the lowest corner of the space.
+
+    In depth-first order: root, then child 7 of the root down to level 14, whose child 0 is the cube
+    of two voxels an edge at the origin and child 1 a free leaf of that size.
+    """
+    masks = [node(c0=FREE_LEAF, c7=INNER)]
+    masks += [node(c0=INNER)] * 13
+    masks += [node(c0=INNER, c1=FREE_LEAF)]
+    masks += [node(c0=OCCUPIED_LEAF, c1=FREE_LEAF)]
+    return content(masks, count=len(masks) + 4)
+
+
+def test_a_tree_written_by_hand(tmp_path):
+    """Corners, sizes and occupancy of the leaves follow from their places in the tree."""
+    path = tmp_path / "map.bt"
+    path.write_bytes(deep_tree())
+    octomap = read_octomap(path)
+    assert octomap.resolution == 0.5
+    leaves = {
+        (*corner, size): occupied
+        for corner, size, occupied in zip(
+            octomap.corners.tolist(), octomap.sizes.tolist(), octomap.occupied, strict=True
+        )
+    }
+    lowest = -(2**15)
+    assert leaves == {
+        (lowest, lowest, lowest, 2**15): False,
+        (0, 0, 0, 1): True,
+        (1, 0, 0, 1): False,
+        (2, 0, 0, 2): False,
+    }
+
+
+def test_axes_of_the_children(tmp_path):
+    """Child 1 lies towards +x, child 2 towards +y, child 4 towards +z; siblings stay in order."""
+    branch = [node(c0=INNER)] * 14
+    # Two inner children of the root, 3 (+x +y -z) and 6 (-x +y +z), with a voxel at the corner.
+    masks = [node(c3=INNER, c6=INNER)]
+    masks += [*branch, node(c0=OCCUPIED_LEAF), *branch, node(c7=FREE_LEAF)]
+    path = tmp_path / "map.bt"
+    path.write_bytes(content(masks, count=len(masks) + 2))
+    octomap = read_octomap(path)
+    low = -(2**15)
+    np.testing.assert_array_equal(octomap.corners, [[0, 0, low], [low + 1, 1, 1]])
+    np.testing.assert_array_equal(octomap.occupied, [True, False])
+
+
+def test_grid_and_distance_field(tmp_path):
+    """In a box the voxels have their states; the rest is unknown; the field is the box's."""
+    path = tmp_path / "map.bt"
+    path.write_bytes(deep_tree())
+    lower, upper = np.array([-0.5, 0.0, 0.0]), np.array([2.0, 1.0, 1.0])
+    states, corner = read_octomap(path).states(lower, upper)
+    np.testing.assert_array_equal(corner, lower)
+    expected = np.full((5, 2, 2), UNKNOWN)
+    expected[1, 0, 0], expected[2, 0, 0], expected[3:] = OCCUPIED, FREE, FREE
+    np.testing.assert_array_equal(states, expected)
+    field = esdf_from_octomap(path, lower, upper)
+    np.testing.assert_array_equal(field.states, expected)
+    assert field.distance([0.25, 0.25, 0.25]) == pytest.approx(-0.25)
+    assert field.distance([1.75, 0.25, 0.25]) == pytest.approx(1.25)
+
+
+def test_boxes_too_large_or_empty_are_refused(tmp_path):
+    """The whole space of a tree with a huge leaf is refused with the number of voxels."""
+    path = tmp_path / "map.bt"
+    path.write_bytes(deep_tree())
+    with pytest.raises(ValueError, match=r"the limit is 2\.5e\+08. Give smaller bounds"):
+        esdf_from_octomap(path)
+    with pytest.raises(ValueError, match="is empty"):
+        esdf_from_octomap(path, np.ones(3), np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda c: c[:-2], "truncated after 30 bytes; 1 inner nodes are missing"),
+        (lambda c: c[:-1], "truncated after 31 bytes"),
+        (lambda c: c[:-20], "truncated"),
+        (lambda c: c + b"\0\0", "ends after 32 of 34 bytes"),
+        (lambda c: c.replace(b"size 20", b"size 21"), "promises 21 nodes, the tree has 20"),
+        (lambda c: c.replace(b"size 20", b"size many"), "header needs id, size and res"),
+        (lambda c: c.replace(b"res 0.5\n", b""), "header needs id, size and res"),
+        (lambda c: c.replace(b"res 0.5", b"res -1"), "resolution -1.0 m"),
+        (lambda c: c.replace(b"OcTree\n", b"ColorOcTree\n"), "kind 'ColorOcTree'"),
+        (lambda c: c.replace(b"# Octomap", b"# Octopus"), "not a binary OctoMap"),
+        (lambda c: c[: c.index(b"data\n") + 5], "the octree is empty"),
+        (lambda c: b"PK\x03\x04" + c, "not a binary OctoMap"),
+        (lambda c: b"", "not a binary OctoMap"),
+    ],
+)
+def test_damaged_and_foreign_files_are_refused(tmp_path, damage, message):
+    """Truncated, padded, mislabelled and foreign files each end in a message naming the file."""
+    path = tmp_path / "map.bt"
+    path.write_bytes(damage(deep_tree()))
+    with pytest.raises(ValueError, match=message) as error:
+        read_octomap(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_file_is_reported(tmp_path):
+    """Reading what is not there names the path."""
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.bt"):
+        read_octomap(tmp_path / "nowhere.bt")
+
+
+@pytest.fixture
+def maps() -> Path:
+    if "FLYSPLAT_DATA" not in os.environ:
+        pytest.skip("FLYSPLAT_DATA is not set: real OctoMaps needed")
+    return Path(os.environ["FLYSPLAT_DATA"]) / "maps"
+
+
+@pytest.mark.parametrize(
+    ("name", "resolution", "extent"),
+    [
+        ("fr_078_tidyup", 0.05, (12.8, 14.0, 4.7)),
+        ("geb079", 0.08, (38.96, 14.96, 3.12)),
+        ("fr_campus", 0.2, (292.6, 167.2, 27.8)),
+        ("forest0", 0.1, (10.0, 10.0, 5.0)),
+    ],
+)
+def test_real_maps(maps, name, resolution, extent):
+    """Real maps are read whole (their node counts agree) and have their published extent."""
+    octomap = read_octomap(maps / f"{name}.bt")
+    assert octomap.resolution == resolution
+    np.testing.assert_allclose(octomap.upper_W - octomap.lower_W, extent, atol=1e-6)
+
+
+def test_the_field_of_a_real_forest(maps):
+    """The synthetic forest fills its box, has a ground and trunks, and room to fly between them."""
+    field = esdf_from_octomap(maps / "forest0.bt")
+    assert field.shape == (100, 100, 50)
+    assert field.volume(UNKNOWN) == 0.0
+    assert 0.7 < field.volume(FREE) / 500.0 < 0.9
+    x, y, _ = (c.ravel() for c in np.meshgrid(*field.voxel_centers()[:2], [0.0]))
+    flying = field.distance(np.stack([x, y, np.full(x.shape, 1.5)], -1))
+    assert (flying < 0.0).any() and np.quantile(flying, 0.9) > 0.4
