@@ -1,0 +1,191 @@
+"""The planner that knows the scene: hypotheses from the distance field and the time of arrival."""
+
+import math
+import weakref
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
+
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
+from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from flysplat.systems.vehicle.quadrotor_dynamics import GRAVITY, VEHICLE_RADIUS, QuadrotorParams
+from flysplat.systems.vehicle.state_to_pose import pose_from_state
+
+_STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
+
+
+@dataclass
+class PrivilegedPlannerConfig:
+    """How often and how the planner plans."""
+
+    # [Hz] Plans per second.
+    rate: float = 15.0
+    # The trajectories and their costs.
+    lattice: LatticeConfig = field(default_factory=LatticeConfig)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        if not 0.0 < self.rate < math.inf:
+            raise ValueError(
+                f"PrivilegedPlannerConfig.rate is {self.rate} Hz but must be positive and finite; "
+                f"the default is {PrivilegedPlannerConfig.rate}."
+            )
+        self.lattice.validate()
+
+
+def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, drag: float) -> np.ndarray:
+    """The acceleration a_WB (3,) [m/s^2] of level flight at this attitude and velocity.
+
+    The thrust that carries the weight, c = g / (z_B · e_z), accelerates along the horizontal part
+    of the body z axis z_B, against the drag. A plan that starts with this acceleration goes on
+    smoothly from the last.
+    """
+    tilt = R_WB[:2, 2] / max(R_WB[2, 2], _STEEPEST)
+    return np.append(GRAVITY * tilt - drag * v_WB[:2], 0.0)
+
+
+def plan(
+    time: float,
+    state: np.ndarray,
+    field: Esdf,
+    toa: TimeOfArrival,
+    lattice: TrajectoryLattice,
+    drag: float = QuadrotorParams.drag,
+) -> Hypotheses:
+    """The best K distinct trajectories from a state, cheapest first.
+
+    A pure function of its arguments, for any state: the planner system and whoever labels logged
+    states call the same.
+
+    Args:
+        time: of the state [s].
+        state: (13,) [p_WB, v_WB, q_WB, w_WB_B].
+        field: a conservative distance field.
+        toa: the time of arrival at the goal, over the same grid.
+        lattice: the trajectories to choose from.
+        drag: linear drag over mass [1/s].
+
+    Raises:
+        ValueError: if the state is not finite or its quaternion zero, or if no way leads from the
+            free space around p_WB to the goal.
+    """
+    state = np.asarray(state, dtype=float)
+    if state.shape != (13,) or not np.isfinite(state).all():
+        raise ValueError(
+            f"The state to plan from is {state.tolist()} but must be 13 finite numbers; check the "
+            "plant or estimator it comes from."
+        )
+    X_WB = pose_from_state(state)
+    R_WB, p_WB, v_WB = X_WB.rotation().matrix(), state[0:3], state[3:6]
+    _check_way_exists(p_WB, field, toa)
+    a_WB = level_acceleration(R_WB, v_WB, drag)
+    positions_W, costs = lattice.best(p_WB, v_WB, a_WB, field, toa)
+    waypoints_B = (positions_W[:, :NUM_WAYPOINTS] - p_WB) @ R_WB
+    return Hypotheses(time, X_WB, waypoints_B, costs)
+
+
+def _check_way_exists(p_WB: np.ndarray, field: Esdf, toa: TimeOfArrival) -> None:
+    if toa.is_reachable(p_WB):
+        return
+    # A voxel may be blocked though a point in it is free, and contact is for others to judge; but
+    # a point a whole voxel clear of contact, in a voxel no way leads from, is cut off.
+    clearance = float(field.distance(p_WB)) - VEHICLE_RADIUS
+    if clearance > field.voxel_size:
+        raise ValueError(
+            f"No way leads from p_WB = {np.round(p_WB, 2).tolist()} m, clearance "
+            f"{clearance:.2f} m, to the goal p_WG = {np.round(toa.p_WG, 2).tolist()} m: every "
+            f"passage is unknown or narrower than the vehicle, {2.0 * VEHICLE_RADIUS:.2f} m, and "
+            "its margin; choose start and goal in the same connected free space, or smaller "
+            "voxels if a passage is just wide enough."
+        )
+
+
+class PrivilegedPlanner(LeafSystem):
+    """Plans K distinct trajectories to the goal through a known distance field.
+
+    .. pydrake_system::
+
+        name: PrivilegedPlanner
+        input_ports:
+        - state
+        - goal
+        output_ports:
+        - hypotheses
+
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``goal`` (3): p_WG [m], W frame.
+    - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`, cheapest first, in the body frame B at
+      the time of planning; a discrete state, NaN before the first update.
+
+    Updates at ``rate`` (15 Hz) from time 0. Each plan holds the K best distinct ones of a
+    lattice of quintic point-mass trajectories, by the cost of `LatticeConfig`. The time of arrival
+    is computed once per goal (0.1 s for 400,000 voxels, 1 s for 3 million) and kept in the
+    Context's cache.
+
+    Raises:
+        ValueError: from the constructor on a config out of range; from an update if the goal is
+            outside the known volume, too close to an obstacle or cut off from the vehicle, or if
+            the state is not finite.
+    """
+
+    def __init__(
+        self,
+        esdf: Esdf,
+        config: PrivilegedPlannerConfig | None = None,
+        params: QuadrotorParams | None = None,
+    ) -> None:
+        """Constructs the planner.
+
+        Args:
+            esdf: the scene; unknown space and all outside its box count as occupied.
+            config: see `PrivilegedPlannerConfig`.
+            params: the vehicle's; its drag tells its acceleration from its attitude.
+        """
+        super().__init__()
+        self._config = config or PrivilegedPlannerConfig()
+        self._config.validate()
+        params = params or QuadrotorParams()
+        params.validate()
+        self._drag = params.drag
+        self._field = esdf if esdf.occupied_outside else esdf.conservative()
+        self._lattice = TrajectoryLattice(self._config.lattice)
+        self._state_port = self.DeclareVectorInputPort("state", 13)
+        self._goal_port = self.DeclareVectorInputPort("goal", 3)
+        plans = self.DeclareDiscreteState(unplanned(self._config.lattice.num_hypotheses))
+        self.DeclareStateOutputPort("hypotheses", plans)
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / self._config.rate, 0.0, self._update)
+        # Drake would never free a system that its own cache entry refers to, nor one that keeps the
+        # entry itself: hence a weak reference, and the index.
+        planner = weakref.proxy(self)
+        self._time_of_arrival = self.DeclareCacheEntry(
+            "time of arrival",
+            ValueProducer(
+                Value[object],  # pyright: ignore[reportArgumentType]
+                lambda context, value: planner._calc_time_of_arrival(context, value),
+            ),
+            {self._goal_port.ticket()},
+        ).cache_index()
+
+    def _calc_time_of_arrival(self, context, value) -> None:
+        p_WG = np.asarray(self._goal_port.Eval(context))
+        last = value.get_value()
+        # A goal port reports a change at every step if its source is not a constant; only a
+        # change of the goal itself is worth the march.
+        if not isinstance(last, TimeOfArrival) or not np.array_equal(last.p_WG, p_WG):
+            value.set_value(time_of_arrival(self._field, p_WG, self._config.lattice.margin))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        hypotheses = plan(
+            context.get_time(),
+            np.asarray(self._state_port.Eval(context)),
+            self._field,
+            cast(TimeOfArrival, self.get_cache_entry(self._time_of_arrival).Eval(context)),
+            self._lattice,
+            self._drag,
+        )
+        discrete_state.set_value(hypotheses.to_vector())

@@ -1,0 +1,276 @@
+"""A lattice of quintic point-mass trajectories, their costs and the K best distinct ones.
+
+From the present position, velocity and acceleration, quintic polynomials (the minimum-jerk curves
+between boundary states) lead to a fan of final velocities and to points of the way to the goal. All
+are evaluated at once: positions and jerks are linear in the boundary states, so they are one matrix
+product, and their clearances one batched look-up in the distance field.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from flysplat.systems.collision.distance_field import DistanceField
+from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
+from flysplat.systems.policies.time_of_arrival import TimeOfArrival, slowness
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+_LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near a goal that is not in direct reach
+
+
+@dataclass
+class LatticeConfig:
+    """The lattice, the weights of its cost and how many trajectories are kept.
+
+    The cost of a trajectory with samples p_i, in seconds of way at 1 m/s, is::
+
+        T(p_N) + sum (S(d_i) - 1) |p_i - p_(i-1)|           time of arrival and what nearness adds
+        + penetration_weight sum max(0, r + margin - d_i)   contact
+        + speed_weight mean max(0, |v_i| - speed)² + jerk_weight mean |j_i|²
+
+    with the time of arrival T, the slowness S, the distances d_i and the radius r. T and S belong
+    together: along the way to the goal a trajectory costs T at its start less its own length, at
+    any speed, so that going on always beats waiting. A barrier that T does not know of would hold
+    the vehicle before narrow places.
+    """
+
+    # [m/s] Nominal speed.
+    speed: float = 2.0
+    # [s] Duration of the trajectories, a multiple of 0.1 s, the time between samples.
+    horizon: float = 2.0
+    # [-] Number of directions to the sides, and [rad] the largest angle.
+    num_yaws: int = 25
+    max_yaw: float = 1.745
+    # [-] Number of directions up and down, and [rad] the largest angle.
+    num_pitches: int = 7
+    max_pitch: float = 0.5
+    # [-] Final speeds as fractions of the nominal speed.
+    speed_fractions: list[float] = field(default_factory=lambda: [0.33, 0.67, 1.0])
+    # [-] How many trajectories are kept.
+    num_hypotheses: int = 3
+    # [m] Mean distance between two of them, for them to count as distinct.
+    separation: float = 0.35
+    # [m] Clearance kept for errors of tracking and of the field's grid.
+    margin: float = 0.05
+    # [s/m] Weight of coming closer to obstacles than radius and margin.
+    penetration_weight: float = 200.0
+    # [s^3/m^2] Weight of flying faster than the nominal speed.
+    speed_weight: float = 10.0
+    # [s^7/m^2] Weight of the jerk.
+    jerk_weight: float = 0.003
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("num_yaws", "num_pitches", "num_hypotheses"):
+            _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
+        for name in ("speed", "horizon"):
+            _check(name, getattr(self, name), 0.0 < getattr(self, name) < math.inf, "positive")
+        samples = self.horizon / WAYPOINT_PERIOD
+        whole = samples > NUM_WAYPOINTS - 0.5 and abs(samples - round(samples)) < 1e-6
+        least = NUM_WAYPOINTS * WAYPOINT_PERIOD
+        _check("horizon", self.horizon, whole, f"a multiple of 0.1 s and at least {least} s")
+        weights = "penetration_weight", "speed_weight", "jerk_weight"
+        for name in (*weights, "separation", "margin", "max_yaw", "max_pitch"):
+            _check(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, "at least 0")
+        _check("max_yaw", self.max_yaw, self.max_yaw <= math.pi, "at most pi")
+        _check("max_pitch", self.max_pitch, self.max_pitch < math.pi / 2, "less than pi/2")
+        in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
+        _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
+        trajectories = self.num_yaws * self.num_pitches * len(self.speed_fractions)
+        few = self.num_hypotheses <= trajectories
+        _check(
+            "num_hypotheses",
+            self.num_hypotheses,
+            few,
+            f"at most {trajectories}, the size of the lattice",
+        )
+
+
+class Trajectories(NamedTuple):
+    """Trajectories as samples every 0.1 s, from 0.1 s after now to the horizon, in the world."""
+
+    positions: np.ndarray  # (N, S, 3) [m]
+    jerks: np.ndarray  # (N, S, 3) [m/s^3]
+
+
+class TrajectoryLattice:
+    """The quintics from a state to a fan of final velocities, their costs, and the best of them."""
+
+    def __init__(self, config: LatticeConfig | None = None) -> None:
+        """Prepares what does not depend on the state.
+
+        Raises:
+            ValueError: on a config out of range.
+        """
+        self.config = config = config or LatticeConfig()
+        config.validate()
+        samples = np.arange(1, round(config.horizon / WAYPOINT_PERIOD) + 1)
+        self._basis = np.concatenate(
+            [quintic_basis(WAYPOINT_PERIOD * samples, config.horizon, order) for order in (0, 3)]
+        )  # (2 S, 6)
+        self._final_velocities_L = final_velocities(config)
+
+    def trajectories(
+        self, p_WB: np.ndarray, v_WB: np.ndarray, a_WB: np.ndarray, toa: TimeOfArrival
+    ) -> Trajectories:
+        """The N trajectories from a position, velocity and acceleration, (3,) each.
+
+        After the horizon H they end without acceleration: those of the lattice, which points down
+        the gradient of T, with its velocities v_1 at p_WB + H v_1; one more for each speed on the
+        way to the goal, after that length and along it, or at rest in the goal. The speed falls in
+        proportion to the time of arrival where the nominal one would take less than half the
+        horizon.
+        """
+        config = self.config
+        stopping_distance = 0.5 * config.horizon * config.speed
+        slowing = float(toa.value(p_WB)) / stopping_distance
+        speed = config.speed * min(max(slowing, _LEAST_SPEED_FRACTION), 1.0)
+        v_L = speed * self._final_velocities_L @ rotation_to(-toa.gradient(p_WB)).T
+        speeds = speed * np.array(config.speed_fractions)
+        p_way, directions = toa.way(p_WB, config.horizon * speeds)
+        count = len(v_L) + len(speeds)
+        boundary = np.zeros((6, count, 3))
+        boundary[0], boundary[1], boundary[2] = p_WB, v_WB, a_WB
+        boundary[3] = np.concatenate([p_WB + config.horizon * v_L, p_way])
+        boundary[4] = np.concatenate([v_L, speeds[:, None] * directions])
+        samples = self._basis @ boundary.reshape(6, -1)  # (2 S, 3 N)
+        samples = samples.reshape(2, -1, count, 3).swapaxes(1, 2)
+        return Trajectories(positions=samples[0], jerks=samples[1])
+
+    def costs(
+        self, trajectories: Trajectories, p_WB: np.ndarray, field: DistanceField, toa: TimeOfArrival
+    ) -> np.ndarray:
+        """The costs (N,) of trajectories that start at p_WB (3,) [m], see `LatticeConfig`.
+
+        Args:
+            trajectories: N of them.
+            p_WB: where they start [m].
+            field: a distance field that answers everywhere, as `Esdf.conservative()` does.
+            toa: the time of arrival at the goal.
+        """
+        config = self.config
+        positions = trajectories.positions
+        distances = field.distance(positions)  # (N, S)
+        starts = np.broadcast_to(p_WB, (len(positions), 1, 3))
+        steps = _norm(np.diff(positions, axis=1, prepend=starts))  # (N, S) [m]
+        nearness = ((slowness(distances) - 1.0) * steps).sum(axis=1)
+        too_close = np.maximum(VEHICLE_RADIUS + config.margin - distances, 0.0)
+        too_fast = np.maximum(steps / WAYPOINT_PERIOD - config.speed, 0.0)
+        return (
+            toa.value(positions[:, -1])
+            + nearness
+            + config.penetration_weight * too_close.sum(axis=1)
+            + config.speed_weight * np.square(too_fast).mean(axis=1)
+            + config.jerk_weight * np.square(trajectories.jerks).sum(axis=2).mean(axis=1)
+        )
+
+    def best(
+        self,
+        p_WB: np.ndarray,
+        v_WB: np.ndarray,
+        a_WB: np.ndarray,
+        field: DistanceField,
+        toa: TimeOfArrival,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The positions (K, S, 3) [m] and costs (K,) of the K best distinct trajectories.
+
+        The first is the cheapest of all; see `trajectories`, `costs` and `select_distinct`.
+        """
+        config = self.config
+        trajectories = self.trajectories(p_WB, v_WB, a_WB, toa)
+        costs = self.costs(trajectories, p_WB, field, toa)
+        chosen = select_distinct(
+            trajectories.positions, costs, config.num_hypotheses, config.separation
+        )
+        return trajectories.positions[chosen], costs[chosen]
+
+
+def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.ndarray:
+    """The matrix (n, 6) that evaluates quintics at `times` (n,) [s].
+
+    Times the boundary states (p_0, v_0, a_0, p_1, v_1, a_1) it gives that `derivative` of the one
+    quintic that has position p_0, velocity v_0 and acceleration a_0 at time 0 and p_1, v_1, a_1 at
+    `horizon` [s].
+    """
+
+    def monomials(t: np.ndarray, order: int) -> np.ndarray:
+        """The derivatives of order `order` of 1, t, ..., t^5: (n, 6)."""
+        powers = np.arange(6)
+        factors = np.array([math.perm(k, order) for k in range(6)])
+        return factors * t[:, None] ** np.maximum(powers - order, 0)
+
+    ends = np.array([0.0, horizon])
+    conditions = np.stack([monomials(ends, order) for order in range(3)], axis=1)  # (2, 3, 6)
+    return monomials(np.asarray(times, dtype=float), derivative) @ np.linalg.inv(
+        conditions.reshape(6, 6)
+    )
+
+
+def final_velocities(config: LatticeConfig) -> np.ndarray:
+    """The final velocities (N, 3) in units of the speed; the last is rest.
+
+    In the lattice frame L: x is ahead, yaws are about z and positive to the left, pitches are
+    positive upwards.
+    """
+    yaw, pitch, speed = np.meshgrid(
+        np.linspace(-config.max_yaw, config.max_yaw, config.num_yaws),
+        np.linspace(-config.max_pitch, config.max_pitch, config.num_pitches),
+        config.speed_fractions,
+        indexing="ij",
+    )
+    forward, left, up = np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)
+    velocities = speed * np.stack([forward, left, up])
+    return np.vstack([velocities.reshape(3, -1).T, np.zeros(3)])
+
+
+def rotation_to(direction_W: np.ndarray) -> np.ndarray:
+    """The rotation R_WL (3, 3) whose x axis points along `direction_W` (3,) and whose y is level.
+
+    A zero direction gives the world's axes, a vertical one has y along the world's y.
+    """
+    length = np.linalg.norm(direction_W)
+    x_W = direction_W / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+    level = math.hypot(x_W[0], x_W[1])
+    y_W = np.array([-x_W[1], x_W[0], 0.0]) / level if level > 1e-6 else np.array([0.0, 1.0, 0.0])
+    return np.column_stack([x_W, y_W, np.cross(x_W, y_W)])
+
+
+def select_distinct(
+    positions: np.ndarray, costs: np.ndarray, count: int, separation: float
+) -> np.ndarray:
+    """The indices (count,) of cheap trajectories that differ, cheapest first.
+
+    Greedy: the cheapest, then time and again the cheapest of those whose mean distance from every
+    one chosen exceeds `separation`. Once none does, the most distant of the rest.
+
+    Args:
+        positions: (N, S, 3) [m].
+        costs: (N,).
+        count: K <= N.
+        separation: [m].
+    """
+    chosen = [int(np.argmin(costs))]
+    apart = np.full(len(costs), np.inf)
+    while len(chosen) < count:
+        apart = np.minimum(apart, _norm(positions - positions[chosen[-1]]).mean(axis=1))
+        apart[chosen] = -1.0  # Never twice.
+        distinct = apart > separation
+        if distinct.any():
+            chosen.append(int(np.argmin(np.where(distinct, costs, np.inf))))
+        else:
+            chosen.append(int(np.argmax(apart)))
+    return np.array(chosen)[np.argsort(costs[chosen], kind="stable")]
+
+
+def _norm(vectors: np.ndarray) -> np.ndarray:
+    """Lengths (...,) of vectors (..., 3)."""
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+
+
+def _check(name: str, value: object, valid: bool, limit: str) -> None:
+    if not valid:
+        raise ValueError(
+            f"LatticeConfig.{name} is {value} but must be {limit}; see the comment at the field."
+        )

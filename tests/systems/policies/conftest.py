@@ -1,0 +1,90 @@
+"""Small worlds of analytic shapes, shared by the tests of the policies."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from flysplat.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
+
+VOXEL_SIZE = 0.2
+
+
+def box(lower, upper) -> Box:
+    """A solid from one corner to the opposite one, (3,) [m] each."""
+    lower, upper = np.array(lower, dtype=float), np.array(upper, dtype=float)
+    return Box(RigidTransform((lower + upper) / 2), upper - lower)
+
+
+def field_of(shapes, size) -> Esdf:
+    """The conservative field of shapes in the box from the origin to `size` (3,) [m]."""
+    world = AnalyticDistanceField(shapes, np.zeros(3), np.array(size, dtype=float))
+    return esdf_from_distance_field(world, VOXEL_SIZE).conservative()
+
+
+@pytest.fixture(scope="session")
+def empty() -> Esdf:
+    """16 x 8 x 6 m of nothing but its bounds."""
+    shape = (80, 40, 30)
+    far, free = np.full(shape, 50.0, np.float32), np.zeros(shape, np.uint8)
+    return Esdf(far, free, np.zeros(3), VOXEL_SIZE).conservative()
+
+
+@pytest.fixture(scope="session")
+def pillar() -> Esdf:
+    """16 x 8 x 6 m with a pillar of radius 0.4 m at (6, 4)."""
+    return field_of([Cylinder([6, 4, -1], [6, 4, 7], 0.4)], [16.0, 8.0, 6.0])
+
+
+@pytest.fixture(scope="session")
+def half_wall() -> Esdf:
+    """12 x 10 x 4 m with a wall at 6 <= x <= 6.4 from y = 0 to y = 6."""
+    return field_of([box([6, -1, -1], [6.4, 6, 5])], [12.0, 10.0, 4.0])
+
+
+@pytest.fixture(scope="session")
+def closed_wall() -> Esdf:
+    """12 x 10 x 4 m cut in two by a wall at 6 <= x <= 6.4."""
+    return field_of([box([6, -1, -1], [6.4, 11, 5])], [12.0, 10.0, 4.0])
+
+
+@pytest.fixture(scope="session")
+def u_trap() -> Esdf:
+    """14 x 10 x 4 m with a U of walls open towards -x, inside 4 <= x <= 8, 2 <= y <= 8."""
+    walls = [
+        box([8, 1.6, -1], [8.4, 8.4, 5]),
+        box([4, 1.6, -1], [8.4, 2, 5]),
+        box([4, 8, -1], [8.4, 8.4, 5]),
+    ]
+    return field_of(walls, [14.0, 10.0, 4.0])
+
+
+@pytest.fixture(scope="session")
+def doorway() -> Esdf:
+    """12 x 8 x 4 m in two rooms, joined by a door 1.2 m wide at y = 4 in a wall at x = 6."""
+    walls = [box([6, -1, -1], [6.2, 3.4, 5]), box([6, 4.6, -1], [6.2, 9, 5])]
+    return field_of(walls, [12.0, 8.0, 4.0])
+
+
+@pytest.fixture(scope="session")
+def make_forest():
+    """Makes (world, field) of 20 x 10 x 5 m: ground and trunks at least 2.5 m apart."""
+
+    def make(seed: int) -> tuple[AnalyticDistanceField, Esdf]:
+        rng = np.random.default_rng(seed)
+        trunks = []
+        for p in rng.uniform([0, 0], [20, 10], (300, 2)):
+            keep_clear = [(1.5, 5.0), (18.5, 5.0)]  # start and goal
+            apart = all(np.linalg.norm(p - q) > 2.5 for q in trunks)
+            if apart and all(np.linalg.norm(p - q) > 1.5 for q in keep_clear):
+                trunks.append(p)
+        shapes = [
+            Cylinder([x, y, -1], [x, y, 6], radius)
+            for (x, y), radius in zip(trunks, rng.uniform(0.2, 0.4, len(trunks)), strict=True)
+        ]
+        ground = HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0)
+        world = AnalyticDistanceField([*shapes, ground], np.zeros(3), np.array([20.0, 10.0, 5.0]))
+        return world, esdf_from_distance_field(world, VOXEL_SIZE)
+
+    return make

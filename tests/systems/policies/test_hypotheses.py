@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from flysplat.systems.policies.hypotheses import Hypotheses, hypotheses_size, unplanned
+
+
+def some_hypotheses(count=3, plan_time=2.0):
+    rng = np.random.default_rng(4)
+    X_WB = RigidTransform(RollPitchYaw(0.2, -0.3, 2.0), np.array([1.0, -2.0, 3.0]))
+    return Hypotheses(plan_time, X_WB, rng.normal(size=(count, 10, 3)), rng.uniform(size=count))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_vector_round_trip(count):
+    """A vector holds plan time, pose, waypoints and costs, and gives them back."""
+    plan = some_hypotheses(count)
+    vector = plan.to_vector()
+    assert vector.shape == (hypotheses_size(count),)
+    again = Hypotheses.from_vector(vector, count)
+    assert again is not None
+    assert again.plan_time == plan.plan_time
+    np.testing.assert_array_equal(again.waypoints_B, plan.waypoints_B)
+    np.testing.assert_array_equal(again.costs, plan.costs)
+    assert again.X_WB.IsNearlyEqualTo(plan.X_WB, 1e-15)
+
+
+def test_layout_of_the_vector():
+    """The vector is [plan_time, p_WB, q_WB, waypoints of each hypothesis in turn, costs]."""
+    plan = some_hypotheses()
+    vector = plan.to_vector()
+    assert vector[0] == 2.0
+    np.testing.assert_array_equal(vector[1:4], [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(vector[4:8], plan.X_WB.rotation().ToQuaternion().wxyz())
+    np.testing.assert_array_equal(vector[8 + 30 : 8 + 33], plan.waypoints_B[1, 0])
+    np.testing.assert_array_equal(vector[-3:], plan.costs)
+
+
+def test_before_the_first_plan_there_is_none():
+    """The vector of no plan reads as None."""
+    assert Hypotheses.from_vector(unplanned(3), 3) is None
+
+
+def test_waypoints_in_the_world():
+    """World waypoints are X_WB applied to each body waypoint."""
+    plan = some_hypotheses()
+    np.testing.assert_allclose(
+        plan.waypoints_W[2, 7], plan.X_WB @ plan.waypoints_B[2, 7], atol=1e-14
+    )
+
+
+def test_best_is_the_cheapest():
+    """`best` is the index of the lowest cost, wherever it stands."""
+    plan = Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.array([3.0, 1.0, 2.0]))
+    assert plan.best == 1
+
+
+def test_position_interpolates_between_waypoints():
+    """Waypoint t stands at plan_time + (t + 1) / 10 s; between is linear, outside the ends hold."""
+    plan = some_hypotheses()
+    way_W = np.vstack([plan.X_WB.translation(), plan.waypoints_W[1]])
+    for time, expected in [
+        (2.0, way_W[0]),
+        (2.1, way_W[1]),
+        (2.35, 0.5 * (way_W[3] + way_W[4])),
+        (3.0, way_W[10]),
+        (9.0, way_W[10]),
+        (1.0, way_W[0]),
+    ]:
+        np.testing.assert_allclose(plan.position_W(time, 1), expected, atol=1e-12)
+
+
+def test_errors_name_sizes_and_remedy():
+    """Vectors and arrays of the wrong size are refused with both sizes in the message."""
+    with pytest.raises(ValueError, match=r"\(101,\).*2 hypotheses.*\(70,\).*same number"):
+        Hypotheses.from_vector(unplanned(3), 2)
+    with pytest.raises(ValueError, match=r"\(3, 9, 3\).*\(K, 10, 3\)"):
+        Hypotheses(0.0, RigidTransform(), np.zeros((3, 9, 3)), np.zeros(3))
+    with pytest.raises(ValueError, match=r"\(2,\).*3 trajectories"):
+        Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.zeros(2))
+    with pytest.raises(ValueError, match="is 0, but a policy returns at least 1"):
+        hypotheses_size(0)

@@ -1,0 +1,308 @@
+import gc
+import weakref
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.math import RollPitchYaw
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, EventStatus
+from pydrake.systems.primitives import LogVectorOutput
+
+from flysplat.systems.policies import privileged_planner
+from flysplat.systems.policies.hypotheses import Hypotheses, hypotheses_size
+from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
+from flysplat.systems.policies.privileged_planner import (
+    PrivilegedPlanner,
+    PrivilegedPlannerConfig,
+    level_acceleration,
+    plan,
+)
+from flysplat.systems.policies.time_of_arrival import time_of_arrival
+from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from flysplat.systems.vehicle.flatness_controller import (
+    FlatnessController,
+    FlatnessControllerConfig,
+)
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
+
+MARGIN = LatticeConfig().margin
+
+
+def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
+    """The state in level flight: tilted as the acceleration and the drag of 0.375 1/s ask for."""
+    state = hover_state(p_WB)
+    state[3:6] = v_WB
+    thrust_W = np.array([a_WB[0] + 0.375 * v_WB[0], a_WB[1] + 0.375 * v_WB[1], 9.81])
+    axis_angle = np.cross([0, 0, 1], thrust_W / np.linalg.norm(thrust_W))
+    angle = np.arcsin(np.linalg.norm(axis_angle))
+    if angle > 0.0:
+        axis = axis_angle / np.linalg.norm(axis_angle)
+        state[6:10] = [np.cos(angle / 2), *(np.sin(angle / 2) * axis)]
+    return state
+
+
+def fly(esdf, p_WB, p_WG, duration, config=None, truth=None, arrival_distance=0.0):
+    """Flies the closed loop: the states (N, 13) every 0.02 s and the plans every 0.2 s."""
+    builder = DiagramBuilder()
+    config = config or PrivilegedPlannerConfig()
+    plant = builder.AddNamedSystem("plant", QuadrotorPlant())
+    planner = builder.AddNamedSystem("planner", PrivilegedPlanner(esdf, config))
+    lookahead = FlatnessControllerConfig().lookahead
+    selector = builder.AddNamedSystem(
+        "selector", HypothesisSelector(config.lattice.num_hypotheses, lookahead)
+    )
+    controller = builder.AddNamedSystem("controller", FlatnessController())
+    state = plant.GetOutputPort("state")
+    for system in (planner, selector, controller):
+        builder.Connect(state, system.GetInputPort("state"))
+    builder.Connect(planner.GetOutputPort("hypotheses"), selector.GetInputPort("hypotheses"))
+    builder.Connect(selector.GetOutputPort("waypoint"), controller.GetInputPort("waypoint"))
+    builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
+    builder.ExportInput(planner.GetInputPort("goal"), "goal")
+    states = LogVectorOutput(state, builder, publish_period=0.02)
+    plans = LogVectorOutput(planner.GetOutputPort("hypotheses"), builder, publish_period=0.2)
+    diagram = builder.Build()
+
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    diagram.GetInputPort("goal").FixValue(context, p_WG)
+    plant.GetMyMutableContextFromRoot(context).SetContinuousState(hover_state(p_WB))
+
+    def monitor(root_context):
+        p = root_context.get_continuous_state_vector().CopyToVector()[:3]
+        if np.linalg.norm(p - p_WG) < arrival_distance:
+            return EventStatus.ReachedTermination(diagram, "goal")
+        if truth is not None and truth.distance(p) < VEHICLE_RADIUS:
+            return EventStatus.ReachedTermination(diagram, "collision")
+        return EventStatus.DidNothing()
+
+    simulator.set_monitor(monitor)
+    simulator.AdvanceTo(duration)
+    # The log ends up to a sample before the flight does.
+    last = context.get_continuous_state_vector().CopyToVector()
+    return np.vstack([states.FindLog(context).data().T, last]), plans.FindLog(context).data().T
+
+
+def test_flies_straight_at_nominal_speed(empty):
+    """On a clear path the best plan is straight on, at the nominal speed."""
+    toa = time_of_arrival(empty, np.array([14.0, 4.0, 3.0]))
+    state = flying([3.0, 4.0, 3.0], [2.0, 0.0, 0.0])
+    way_W = plan(0.0, state, empty, toa, TrajectoryLattice()).waypoints_W[0]
+    np.testing.assert_allclose(way_W[:, 0], 3.0 + 0.2 * np.arange(1, 11), atol=0.02)
+    np.testing.assert_allclose(way_W[:, 1:], [[4.0, 3.0]] * 10, atol=0.03)
+
+
+def test_waypoints_are_in_the_body_frame(empty):
+    """Seen in the world the plan is the same whatever the yaw of the vehicle."""
+    toa = time_of_arrival(empty, np.array([14.0, 4.0, 3.0]))
+    lattice = TrajectoryLattice()
+    plans = [plan(0.0, hover_state([3, 3, 3], yaw), empty, toa, lattice) for yaw in (0.0, 2.0)]
+    np.testing.assert_allclose(plans[0].waypoints_W, plans[1].waypoints_W, atol=1e-9)
+    assert not np.allclose(plans[0].waypoints_B, plans[1].waypoints_B, atol=0.1)
+    expected = plans[1].X_WB.inverse() @ plans[1].waypoints_W[0, 9]
+    np.testing.assert_allclose(plans[1].waypoints_B[0, 9], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("y", [3.6, 4.0, 4.3])
+def test_all_hypotheses_avoid_an_obstacle(pillar, y):
+    """Before an obstacle with free space around, every hypothesis keeps clear of it."""
+    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]), MARGIN)
+    state = flying([3.5, y, 3.0], [2.0, 0.0, 0.0])
+    hypotheses = plan(0.0, state, pillar, toa, TrajectoryLattice())
+    assert pillar.distance(hypotheses.waypoints_W).min() > VEHICLE_RADIUS + MARGIN
+    assert np.all(np.diff(hypotheses.costs) >= 0.0)
+
+
+def test_a_state_in_an_obstacle_leads_out(pillar):
+    """Where every trajectory starts in contact, the plan leads to greater distance."""
+    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
+    state = hover_state([5.4, 4.1, 3.0])
+    way_W = plan(0.0, state, pillar, toa, TrajectoryLattice()).waypoints_W[0]
+    assert pillar.distance(state[:3]) < VEHICLE_RADIUS
+    assert pillar.distance(way_W[-1]) > pillar.distance(state[:3]) + 0.1
+
+
+@pytest.mark.parametrize("p_WB", [[7.0, 5.0, 2.0], [7.3, 6.5, 2.0], [4.5, 3.0, 1.5]])
+def test_escapes_a_u_trap(u_trap, p_WB):
+    """A point mass that follows the best plan leaves a dead end and arrives, never in contact."""
+    p_WG = np.array([12.0, 5.0, 2.0])
+    toa, lattice = time_of_arrival(u_trap, p_WG, MARGIN), TrajectoryLattice()
+    p, v, a = np.array(p_WB), np.zeros(3), np.zeros(3)
+    for _ in range(120):
+        way_W = plan(0.0, flying(p, v, a), u_trap, toa, lattice).waypoints_W[0]
+        p, v, a = way_W[0], (way_W[1] - p) / 0.2, (way_W[1] - 2.0 * way_W[0] + p) / 0.1**2
+        assert u_trap.distance(p) > VEHICLE_RADIUS
+        if np.linalg.norm(p - p_WG) < 0.3:
+            return
+    pytest.fail(f"After 12 s still at {p}.")
+
+
+def test_passes_a_narrow_door(doorway):
+    """A door with 0.25 m to spare on either side is flown through, not hovered before."""
+    states, _ = fly(doorway, [2.0, 2.0, 1.5], [10.0, 6.0, 1.5], 9.0, arrival_distance=0.3)
+    assert np.linalg.norm(states[-1, :3] - [10.0, 6.0, 1.5]) < 0.3
+    assert doorway.distance(states[:, :3]).min() > VEHICLE_RADIUS
+
+
+@pytest.mark.parametrize("clearance", [0.1, 0.5])
+def test_arrives_and_stops_near_an_obstacle(pillar, clearance):
+    """The vehicle arrives at a goal, also close to an obstacle, and stays there."""
+    p_WG = np.array([6.0 - 0.4 - VEHICLE_RADIUS - clearance, 4.0, 3.0])
+    states, _ = fly(pillar, [2.0, 2.5, 2.5], p_WG, 9.0)
+    rest = states[-50:]  # the last second
+    assert np.linalg.norm(rest[:, :3] - p_WG, axis=1).max() < 0.1
+    assert np.linalg.norm(rest[:, 3:6], axis=1).max() < 0.1
+    assert pillar.distance(states[:, :3]).min() > VEHICLE_RADIUS
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_flies_through_a_forest(make_forest, seed):
+    """The whole Diagram flies through random forests, in time and with positive clearance."""
+    world, esdf = make_forest(seed)
+    p_WB, p_WG = np.array([1.5, 5.0, 1.5]), np.array([18.5, 5.0, 1.5])
+    states, plans = fly(esdf, p_WB, p_WG, 16.0, truth=world, arrival_distance=0.5)
+    p, speed = states[:, :3], np.linalg.norm(states[:, 3:6], axis=1)
+    assert np.linalg.norm(p[-1] - p_WG) < 0.5
+    assert world.distance(p).min() > VEHICLE_RADIUS
+    assert speed.max() < 1.15 * 2.0 and speed.mean() > 1.5
+    later = [Hypotheses.from_vector(vector, 3) for vector in plans[1:]]
+    assert all(h is not None and np.isfinite(h.costs).all() for h in later)
+
+
+def test_same_flight_bit_for_bit(make_forest):
+    """The same flight twice gives the same bits."""
+    _, esdf = make_forest(7)
+    flights = [fly(esdf, [1.5, 5.0, 1.5], [18.5, 5.0, 1.5], 2.0) for _ in range(2)]
+    np.testing.assert_array_equal(flights[0][0], flights[1][0])
+    np.testing.assert_array_equal(flights[0][1], flights[1][1])
+
+
+@given(
+    p=st.tuples(*[st.floats(-100, 100)] * 3),
+    v=st.tuples(*[st.floats(-30, 30)] * 3),
+    rpy=st.tuples(*[st.floats(-4, 4)] * 3),
+)
+@settings(max_examples=150, deadline=None)
+def test_any_state_gets_finite_plans(pillar_plan, p, v, rpy):
+    """From any state, in obstacles, upside down or outside the bounds, the plans are finite."""
+    q = RollPitchYaw(rpy).ToQuaternion().wxyz()
+    hypotheses = pillar_plan(np.array([*p, *v, *q, 0.0, 0.0, 0.0]))
+    assert np.isfinite(hypotheses.to_vector()).all()
+    assert np.all(np.diff(hypotheses.costs) >= 0.0)
+
+
+@pytest.fixture(scope="session")
+def pillar_plan(pillar):
+    toa, lattice = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0])), TrajectoryLattice()
+    return lambda state: plan(0.0, state, pillar, toa, lattice)
+
+
+def test_level_acceleration():
+    """Tilt accelerates by g tan(tilt) along the tilt; in steady flight the drag takes it away."""
+    R_WB = RollPitchYaw(0.0, 0.3, 1.0).ToRotationMatrix().matrix()
+    expected = 9.81 * np.tan(0.3) * np.array([np.cos(1.0), np.sin(1.0), 0.0])
+    np.testing.assert_allclose(level_acceleration(R_WB, np.zeros(3), 0.4), expected, atol=1e-12)
+    v_WB = np.array([*expected[:2] / 0.4, -3.0])
+    np.testing.assert_allclose(level_acceleration(R_WB, v_WB, 0.4), 0.0, atol=1e-12)
+
+
+def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
+    """The march runs at the first update and again when the goal moves, and at no other."""
+    goals = []
+    march = privileged_planner.time_of_arrival
+    monkeypatch.setattr(
+        privileged_planner,
+        "time_of_arrival",
+        lambda field, p_WG, margin: goals.append(p_WG.tolist()) or march(field, p_WG, margin),
+    )
+    planner = PrivilegedPlanner(empty)
+    simulator = Simulator(planner)
+    context = simulator.get_mutable_context()
+    planner.GetInputPort("state").FixValue(context, hover_state([3.0, 4.0, 3.0]))
+    for p_WG, until in [([9.0, 4.0, 3.0], 0.3), ([9.0, 4.0, 3.0], 0.6), ([9.0, 6.0, 3.0], 0.9)]:
+        planner.GetInputPort("goal").FixValue(context, p_WG)
+        simulator.AdvanceTo(until)
+    assert goals == [[9.0, 4.0, 3.0], [9.0, 6.0, 3.0]]
+
+
+def test_is_freed(empty):
+    """A planner that has flown, its Context and a copy are freed when nobody holds them."""
+    planner = PrivilegedPlanner(empty)
+    simulator = Simulator(planner)
+    context = simulator.get_mutable_context()
+    planner.GetInputPort("state").FixValue(context, hover_state([3.0, 4.0, 3.0]))
+    planner.GetInputPort("goal").FixValue(context, [9.0, 4.0, 3.0])
+    simulator.AdvanceTo(0.1)
+    held, copied = weakref.ref(planner), context.Clone()
+    del planner, simulator, context, copied
+    gc.collect()
+    assert held() is None
+
+
+def test_plans_at_its_rate(empty):
+    """There is no plan before the first update, and each plan carries the time of its update."""
+    planner = PrivilegedPlanner(empty, PrivilegedPlannerConfig(rate=10.0))
+    simulator = Simulator(planner)
+    context = simulator.get_mutable_context()
+    planner.GetInputPort("state").FixValue(context, hover_state([3.0, 4.0, 3.0]))
+    planner.GetInputPort("goal").FixValue(context, [9.0, 4.0, 3.0])
+    port = planner.GetOutputPort("hypotheses")
+    assert port.size() == hypotheses_size(3)
+    assert Hypotheses.from_vector(np.asarray(port.Eval(context)), 3) is None
+    for until, plan_time in [(0.05, 0.0), (0.15, 0.1), (0.27, 0.2)]:
+        simulator.AdvanceTo(until)
+        hypotheses = Hypotheses.from_vector(np.asarray(port.Eval(context)), 3)
+        assert hypotheses is not None and hypotheses.plan_time == pytest.approx(plan_time)
+
+
+def test_unknown_space_is_not_planned_through(make_forest):
+    """A plain field is made conservative: its bounds are not open space to the planner."""
+    _, esdf = make_forest(0)
+    planner = PrivilegedPlanner(esdf)
+    context = planner.CreateDefaultContext()
+    planner.GetInputPort("state").FixValue(context, hover_state([1.5, 5.0, 1.5]))
+    planner.GetInputPort("goal").FixValue(context, [19.8, 5.0, 1.5])
+    with pytest.raises(ValueError, match="boundary of the known volume"):
+        Simulator(planner, context).AdvanceTo(0.1)
+
+
+def test_a_goal_that_is_cut_off_is_refused(closed_wall):
+    """With no way from start to goal the update says so, with both places and the remedy."""
+    toa = time_of_arrival(closed_wall, np.array([9.0, 5.0, 2.0]))
+    message = r"No way leads from p_WB = \[3.0, 5.0, 2.0\].*clearance 1.\d+ m.*\[9.0, 5.0, 2.0\]"
+    with pytest.raises(ValueError, match=message):
+        plan(0.0, hover_state([3.0, 5.0, 2.0]), closed_wall, toa, TrajectoryLattice())
+
+
+def test_a_state_that_is_not_finite_is_refused(pillar_plan):
+    """A NaN in the state is an error of its source, not a plan."""
+    state = hover_state([3.0, 4.0, 3.0])
+    state[4] = np.nan
+    with pytest.raises(ValueError, match="must be 13 finite numbers"):
+        pillar_plan(state)
+
+
+def test_config_in_yaml():
+    """The config survives YAML, and a typo in it is an error."""
+    config = PrivilegedPlannerConfig(rate=5.0, lattice=LatticeConfig(speed=3.0))
+    text = yaml_dump_typed(config)
+    assert yaml_load_typed(schema=PrivilegedPlannerConfig, data=text) == config
+    with pytest.raises(RuntimeError, match="sped"):
+        yaml_load_typed(schema=PrivilegedPlannerConfig, data="lattice: {sped: 3.0}")
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (PrivilegedPlannerConfig(rate=0.0), "rate is 0.0 Hz but must be positive"),
+        (PrivilegedPlannerConfig(lattice=LatticeConfig(speed=-1.0)), "speed is -1.0"),
+    ],
+)
+def test_configs_out_of_range_are_refused(empty, config, message):
+    """Construction fails on a value out of range, naming it and its limit."""
+    with pytest.raises(ValueError, match=message):
+        PrivilegedPlanner(empty, config)

@@ -1,0 +1,134 @@
+import copy
+
+import numpy as np
+import pytest
+
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.policies.time_of_arrival import slowness, time_of_arrival
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+
+def open_space(voxel_size, size=(8.0, 6.0, 4.0)):
+    """A field 50 m from every obstacle, so that the slowness is 1 everywhere."""
+    shape = tuple(round(extent / voxel_size) for extent in size)
+    return Esdf(
+        np.full(shape, 50.0, np.float32), np.zeros(shape, np.uint8), np.zeros(3), voxel_size, True
+    )
+
+
+@pytest.mark.parametrize("voxel_size", [0.4, 0.2, 0.1])
+def test_is_the_distance_in_open_space(voxel_size):
+    """Without obstacles it is the distance to the goal, with an error of the order of a voxel."""
+    p_WG = np.array([6.83, 2.21, 1.47])
+    toa = time_of_arrival(open_space(voxel_size), p_WG)
+    lower, upper = 0.5 * voxel_size, np.array([8.0, 6.0, 4.0]) - 0.5 * voxel_size
+    p_WQ = np.random.default_rng(0).uniform(lower, upper, (5000, 3))
+    error = toa.value(p_WQ) - np.linalg.norm(p_WQ - p_WG, axis=1)
+    assert np.abs(error).max() < voxel_size
+    assert np.abs(error).mean() < 0.35 * voxel_size
+
+
+def test_goes_around_a_wall(half_wall):
+    """Behind a wall it is the length of the way around, plus what nearness to the wall adds."""
+    p_WG, p_WB = np.array([9.0, 2.0, 2.0]), np.array([3.0, 2.0, 2.0])
+    toa = time_of_arrival(half_wall, p_WG)
+    corner = np.array([6.2, 6.0 + VEHICLE_RADIUS, 2.0])
+    shortest = np.linalg.norm(corner - p_WB) + np.linalg.norm(p_WG - corner)
+    assert shortest < toa.value(p_WB) < 1.5 * shortest
+    # Before the wall the way leads to its end and off the wall, not to the goal behind it.
+    downhill = -toa.gradient(np.array([5.0, 3.0, 2.0]))
+    assert downhill[1] > 0.5 and downhill[0] < 0.0
+
+
+def test_gradient_is_the_slowness(pillar):
+    """The norm of the gradient is the slowness: the eikonal equation holds."""
+    toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
+    p_WQ = np.random.default_rng(1).uniform([1.5, 1.5, 2], [10.0, 6.5, 4], (4000, 3))
+    distance = pillar.distance(p_WQ)
+    p_WQ = p_WQ[distance > VEHICLE_RADIUS + 0.3]
+    ratio = np.linalg.norm(toa.gradient(p_WQ), axis=1) / slowness(pillar.distance(p_WQ))
+    assert abs(np.median(ratio) - 1.0) < 0.02
+    assert np.mean(np.abs(ratio - 1.0) < 0.15) > 0.95
+
+
+def test_gradient_is_that_of_the_value(pillar):
+    """The gradient agrees with central differences of the value."""
+    toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
+    cells = np.random.default_rng(2).integers([2, 2, 2], [70, 35, 25], (200, 3))
+    p_WQ = (cells + 1.0) * 0.2  # cell centres, away from the kinks between cells
+    step = 1e-2
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        slope = (toa.value(p_WQ + offset) - toa.value(p_WQ - offset)) / (2 * step)
+        np.testing.assert_allclose(toa.gradient(p_WQ)[:, axis], slope, atol=1e-3)
+
+
+def test_slowness_rises_towards_contact():
+    """One in the open, above ten at contact and falling with distance in between."""
+    distance = np.linspace(0.0, 6.0, 500)
+    values = slowness(distance)
+    assert np.all(np.diff(values) < 0.0)
+    assert slowness(np.array(6.0)) == pytest.approx(1.0, abs=1e-6)
+    assert 10.0 < slowness(np.array(VEHICLE_RADIUS)) < 12.0
+
+
+def test_way_leads_to_the_goal(u_trap):
+    """From inside a U the way leads out and around to the goal, clear of the walls, without end."""
+    p_WG = np.array([12.0, 5.0, 2.0])
+    toa = time_of_arrival(u_trap, p_WG, margin=0.05)
+    lengths = np.arange(0.0, 40.0, 0.2)
+    points, directions = toa.way(np.array([7.0, 5.0, 2.0]), lengths)
+    np.testing.assert_allclose(points[-1], p_WG)
+    arrived = np.linalg.norm(points - p_WG, axis=1) < 1e-9
+    np.testing.assert_array_equal(directions[arrived], 0.0)
+    np.testing.assert_allclose(np.linalg.norm(directions[~arrived][1:], axis=1), 1.0)
+    assert u_trap.distance(points).min() > VEHICLE_RADIUS
+    assert points[:, 0].min() < 4.0  # out of the opening
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert steps.max() < 0.2 + 1e-9
+    assert np.sum(steps) < 1.2 * toa.value(points[0])
+
+
+def test_leads_out_of_obstacles(pillar):
+    """Inside an obstacle and outside the box the values are finite and fall towards free space."""
+    toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
+    assert np.isfinite(toa.times).all()
+    assert not toa.is_reachable(np.array([6.0, 4.0, 3.0]))
+    assert toa.value(np.array([6.3, 4.0, 3.0])) > toa.value(np.array([6.9, 4.0, 3.0]))
+    assert np.isfinite(toa.value(np.array([-50.0, 3.0, 900.0])))
+    assert not toa.is_reachable(np.array([-50.0, 3.0, 900.0]))
+
+
+def test_knows_what_is_cut_off(closed_wall):
+    """Behind a closed wall nothing is reachable, before it everything free is."""
+    toa = time_of_arrival(closed_wall, np.array([9.0, 5.0, 2.0]))
+    assert not toa.is_reachable(np.array([3.0, 5.0, 2.0]))
+    assert toa.is_reachable(np.array([11.0, 2.0, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ("p_WG", "message"),
+    [
+        ([6.0, 4.0, 3.0], r"clearance of -0\.\d+ m.*at least 0.05 m.*further into free space"),
+        ([0.1, 4.0, 3.0], r"clearance of -0.25 m.*at least 0.05 m.*choose a goal 0.30 m further"),
+        ([17.0, 4.0, 3.0], r"\[17.00, 4.00, 3.00\] m lies outside the known volume.*16.00"),
+        ([np.nan, 4.0, 3.0], "must be 3 finite coordinates"),
+    ],
+)
+def test_bad_goals_are_refused(pillar, p_WG, message):
+    """A goal in an obstacle, near the boundary, outside or not finite: value, limit and remedy."""
+    with pytest.raises(ValueError, match=message):
+        time_of_arrival(pillar, np.array(p_WG), margin=0.05)
+
+
+def test_a_field_with_unknown_ends_is_refused():
+    """Only a conservative field is planned in."""
+    field = Esdf(np.ones((9, 9, 9), np.float32), np.zeros((9, 9, 9), np.uint8), np.zeros(3), 0.2)
+    with pytest.raises(ValueError, match=r"pass esdf.conservative\(\)"):
+        time_of_arrival(field, np.full(3, 0.9))
+
+
+def test_copies_share_the_grid(empty):
+    """A deep copy, as of a Drake Context, is the same object."""
+    toa = time_of_arrival(empty, np.array([8.0, 4.0, 3.0]))
+    assert copy.deepcopy(toa) is toa

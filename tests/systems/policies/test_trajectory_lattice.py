@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+
+from flysplat.systems.policies.time_of_arrival import time_of_arrival
+from flysplat.systems.policies.trajectory_lattice import (
+    LatticeConfig,
+    Trajectories,
+    TrajectoryLattice,
+    final_velocities,
+    quintic_basis,
+    rotation_to,
+    select_distinct,
+)
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+
+@pytest.mark.parametrize("derivative", [0, 1, 2])
+def test_quintics_meet_their_boundary_states(derivative):
+    """At both ends position, velocity and acceleration are those asked for."""
+    basis = quintic_basis(np.array([0.0, 1.7]), 1.7, derivative)
+    expected = np.zeros((2, 6))
+    expected[0, derivative] = expected[1, 3 + derivative] = 1.0
+    np.testing.assert_allclose(basis, expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("derivative", [0, 1, 2, 3])
+def test_quintics_equal_the_polynomial(derivative):
+    """Any quintic polynomial is reproduced, with its derivatives, from its boundary states."""
+    polynomial = Polynomial([0.3, -1.0, 2.0, 0.7, -0.4, 0.09])
+    times, horizon = np.linspace(0.0, 2.0, 21), 2.0
+    boundary = [polynomial.deriv(order)(t) for t in (0.0, horizon) for order in range(3)]
+    np.testing.assert_allclose(
+        quintic_basis(times, horizon, derivative) @ boundary,
+        polynomial.deriv(derivative)(times) if derivative else polynomial(times),
+        atol=1e-11,
+    )
+
+
+def test_fan_of_final_velocities():
+    """The fan spans its yaws, pitches and speeds evenly about straight ahead, and holds rest."""
+    config = LatticeConfig()
+    velocities = final_velocities(config)
+    assert velocities.shape == (25 * 7 * 3 + 1, 3)
+    np.testing.assert_array_equal(velocities[-1], 0.0)
+    speeds = np.linalg.norm(velocities[:-1], axis=1)
+    np.testing.assert_allclose(np.unique(speeds.round(9)), config.speed_fractions)
+    yaw = np.arctan2(velocities[:-1, 1], velocities[:-1, 0])
+    assert yaw.max() == pytest.approx(config.max_yaw) == pytest.approx(-yaw.min())
+    pitch = np.arcsin(velocities[:-1, 2] / speeds)
+    assert pitch.max() == pytest.approx(0.5) == pytest.approx(-pitch.min())
+    assert np.any(np.all(np.abs(velocities - [1, 0, 0]) < 1e-12, axis=1))
+
+
+@pytest.mark.parametrize("direction", [[3, 0, 0], [-1, 2, 0.5], [0, 0, 2], [0, 0, -1], [0, 0, 0]])
+def test_lattice_frame(direction):
+    """The frame is a rotation whose x axis is the direction and whose y axis is level."""
+    direction = np.array(direction, dtype=float)
+    R_WL = rotation_to(direction)
+    np.testing.assert_allclose(R_WL.T @ R_WL, np.eye(3), atol=1e-14)
+    assert np.linalg.det(R_WL) == pytest.approx(1.0)
+    np.testing.assert_allclose(R_WL[:, 0] * np.linalg.norm(direction), direction, atol=1e-14)
+    assert R_WL[2, 1] == 0.0
+
+
+def test_trajectories_keep_their_ends(pillar):
+    """Trajectories leave with the given velocity and acceleration; the fan ends as it should."""
+    lattice = TrajectoryLattice()
+    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
+    p, v, a = np.array([2.0, 3.0, 2.0]), np.array([1.5, 0.3, -0.2]), np.array([0.5, -1.0, 0.0])
+    trajectories = lattice.trajectories(p, v, a, toa)
+    assert trajectories.positions.shape == (25 * 7 * 3 + 1 + 3, 20, 3)
+    # Third-order exact near the start: p + v t + a t^2 / 2 + j t^3 / 6 + O(t^4).
+    t, j = 0.1, trajectories.jerks[:, 0]
+    start = p + v * t + a * t**2 / 2 + j * t**3 / 6
+    assert np.abs(trajectories.positions[:, 0] - start).max() < 0.01
+    R_WL = rotation_to(-toa.gradient(p))
+    ends = p + 2.0 * 2.0 * final_velocities(lattice.config) @ R_WL.T
+    np.testing.assert_allclose(trajectories.positions[:-3, -1], ends, atol=1e-12)
+    way, _ = toa.way(p, 4.0 * np.array(lattice.config.speed_fractions))
+    np.testing.assert_allclose(trajectories.positions[-3:, -1], way, atol=1e-12)
+
+
+def test_costs_are_the_documented_sum(pillar):
+    """The cost of a hand-made trajectory equals the formula evaluated term by term."""
+    config = LatticeConfig(penetration_weight=7.0, speed_weight=3.0, jerk_weight=0.5, margin=0.2)
+    lattice = TrajectoryLattice(config)
+    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
+    p = np.array([4.0, 4.0, 3.0])
+    positions = p + np.linspace(0.06, 1.2, 20)[:, None] * [1.0, 0.3, 0.0]
+    jerks = np.random.default_rng(0).normal(size=(1, 20, 3))
+    positions[10:] += [0.4, 0.0, 0.0]  # one step too fast
+    [cost] = lattice.costs(Trajectories(positions[None], jerks), p, pillar, toa)
+
+    expected = float(toa.value(positions[-1]))
+    for i, q in enumerate(positions):
+        step = np.linalg.norm(q - (positions[i - 1] if i else p))
+        d = float(pillar.distance(q))
+        speed = 0.1 + 0.9 * min(max((d - VEHICLE_RADIUS) / 0.6, 0.0), 1.0)
+        soft = np.log1p(np.exp(4.0 * (VEHICLE_RADIUS + 1.0 - d))) / 4.0
+        expected += (1.0 / speed + 1.5 * soft - 1.0) * step
+        expected += 7.0 * max(0.0, VEHICLE_RADIUS + 0.2 - d)
+        expected += 3.0 * max(0.0, step / 0.1 - 2.0) ** 2 / 20
+        expected += 0.5 * np.sum(jerks[0, i] ** 2) / 20
+    assert cost == pytest.approx(expected, rel=1e-9)
+
+
+def test_best_are_in_order_and_distinct(pillar):
+    """The K best come cheapest first, the first is the cheapest of all, and they differ."""
+    lattice = TrajectoryLattice(LatticeConfig(num_hypotheses=5))
+    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
+    p, v, a = np.array([3.0, 4.1, 3.0]), np.array([2.0, 0.0, 0.0]), np.zeros(3)
+    positions, costs = lattice.best(p, v, a, pillar, toa)
+    assert positions.shape == (5, 20, 3)
+    assert np.all(np.diff(costs) >= 0.0)
+    assert costs[0] == lattice.costs(lattice.trajectories(p, v, a, toa), p, pillar, toa).min()
+    for i in range(5):
+        for j in range(i):
+            assert np.linalg.norm(positions[i] - positions[j], axis=1).mean() > 0.35
+
+
+def test_selection_falls_back_to_the_most_distant():
+    """Where no trajectory is distinct any more the most distant ones fill up, none twice."""
+    positions = np.array([0.0, 0.01, 0.02, 1.0, 0.03])[:, None, None] * np.ones((5, 4, 3))
+    costs = np.array([1.0, 2.0, 3.0, 9.0, 4.0])
+    np.testing.assert_array_equal(select_distinct(positions, costs, 3, 0.35), [0, 4, 3])
+    np.testing.assert_array_equal(select_distinct(positions, costs, 5, 0.35), [0, 1, 2, 4, 3])
+    alike = np.zeros((3, 4, 3))
+    np.testing.assert_array_equal(select_distinct(alike, costs[:3], 3, 0.35), [0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed": 0.0}, "speed is 0.0 but must be positive"),
+        ({"horizon": 0.9}, "horizon is 0.9 but must be a multiple of 0.1 s and at least 1.0 s"),
+        ({"horizon": 1.55}, "multiple of 0.1 s"),
+        ({"num_yaws": 0}, "num_yaws is 0 but must be at least 1"),
+        ({"max_pitch": 1.6}, "max_pitch is 1.6 but must be less than pi/2"),
+        ({"margin": -0.1}, "margin is -0.1 but must be at least 0"),
+        ({"speed_fractions": []}, "one or more values"),
+        ({"speed_fractions": [0.5, 1.2]}, r"values in \(0, 1\]"),
+        ({"num_hypotheses": 600}, "at most 525"),
+        ({"jerk_weight": float("nan")}, "jerk_weight is nan"),
+    ],
+)
+def test_configs_out_of_range_are_refused(changes, message):
+    """Each field's limit is enforced, and the message names field, value and limit."""
+    with pytest.raises(ValueError, match=f"LatticeConfig.*{message}"):
+        TrajectoryLattice(LatticeConfig(**changes))
