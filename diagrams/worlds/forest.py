@@ -23,7 +23,7 @@ def make_forest(config: ForestConfig, seed: int = 0) -> World:
 
     Start and goal face each other across the length. A way between them exists by construction: any
     two trunks are further apart, at every height, than the vehicle is wide, and one trunk alone
-    leaves room beside it (`ForestConfig.validate`). So trunks grown by the radius of the vehicle are
+    leaves room beside it (`ForestConfig.validate`). So trunks grown by the vehicle's radius are
     disjoint and cannot close a line from side to side; rocks and logs end below the flight height,
     and no trunk is near start and goal.
 

@@ -38,7 +38,7 @@ class ForestConfig:
         tilt = self.height * np.tan(np.deg2rad(self.lean_max))
         return float(self.spacing - 2 * self.radius_max - 2 * tilt)
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Raises ValueError for the first value with which no forest can be grown."""
         positive = "length", "width", "height", "spacing", "radius_min", "radius_max", "voxel_size"
         for name in positive:

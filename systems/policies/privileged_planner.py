@@ -158,6 +158,8 @@ class PrivilegedPlanner(LeafSystem):
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
         plans = self.DeclareDiscreteState(unplanned(self._config.lattice.num_hypotheses))
         self.DeclareStateOutputPort("hypotheses", plans)
+        # The march belongs to the start of a simulation, not to its first instant.
+        self.DeclareInitializationPublishEvent(self._march)
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / self._config.rate, 0.0, self._update)
         # Drake would never free a system that its own cache entry refers to, nor one that keeps the
         # entry itself: hence a weak reference, and the index.
@@ -178,6 +180,9 @@ class PrivilegedPlanner(LeafSystem):
         # change of the goal itself is worth the march.
         if not isinstance(last, TimeOfArrival) or not np.array_equal(last.p_WG, p_WG):
             value.set_value(time_of_arrival(self._field, p_WG, self._config.lattice.margin))
+
+    def _march(self, context: Context) -> None:
+        self.get_cache_entry(self._time_of_arrival).Eval(context)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         hypotheses = plan(

@@ -1,0 +1,197 @@
+"""One flight: from a scenario to a trajectory and how it ended."""
+
+import enum
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import Context, Diagram, EventStatus
+
+from flysplat.diagrams.flight_diagram import goal_of
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.distance_field import FieldState
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+
+
+class Outcome(enum.StrEnum):
+    """How a flight ended."""
+
+    GOAL = "goal"
+    COLLISION = "collision"
+    LEFT_VOLUME = "left_volume"
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """What a flight leaves behind; N samples at `LOG_PERIOD` and one at the end."""
+
+    outcome: Outcome
+    times: np.ndarray  # (N,) [s]
+    states: np.ndarray  # (N, 13): p_WB, v_WB, q_WB, w_WB_B
+    commands: np.ndarray  # (N, 4): thrust [m/s^2], body rates [rad/s]
+    # (N,) [m] Distance to the nearest surface less the vehicle's radius; NaN outside the world.
+    clearances: np.ndarray
+    plan_times: np.ndarray  # (M,) [s]
+    hypotheses: np.ndarray  # (M, size): see flysplat.systems.policies.hypotheses
+    wall_time: float  # [s] that the simulation took after its initialisation
+
+    def summary(self) -> dict[str, float | str]:
+        """The flight in numbers; distances along the samples, speed as path length over time."""
+        path_length = float(np.linalg.norm(np.diff(self.states[:, :3], axis=0), axis=1).sum())
+        duration = float(self.times[-1])
+        return {
+            "outcome": str(self.outcome),
+            "flight_time_s": duration,
+            "path_length_m": path_length,
+            "mean_speed_m_s": path_length / duration if duration > 0 else 0.0,
+            "min_clearance_m": float(np.nanmin(self.clearances)),
+            "real_time_factor": duration / self.wall_time,
+        }
+
+    def save(self, path: Path) -> None:
+        """Writes the arrays of this flight as a compressed .npz file, the same bytes every time."""
+        np.savez_compressed(
+            path,
+            times=self.times,
+            states=self.states,
+            commands=self.commands,
+            clearances=self.clearances,
+            plan_times=self.plan_times,
+            hypotheses=self.hypotheses,
+        )
+
+
+def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
+    """
+    The state (13,) a flight starts in: level, at rest, facing the goal.
+
+    The position is drawn from the scenario's seed, uniformly from the ball of `start_radius` about
+    the start.
+
+    Raises:
+        ValueError: if the start or the goal is outside the known free volume, or nearer to a
+            surface
+            than the vehicle's radius.
+    """
+    p_WG = goal_of(scenario, world)
+    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+    _check_free(world, "start", p_WS)
+    _check_free(world, "goal", p_WG)
+
+    generator = np.random.default_rng(scenario.seed)
+    p_WB = None
+    # The start itself is free, and so is a neighbourhood of it: the search ends.
+    while p_WB is None or not _is_free(world, p_WB):
+        direction = generator.normal(size=3)
+        distance = scenario.start_radius * generator.uniform() ** (1 / 3)
+        p_WB = p_WS + distance * direction / np.linalg.norm(direction)
+    heading = p_WG - p_WB
+    return hover_state(p_WB, yaw=np.arctan2(heading[1], heading[0]))
+
+
+def fly(
+    diagram: Diagram,
+    scenario: Scenario,
+    world: World,
+    progress: Callable[[float], None] | None = None,
+) -> Flight:
+    """
+    Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
+
+    Args:
+        diagram, scenario, world: as built.
+        progress: called with the simulated time [s] now and then.
+    """
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scenario.simulator, simulator)
+    root = simulator.get_mutable_context()
+    plant_context = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
+    plant_context.SetContinuousState(sample_initial_state(scenario, world))
+    p_WG = goal_of(scenario, world)
+
+    def monitor(context: Context) -> EventStatus:
+        if progress is not None:
+            progress(context.get_time())
+        outcome = flight_outcome(diagram, context, p_WG, scenario.goal_radius)
+        if outcome is None:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(diagram, outcome)
+
+    simulator.set_monitor(monitor)
+    simulator.Initialize()
+    started = time.perf_counter()
+    simulator.AdvanceTo(scenario.timeout)
+    wall_time = time.perf_counter() - started
+
+    ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
+    return _record(diagram, root, world, ended, wall_time)
+
+
+def flight_outcome(
+    diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
+) -> Outcome | None:
+    """How the flight ends at this instant; None while it goes on."""
+    if diagram.GetOutputPort("in_collision").Eval(context)[0]:
+        return Outcome.COLLISION
+    if diagram.GetOutputPort("field_state").Eval(context)[0] >= FieldState.UNKNOWN:
+        return Outcome.LEFT_VOLUME
+    p_WB = diagram.GetOutputPort("state").Eval(context)[:3]
+    if np.linalg.norm(p_WG - p_WB) <= goal_radius:
+        return Outcome.GOAL
+    return None
+
+
+def _record(
+    diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
+) -> Flight:
+    logs = {
+        name: diagram.GetSubsystemByName(f"{name}_log").FindLog(root)
+        for name in ("state", "command", "hypotheses")
+    }
+    times, states, commands = (
+        logs["state"].sample_times(),
+        logs["state"].data().T,
+        logs["command"].data().T,
+    )
+    if root.get_time() > times[-1]:
+        times = np.append(times, root.get_time())
+        states = np.vstack([states, diagram.GetOutputPort("state").Eval(root)])
+        commands = np.vstack([commands, diagram.GetOutputPort("command").Eval(root)])
+    return Flight(
+        outcome=outcome,
+        times=times.copy(),
+        states=states.copy(),
+        commands=commands.copy(),
+        clearances=world.distance_field.distance(states[:, :3]) - VEHICLE_RADIUS,
+        plan_times=logs["hypotheses"].sample_times().copy(),
+        hypotheses=logs["hypotheses"].data().T.copy(),
+        wall_time=wall_time,
+    )
+
+
+def _is_free(world: World, p_WQ: np.ndarray) -> bool:
+    sample = world.distance_field.query(p_WQ)
+    return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
+
+
+def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
+    """Raises ValueError unless the vehicle fits at p_WQ (3,) [m]."""
+    field = world.distance_field
+    sample = field.query(p_WQ)
+    where = f"{what} {np.round(p_WQ, 3).tolist()}"
+    if sample.state >= FieldState.UNKNOWN:
+        known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
+        raise ValueError(
+            f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
+            f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
+        )
+    if sample.distance <= VEHICLE_RADIUS:
+        raise ValueError(
+            f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
+            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more room"
+        )

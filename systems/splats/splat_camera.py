@@ -1,0 +1,181 @@
+"""A camera that sees Gaussians."""
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.geometry import RenderLabel
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
+from pydrake.systems.sensors import (
+    CameraInfo,
+    ImageDepth16U,
+    ImageDepth32F,
+    ImageLabel16I,
+    ImageRgba8U,
+)
+
+from flysplat.systems.splats.baked_scene import BakedScene, RenderedView
+
+# Below one half, more of the light along a ray comes from behind the surface than from it: no depth
+# to speak of.
+OPAQUE_ALPHA = 0.5
+
+
+class SplatCamera(LeafSystem):
+    """
+    Colour, depth and label images of a Gaussian scene, with the output ports of Drake's
+    `RgbdSensor`.
+
+    .. pydrake_system::
+
+        name: SplatCamera
+        input_ports:
+        - body_pose
+        output_ports:
+        - color_image
+        - depth_image_32f
+        - depth_image_16u
+        - label_image
+        - body_pose_in_world
+        - image_time
+
+    `body_pose` is the pose X_WB of the body that carries the camera; the camera sits at X_WC = X_WB
+    X_BC with x right, y down and z forward, and images all of colour, depth and labels from there.
+    The images are rendered when a port is evaluated, once for all of them, and again only when the
+    pose has changed.
+
+    Depth is planar z of the expected surface, sum_i w_i z_i / sum_i w_i, in metres
+    (`depth_image_32f`) or millimetres (`depth_image_16u`). As in Drake, nearer than `min_depth`
+    reads 0, farther than `max_depth` reads infinity or 65535, and so does a pixel whose alpha stays
+    below one half. Labels are `RenderLabel.kUnspecified` where there is a surface and
+    `RenderLabel.kEmpty` elsewhere: Gaussians carry no semantics.
+    """
+
+    def __init__(
+        self,
+        scene: BakedScene,
+        camera_info: CameraInfo,
+        X_BC: RigidTransform | None = None,
+        *,
+        min_depth: float = 0.1,
+        max_depth: float = 20.0,
+        near: float = 0.01,
+        far: float = 1e10,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ):
+        """
+        Args:
+            scene: what there is to see; held by reference, so that many cameras share one.
+            camera_info: pinhole intrinsics, width and height.
+            X_BC: pose of the camera in the body that carries it; identity when None.
+            min_depth, max_depth: range of the depth image [m].
+            near, far: Gaussians whose centre is not between these planes are not drawn [m].
+            background: colour behind everything, red, green, blue in [0, 1].
+
+        Raises:
+            ValueError: if the depth range is empty or a focal length is not positive.
+        """
+        super().__init__()
+        if not 0 <= min_depth < max_depth < np.inf:
+            raise ValueError(
+                f"camera depth range is [{min_depth}, {max_depth}] m; it must satisfy "
+                "0 <= min_depth < max_depth < inf"
+            )
+        if camera_info.focal_x() <= 0 or camera_info.focal_y() <= 0:
+            raise ValueError(
+                f"camera focal lengths are {camera_info.focal_x()}, {camera_info.focal_y()} "
+                "pixels; both must be positive"
+            )
+        self._scene = scene
+        self._camera_info = camera_info
+        self._X_BC = RigidTransform() if X_BC is None else X_BC
+        self._depth_range = (min_depth, max_depth)
+        self._clipping = (near, far)
+        self._background = background
+
+        pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
+        pose_ticket = self.input_port_ticket(pose_port.get_index())
+        self._view_entry = self.DeclareCacheEntry(
+            "rendered view",
+            ValueProducer(allocate=Value[object], calc=self._calc_view),
+            {pose_ticket},
+        )
+        width, height = camera_info.width(), camera_info.height()
+        for name, image, calc in (
+            ("color_image", ImageRgba8U, self._calc_color),
+            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f),
+            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u),
+            ("label_image", ImageLabel16I, self._calc_label),
+        ):
+            self.DeclareAbstractOutputPort(
+                name,
+                alloc=lambda image=image: Value(image(width, height)),
+                calc=calc,
+                prerequisites_of_calc={self._view_entry.ticket()},
+            )
+        self.DeclareAbstractOutputPort(
+            "body_pose_in_world",
+            alloc=lambda: Value(RigidTransform()),
+            calc=self._calc_body_pose,
+            prerequisites_of_calc={pose_ticket},
+        )
+        self.DeclareVectorOutputPort(
+            "image_time", 1, self._calc_image_time, prerequisites_of_calc={self.time_ticket()}
+        )
+
+    def camera_info(self) -> CameraInfo:
+        """The intrinsics."""
+        return self._camera_info
+
+    def X_BC(self) -> RigidTransform:
+        """The pose of the camera in the body that carries it."""
+        return self._X_BC
+
+    def render(self, X_WB: RigidTransform) -> RenderedView:
+        """The view from body pose X_WB: float colour, depth and alpha, before they become Drake
+        images.
+        """
+        info = self._camera_info
+        return self._scene.render(
+            info.intrinsic_matrix(),
+            info.width(),
+            info.height(),
+            X_WB @ self._X_BC,
+            near=self._clipping[0],
+            far=self._clipping[1],
+            background=self._background,
+        )
+
+    def _calc_view(self, context: Context, value: AbstractValue) -> None:
+        value.set_value(self.render(self.GetInputPort("body_pose").Eval(context)))
+
+    def _calc_color(self, context: Context, value: AbstractValue) -> None:
+        pixels = value.get_mutable_value().mutable_data  # (H, W, 4)
+        color = self._view_entry.Eval(context).color
+        pixels[..., :3] = np.clip(color * 255.0 + 0.5, 0.0, 255.0)
+        pixels[..., 3] = 255
+
+    def _depth(self, context: Context) -> np.ndarray:
+        """(H, W) [m], with 0 and inf out of range."""
+        view = self._view_entry.Eval(context)
+        min_depth, max_depth = self._depth_range
+        seen = (view.alpha >= OPAQUE_ALPHA) & (view.depth <= max_depth)
+        return np.where(seen, np.where(view.depth < min_depth, 0.0, view.depth), np.inf)
+
+    def _calc_depth_32f(self, context: Context, value: AbstractValue) -> None:
+        value.get_mutable_value().mutable_data[..., 0] = self._depth(context)
+
+    def _calc_depth_16u(self, context: Context, value: AbstractValue) -> None:
+        millimetres = np.minimum(self._depth(context) * 1000.0 + 0.5, 65535.0)
+        value.get_mutable_value().mutable_data[..., 0] = millimetres
+
+    def _calc_label(self, context: Context, value: AbstractValue) -> None:
+        surface = self._view_entry.Eval(context).alpha >= OPAQUE_ALPHA
+        value.get_mutable_value().mutable_data[..., 0] = np.where(
+            surface, int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
+        )
+
+    def _calc_body_pose(self, context: Context, value: AbstractValue) -> None:
+        value.set_value(self.GetInputPort("body_pose").Eval(context))
+
+    def _calc_image_time(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, context.get_time())

@@ -1,0 +1,153 @@
+"""The onboard camera's picture, as Meshcat shows it."""
+
+import base64
+import json
+
+import cv2
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.common.value import Value
+from pydrake.geometry import InMemoryMesh, Mesh, Meshcat
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+
+from flysplat.systems.visualization.flipbook import page_path, show_page
+
+
+class CameraVisualizer(LeafSystem):
+    """
+    Hangs what the camera sees in front of it in Meshcat, as a picture across the view frustum.
+
+    .. pydrake_system::
+
+        name: CameraVisualizer
+        input_ports:
+        - color_image
+
+    Takes an image every `period` seconds and shows every `stride`-th. The picture is a child of the
+    vehicle's Meshcat path, so it moves with the vehicle at X_BC and needs no pose of its own.
+    """
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        camera_info: CameraInfo,
+        X_BC: RigidTransform,
+        period: float = 1 / 15,
+        stride: int = 3,
+        depth: float = 0.6,
+        path: str = "/flysplat/vehicle/camera",
+    ):
+        """
+        Args:
+            meshcat: where to draw.
+            camera_info, X_BC: intrinsics, and pose of the camera in the vehicle's body frame.
+            period: time between two images [s]; as other readers of the camera have it, or it
+                renders for each.
+            stride: how many images there are to a picture that is shown.
+            depth: distance from the camera to the picture [m].
+            path: Meshcat path of the camera.
+        """
+        super().__init__()
+        self._meshcat = meshcat
+        self._period = period
+        self._stride = stride
+        self._path = path
+        width, height = camera_info.width(), camera_info.height()
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
+        center = [camera_info.center_x(), camera_info.center_y()]
+        focal = [camera_info.focal_x(), camera_info.focal_y()]
+        # (4, 3) [m], frame C: top left, top right, bottom right, bottom left.
+        self._p_CCorners = depth * np.column_stack([(corners - center) / focal, np.ones(4)])
+        self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+        meshcat.SetTransform(path, X_BC)
+        edges = np.stack([np.zeros((4, 3)), self._p_CCorners], axis=1).reshape(8, 3)
+        meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
+
+    def _publish(self, context: Context) -> EventStatus:
+        time = context.get_time()
+        page, skipped = divmod(round(time / self._period), self._stride)
+        if skipped:
+            return EventStatus.DidNothing()
+        rgba = self.GetInputPort("color_image").Eval(context).data
+        gltf = MemoryFile(picture_gltf(rgba[..., :3], self._p_CCorners), ".gltf", "onboard picture")
+        path = f"{self._path}/picture"
+        self._meshcat.SetObject(page_path(path, page), Mesh(InMemoryMesh(mesh_file=gltf)))
+        show_page(self._meshcat, path, page, time)
+        return EventStatus.Succeeded()
+
+
+def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
+    """
+    A glTF 2.0 document of one rectangle textured with a picture, unlit and seen from both sides.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        corners: (4, 3) [m], the picture's top left, top right, bottom right and bottom left corner.
+    """
+    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+    positions = corners.astype("<f4")
+    texture = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4")
+    indices = np.array([0, 1, 2, 0, 2, 3], "<u2")
+    # glTF's y axis is up while Drake's is z: Drake turns glTF content by 90 degrees about x on the
+    # way in.
+    positions = positions @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], "<f4")
+    binary = positions.tobytes() + texture.tobytes() + indices.tobytes()
+    return json.dumps(
+        {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [
+                {
+                    "primitives": [
+                        {
+                            "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
+                            "indices": 2,
+                            "material": 0,
+                        }
+                    ]
+                }
+            ],
+            "materials": [
+                {
+                    "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+                    "extensions": {"KHR_materials_unlit": {}},
+                    "doubleSided": True,
+                }
+            ],
+            "extensionsUsed": ["KHR_materials_unlit"],
+            "textures": [{"source": 0}],
+            "images": [{"uri": _data_uri("image/jpeg", jpeg.tobytes())}],
+            "accessors": [
+                {
+                    "bufferView": 0,
+                    "componentType": 5126,
+                    "count": 4,
+                    "type": "VEC3",
+                    "min": positions.min(axis=0).tolist(),
+                    "max": positions.max(axis=0).tolist(),
+                },
+                {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
+                {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
+            ],
+            "bufferViews": [
+                {"buffer": 0, "byteOffset": 0, "byteLength": 48},
+                {"buffer": 0, "byteOffset": 48, "byteLength": 32},
+                {"buffer": 0, "byteOffset": 80, "byteLength": 12},
+            ],
+            "buffers": [
+                {
+                    "byteLength": len(binary),
+                    "uri": _data_uri("application/octet-stream", binary),
+                }
+            ],
+        }
+    )
+
+
+def _data_uri(media_type: str, content: bytes) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,104 @@
+"""What stands still on a Meshcat scene: world, goal, vehicle, distance field."""
+
+import numpy as np
+from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.perception import BaseField, Fields, PointCloud
+
+from flysplat.systems.collision.distance_field import DistanceField, FieldState
+from flysplat.systems.splats.gaussian_scene import GaussianScene
+
+
+def draw_gaussians(
+    meshcat: Meshcat,
+    path: str,
+    scene: GaussianScene,
+    lower_W: np.ndarray,
+    upper_W: np.ndarray,
+    max_points: int = 120_000,
+) -> None:
+    """
+    Draws the centres of the Gaussians inside a box as coloured points, evenly thinned.
+
+    The points are as large as the median Gaussian, so that surfaces look closed.
+
+    Args:
+        path: Meshcat path of the point cloud.
+        lower_W, upper_W: corners of the box (3,) [m]; what lies outside (sky, far hills) is left
+            out.
+        max_points: most points drawn.
+    """
+    inside = np.flatnonzero(np.all((scene.means >= lower_W) & (scene.means <= upper_W), axis=1))
+    if len(inside) > max_points:
+        inside = inside[np.linspace(0, len(inside) - 1, max_points).astype(int)]
+    cloud = PointCloud(len(inside), Fields(BaseField.kXYZs | BaseField.kRGBs))
+    cloud.mutable_xyzs()[:] = scene.means[inside].T
+    # Meshcat takes the colours of points for linear light and encodes them for the screen itself.
+    cloud.mutable_rgbs()[:] = (scene.base_colors[inside].T ** 2.2 * 255).astype(np.uint8)
+    extent = np.median(scene.scales[inside].max(axis=1)) if len(inside) else 0.05
+    meshcat.SetObject(path, cloud, point_size=2.0 * float(extent))
+
+
+def draw_goal(meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float) -> None:
+    """Draws the goal region: a translucent ball of `radius` [m] about p_WG (3,) [m]."""
+    meshcat.SetObject(path, Sphere(radius), Rgba(0.1, 0.9, 0.3, 0.4))
+    meshcat.SetTransform(path, RigidTransform(p_WG))
+
+
+def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
+    """Draws a quadrotor whose propeller tips reach `radius` [m]; frame B: x forward, z up."""
+    propeller = 0.36 * radius
+    arm = radius - propeller
+    dark, front, rear = Rgba(0.1, 0.1, 0.12), Rgba(0.9, 0.2, 0.1, 0.6), Rgba(0.3, 0.3, 0.35, 0.6)
+    meshcat.SetObject(f"{path}/body", Box(0.5 * radius, 0.35 * radius, 0.2 * radius), dark)
+    for name, angle, color in (
+        ("front_left", np.pi / 4, front),
+        ("rear_left", 3 * np.pi / 4, rear),
+        ("rear_right", -3 * np.pi / 4, rear),
+        ("front_right", -np.pi / 4, front),
+    ):
+        R_BA = RotationMatrix.MakeZRotation(angle)
+        meshcat.SetObject(f"{path}/{name}_arm", Box(arm, 0.02, 0.02), dark)
+        meshcat.SetTransform(f"{path}/{name}_arm", RigidTransform(R_BA, R_BA @ [arm / 2, 0, 0]))
+        meshcat.SetObject(f"{path}/{name}_propeller", Cylinder(propeller, 0.01), color)
+        meshcat.SetTransform(
+            f"{path}/{name}_propeller", RigidTransform(R_BA @ np.array([arm, 0, 0.03]))
+        )
+
+
+def draw_distance_slice(
+    meshcat: Meshcat, path: str, field: DistanceField, height: float, spacing: float = 0.2
+) -> None:
+    """
+    Draws the horizontal slice of a distance field at z = `height` [m].
+
+    Red is at or inside a surface, fading through yellow at 1 m to blue at 2 m and more; unknown
+    space is grey.
+
+    Args:
+        path: Meshcat path of the coloured mesh.
+        spacing: distance between the samples [m].
+    """
+    lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
+    counts = np.maximum(2, np.ceil((upper_W[:2] - lower_W[:2]) / spacing).astype(int))
+    # Half a cell inside, where every field has an answer.
+    margin = 1e-3 * (upper_W[:2] - lower_W[:2])
+    xs, ys = (
+        np.linspace(lower_W[i] + margin[i], upper_W[i] - margin[i], counts[i]) for i in range(2)
+    )
+    p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
+    sample = field.query(p_WQ)
+    ramp = np.clip(np.nan_to_num(sample.distance) / 2.0, 0.0, 1.0)
+    colors = np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2])
+    colors[:, sample.state >= FieldState.UNKNOWN] = 0.4
+
+    i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
+    corner = (i * counts[1] + j).ravel()
+    faces = np.concatenate(
+        [
+            [corner, corner + counts[1], corner + 1],
+            [corner + 1, corner + counts[1], corner + counts[1] + 1],
+        ],
+        axis=1,
+    ).astype(np.int32)
+    meshcat.SetTriangleColorMesh(path, p_WQ.T, faces, colors)

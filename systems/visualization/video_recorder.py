@@ -1,0 +1,87 @@
+"""A video of what the camera saw: colour beside depth."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
+from tqdm import tqdm
+
+from flysplat.systems.files import written_atomically
+
+
+class VideoRecorder(LeafSystem):
+    """
+    Collects colour and depth images at a fixed rate; `save` writes them as a video afterwards.
+
+    .. pydrake_system::
+
+        name: VideoRecorder
+        input_ports:
+        - color_image
+        - depth_image_16u
+
+    The images wait in memory (0.4 MB each at 320x240) and are encoded after the flight, because
+    encoding takes longer than rendering them and would be charged to the simulation.
+    """
+
+    def __init__(self, width: int, height: int, fps: float):
+        """
+        Args:
+            width, height: size of the images [pixels].
+            fps: images a second of simulated time, and of the video.
+        """
+        super().__init__()
+        self._fps = fps
+        self._frames: list[tuple[np.ndarray, np.ndarray]] = []
+        self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
+        self.DeclareAbstractInputPort("depth_image_16u", Value(ImageDepth16U(width, height)))
+        self.DeclareInitializationPublishEvent(self._clear)
+        self.DeclarePeriodicPublishEvent(1 / fps, 0.0, self._record)
+
+    def _clear(self, context: Context) -> EventStatus:
+        self._frames.clear()
+        return EventStatus.Succeeded()
+
+    def _record(self, context: Context) -> EventStatus:
+        rgba = self.GetInputPort("color_image").Eval(context).data
+        depth = self.GetInputPort("depth_image_16u").Eval(context).data
+        self._frames.append((rgba[..., :3].copy(), depth[..., 0].copy()))
+        return EventStatus.Succeeded()
+
+    def save(self, path: Path, max_depth: float) -> None:
+        """
+        Writes the video (VP9 in MP4, which every browser plays) atomically.
+
+        Args:
+            path: the file, ending in .mp4.
+            max_depth: depth at which the depth picture's colours end [m].
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        height, width = self._frames[0][1].shape
+        size = (2 * width, height)
+        fourcc = cv2.VideoWriter.fourcc(*"vp09")
+        with written_atomically(path) as partial:
+            writer = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, self._fps, size)
+            if not writer.isOpened():
+                raise OSError(f"{path}: OpenCV cannot write a video here; is the folder writable?")
+            for rgb, depth in tqdm(self._frames, "video", unit="frame", leave=False, disable=None):
+                writer.write(np.hstack([rgb[..., ::-1], colorize_depth(depth * 1e-3, max_depth)]))
+            writer.release()
+
+
+def colorize_depth(depth: np.ndarray, max_depth: float) -> np.ndarray:
+    """
+    Depth (H, W) [m] as a picture (H, W, 3) uint8 in OpenCV's channel order.
+
+    Near is bright and far dark, in inverse depth from 0.5 m to `max_depth`; out of range is black.
+    """
+    inverse = 1.0 / np.clip(depth, 0.5, max_depth)
+    shade = (inverse - 1.0 / max_depth) / (2.0 - 1.0 / max_depth)
+    picture = cv2.applyColorMap((np.sqrt(shade) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)
+    picture[(depth <= 0) | (depth > max_depth)] = 0
+    return picture

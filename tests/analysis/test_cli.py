@@ -1,0 +1,120 @@
+"""The command line, as a user meets it."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from flysplat.analysis.cli import main
+
+SHORT = ["--set", "world.length=10", "--set", "world.width=6", "--set", "timeout=15"]
+
+
+def test_fly_leaves_what_it_promises(tmp_path, capsys):
+    """A short flight succeeds, prints its table, and leaves page, video, trajectory and summary."""
+    out = tmp_path / "flight"
+    graph = tmp_path / "diagram.dot"
+    assert main(["fly", "--out", str(out), "--seed", "2", "--graphviz", str(graph), *SHORT]) == 0
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert set(summary) == {
+        "outcome",
+        "flight_time_s",
+        "path_length_m",
+        "mean_speed_m_s",
+        "min_clearance_m",
+        "real_time_factor",
+        "render_ms",
+    }
+    assert summary["outcome"] == "goal"
+    assert summary["min_clearance_m"] > 0
+    printed = capsys.readouterr().out
+    for text in ("outcome", "goal", "minimum clearance", "real-time factor", str(out)):
+        assert text in printed
+
+    trajectory = np.load(out / "trajectory.npz")
+    assert trajectory["states"].shape == (len(trajectory["times"]), 13)
+    assert trajectory["times"][-1] == summary["flight_time_s"]
+
+    video = cv2.VideoCapture(str(out / "flight.mp4"))
+    frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    assert frames == int(summary["flight_time_s"] * 15 + 1e-6) + 1
+    ok, frame = video.read()
+    assert ok
+    assert frame.shape == (240, 640, 3)
+    assert frame[:, :320].std() > 20  # Not one colour: a picture of something,
+    assert frame[:, 320:].std() > 20  # and a depth picture beside it.
+
+    page = (out / "flight.html").read_text()
+    assert "<html" in page.lower()
+    assert "digraph" in graph.read_text()
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
+
+
+def test_written_scenario_gives_the_same_flight_again(tmp_path):
+    """Flying the scenario.yaml that a flight left repeats its trajectory byte for byte."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(["fly", "--out", str(first), "--seed", "5", *SHORT, "--set", "timeout=2"]) == 0
+    again = ["fly", "--scenario", str(first / "scenario.yaml"), "--out", str(second)]
+    assert main(again) == 0
+    trajectories = [(folder / "trajectory.npz").read_bytes() for folder in (first, second)]
+    assert trajectories[0] == trajectories[1]
+
+
+def fails(arguments: list[str], capsys) -> str:
+    """The one message with which a command that must fail fails."""
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("flysplat: ")
+    assert "Traceback" not in error
+    return error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "goal=[100, 0, 2]"], "goal [100.0, 0.0, 2.0] is outside the world"),
+        (["--set", "start=[1.5, 0, -1]"], "start [1.5, 0.0, -1.0] is"),
+        (["--set", "start=[1.5, 0, 0.2]"], "0.200 m from the nearest surface"),
+        (["--set", "camera.focal=!FocalLength {x: 0}"], "they must be positive"),
+        (["--set", "worl.length=3"], "did you mean world"),
+        (["--set", "world.spacing=0.5"], "spacing"),
+        (["--scenario", "nowhere.yaml"], "nowhere.yaml: there is no such"),
+        (["--scene", "nowhere"], "nowhere"),
+        (["--seed", "-1"], "seed"),
+    ],
+)
+def test_bad_input_is_one_message_and_nothing_written(arguments, message, tmp_path, capsys):
+    """Every user error ends with one message, exit status 1 and an output folder without files."""
+    out = tmp_path / "out"
+    assert message in fails(["fly", "--out", str(out), *arguments], capsys)
+    assert not out.exists() or not list(out.iterdir())
+
+
+def test_foreign_scene_is_refused(tmp_path, capsys):
+    """A PLY that is no Gaussian scene, and a folder that is no scene, are refused by name."""
+    ply = tmp_path / "mesh.ply"
+    ply.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    assert str(ply) in fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
+    ply.write_bytes(b"\x00\x01 this is not a PLY")
+    assert str(ply) in fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    assert "folder" in fails(["fly", "--scene", str(folder), "--out", str(tmp_path / "o")], capsys)
+
+
+def test_unwritable_output_folder_is_refused_before_flying(tmp_path, capsys):
+    """An output folder that cannot be made is named, with the remedy, before anything is flown."""
+    (tmp_path / "file").write_text("")
+    error = fails(["fly", "--out", str(tmp_path / "file" / "out")], capsys)
+    assert "file/out" in error
+    assert "--out" in error
+
+
+def test_reconstruct_without_capture_is_refused(tmp_path, capsys):
+    """A capture that is not there is named."""
+    missing = str(tmp_path / "capture")
+    error = fails(["reconstruct", missing, "--out", str(tmp_path / "scene")], capsys)
+    assert missing in error
+    assert not (tmp_path / "scene").exists()

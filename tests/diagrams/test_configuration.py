@@ -1,0 +1,87 @@
+"""Configurations from YAML and from the command line."""
+
+import pytest
+
+from flysplat.diagrams.configuration import dump_config, load_config
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.make_world import SceneConfig
+
+
+def test_file_and_overrides_set_only_what_they_name(tmp_path):
+    """Overrides come after the file, the file after the defaults, and nothing else changes."""
+    path = tmp_path / "scenario.yaml"
+    path.write_text("timeout: 9\nworld: {spacing: 2.5}\npolicy: {lattice: {speed: 3.0}}\n")
+    scenario = load_config(
+        Scenario(seed=4), path, ["policy.lattice.speed=4", "goal=[1, 2, 3]", "camera.fps=30"]
+    )
+    assert (scenario.seed, scenario.timeout, scenario.world.spacing) == (4, 9.0, 2.5)
+    assert scenario.world.width == Scenario().world.width
+    assert scenario.policy.lattice.speed == 4.0
+    assert scenario.policy.rate == Scenario().policy.rate
+    assert scenario.goal == [1.0, 2.0, 3.0]
+    assert (scenario.camera.fps, scenario.camera.width) == (30.0, 320)
+
+
+def test_dumped_scenario_loads_as_itself(tmp_path):
+    """A dumped scenario, of another kind of world too, loads into an equal scenario."""
+    scenario = Scenario(seed=7, world=SceneConfig(path="some/where"), start=[1.0, 2.0, 3.0])
+    path = tmp_path / "scenario.yaml"
+    path.write_text(dump_config(scenario))
+    loaded = load_config(Scenario(), path)
+    assert loaded.world == scenario.world
+    assert dump_config(loaded) == dump_config(scenario)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("wrld.spacing=3", r"'wrld.spacing=3': .*\['wrld'\].*did you mean world"),
+        ("policy.lattice.sped=3", r"\['sped'\].*did you mean .*speed"),
+        ("camera.fpss=3", r"\['fpss'\].*did you mean fps"),
+        ("qqqqqq=3", r"\['qqqqqq'\].*the fields are .*timeout"),
+        ("timeout=soon", "'timeout=soon': .*soon"),
+        ("timeout", "'timeout' has no value; write FIELD=VALUE"),
+        ("goal=[1, 2", "'goal=.1, 2' is not YAML"),
+    ],
+)
+def test_bad_override_is_named(override, message):
+    """An unknown field, a value of another type and broken YAML name the override and the field."""
+    with pytest.raises(ValueError, match=message):
+        load_config(Scenario(), overrides=[override])
+
+
+def test_bad_file_is_named(tmp_path):
+    """Errors in a file name the file; so does its absence."""
+    path = tmp_path / "scenario.yaml"
+    with pytest.raises(FileNotFoundError, match=r"scenario.yaml: there is no such"):
+        load_config(Scenario(), path)
+    path.write_text("timout: 3\n")
+    with pytest.raises(ValueError, match=r"scenario.yaml: .*'timout'.*did you mean timeout"):
+        load_config(Scenario(), path)
+    path.write_text("timeout: [\n")
+    with pytest.raises(ValueError, match=r"scenario.yaml is not YAML"):
+        load_config(Scenario(), path)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("timeout=0", "timeout is 0.0; it must be positive"),
+        ("goal_radius=-1", "goal_radius is -1.0; it must be positive"),
+        ("start_radius=-1", "start_radius is -1.0; it must not be negative"),
+        ("start=[1, 2]", r"start is \[1.0, 2.0\]; it must be three numbers"),
+        ("camera.width=0", "camera is 0x240 pixels"),
+        ("camera.fps=0", "camera.fps is 0.0; it must be positive"),
+        ("camera.focal=!FocalLength {x: 0}", "camera.focal gives focal lengths of .*positive"),
+        ("camera.lcm_bus=other", "camera.lcm_bus is 'other', but a splat camera ignores it"),
+    ],
+)
+def test_scenario_refuses_what_cannot_be_flown(override, message):
+    """Values out of range are refused by field, value and limit."""
+    with pytest.raises(ValueError, match=message):
+        load_config(Scenario(), overrides=[override]).validate()
+
+
+def test_default_scenario_is_valid():
+    """The defaults can be flown."""
+    Scenario().validate()

@@ -1,0 +1,164 @@
+"""One flight: how it starts, how it ends, and that it repeats."""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from flysplat.diagrams.flight import Outcome, flight_outcome, fly, sample_initial_state
+from flysplat.diagrams.flight_diagram import BuildFlightDiagram
+from flysplat.diagrams.scenario import Scenario
+from flysplat.systems.policies.hypotheses import Hypotheses
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+
+
+def test_flies_round_the_post_to_the_goal(post_world):
+    """The flight reaches the goal, clears the post by the recorded clearance, and its figures agree
+    with its samples.
+    """
+    scenario = Scenario(timeout=20.0)
+    seen = []
+    flight = fly(
+        BuildFlightDiagram(scenario, post_world), scenario, post_world, progress=seen.append
+    )
+    assert flight.outcome == Outcome.GOAL
+    assert np.linalg.norm(flight.states[-1, :3] - post_world.p_WG) <= scenario.goal_radius
+    post_distance = np.linalg.norm(flight.states[:, :2] - [5.0, 0.0], axis=1) - 0.5
+    assert flight.clearances.min() == pytest.approx(post_distance.min() - VEHICLE_RADIUS, abs=1e-6)
+    assert flight.clearances.min() > 0
+    assert np.all(np.diff(flight.times) > 0)
+    assert seen[-1] == flight.times[-1]
+
+    summary = flight.summary()
+    assert summary["outcome"] == "goal"
+    assert summary["flight_time_s"] == flight.times[-1]
+    # At least the way there, and 0.1 m of start_radius and 0.3 m of goal_radius less.
+    assert 7.6 < summary["path_length_m"] < 12.0
+    assert summary["mean_speed_m_s"] == pytest.approx(
+        summary["path_length_m"] / summary["flight_time_s"]
+    )
+    assert summary["real_time_factor"] == pytest.approx(flight.times[-1] / flight.wall_time)
+
+
+def test_plans_are_recorded_as_flown(post_world):
+    """Every recorded plan after the first instant is a set of hypotheses made from a recorded
+    position.
+    """
+    scenario = Scenario(timeout=1.0)
+    flight = fly(BuildFlightDiagram(scenario, post_world), scenario, post_world)
+    num_hypotheses = scenario.policy.lattice.num_hypotheses
+    plans = [Hypotheses.from_vector(row, num_hypotheses) for row in flight.hypotheses]
+    assert plans[0] is None
+    for plan in plans[1:]:
+        assert plan is not None
+        nearest = np.argmin(np.abs(flight.times - plan.plan_time))
+        offset = plan.X_WB.translation() - flight.states[nearest, :3]
+        assert np.linalg.norm(offset) <= 0.02 * 2.5  # At most half a log period at top speed.
+
+
+@pytest.mark.parametrize(
+    ("p_WB", "outcome"),
+    [
+        ([5.0, 0.5 + VEHICLE_RADIUS - 0.01, 2.0], Outcome.COLLISION),
+        ([5.0, 0.5 + VEHICLE_RADIUS + 0.01, 2.0], None),
+        ([9.0, 0.0, 2.29], Outcome.GOAL),
+        ([9.0, 0.0, 2.31], None),
+        ([-0.01, 0.0, 2.0], Outcome.LEFT_VOLUME),
+        ([1.0, 0.0, 4.01], Outcome.LEFT_VOLUME),
+    ],
+)
+def test_outcome_at_an_instant(post_world, p_WB, outcome):
+    """Touching the post at the vehicle's radius, nearing the goal and leaving the box end a flight,
+    to the centimetre.
+    """
+    scenario = Scenario()
+    diagram = BuildFlightDiagram(scenario, post_world)
+    context = diagram.CreateDefaultContext()
+    plant = diagram.GetSubsystemByName("plant")
+    plant.GetMyMutableContextFromRoot(context).SetContinuousState(hover_state(p_WB))
+    assert flight_outcome(diagram, context, post_world.p_WG, scenario.goal_radius) == outcome
+
+
+def test_collision_ends_the_flight(post_world):
+    """A planner that is shown an empty hall flies into the post, and the flight ends there."""
+    nothing = np.full_like(post_world.esdf.distances, 5.0)
+    empty = dataclasses.replace(
+        post_world.esdf, distances=nothing, states=np.zeros(nothing.shape, np.uint8)
+    )
+    world = dataclasses.replace(post_world, esdf=empty)
+    scenario = Scenario(start_radius=0.0)
+    flight = fly(BuildFlightDiagram(scenario, world), scenario, world)
+    assert flight.outcome == Outcome.COLLISION
+    assert -0.1 < flight.clearances[-1] < 0
+    assert flight.clearances[:-1].min() >= 0
+
+
+def test_timeout_ends_the_flight(post_world):
+    """A flight that has not arrived ends at the timeout."""
+    scenario = Scenario(timeout=0.5)
+    flight = fly(BuildFlightDiagram(scenario, post_world), scenario, post_world)
+    assert flight.outcome == Outcome.TIMEOUT
+    assert flight.times[-1] == pytest.approx(0.5)
+
+
+def test_start_is_drawn_from_the_seed(post_world):
+    """The start is the same for one seed, differs for another, and stays within its radius, level
+    and facing the goal.
+    """
+    states = [sample_initial_state(Scenario(seed=seed), post_world) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(states[0], states[1])
+    assert np.any(states[0] != states[2])
+    for state in states:
+        assert np.linalg.norm(state[:3] - post_world.p_WS) <= 0.1
+        assert np.all(state[3:6] == 0)
+        assert abs(state[9]) < 0.02  # Facing the goal along +x.
+
+
+@pytest.mark.parametrize(
+    ("field", "point", "message"),
+    [
+        ("start", [5.0, 0.0, 2.0], r"start \[5.0, 0.0, 2.0\] is -0.500 m from the nearest surface"),
+        ("start", [5.0, 0.8, 2.0], r"0.300 m from the nearest surface.*radius is 0.354 m"),
+        ("goal", [11.0, 0.0, 2.0], r"goal \[11.0, 0.0, 2.0\] is outside the world.*\[10.0, 3.0"),
+    ],
+)
+def test_start_and_goal_need_room(post_world, field, point, message):
+    """A start or goal in an obstacle, too near to one or outside is refused with its position."""
+    with pytest.raises(ValueError, match=message):
+        sample_initial_state(Scenario(**{field: point}), post_world)
+
+
+def test_same_seed_gives_the_same_bits_in_two_processes():
+    """Two processes that fly the default scenario for three seconds leave identical samples."""
+    script = (
+        "import hashlib; from flysplat.diagrams.scenario import Scenario;"
+        "from flysplat.diagrams.flight import fly;"
+        "from flysplat.diagrams.flight_diagram import BuildFlightDiagram;"
+        "from flysplat.diagrams.worlds.make_world import make_world;"
+        "s = Scenario(seed=3, timeout=3.0); w = make_world(s.world, s.seed);"
+        "f = fly(BuildFlightDiagram(s, w, video=True), s, w);"
+        "print(len(f.times), *(hashlib.sha256(a.tobytes()).hexdigest()"
+        " for a in (f.times, f.states, f.commands, f.clearances, f.hypotheses)))"
+    )
+    outputs = {
+        subprocess.run(
+            [sys.executable, "-c", script], check=True, capture_output=True, text=True
+        ).stdout
+        for _ in range(2)
+    }
+    assert len(outputs) == 1
+    samples, *digests = outputs.pop().split()
+    assert int(samples) >= 150
+    assert hashlib.sha256(b"").hexdigest() not in digests
+
+
+def test_flight_path_does_not_import_torch():
+    """What `flysplat fly` imports does not load torch, which would cost every user seconds."""
+    script = (
+        "import sys; import flysplat.diagrams.fly, flysplat.analysis.cli;"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0

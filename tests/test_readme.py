@@ -1,0 +1,21 @@
+"""The README's own code."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_python_code_flies():
+    """The README's Python builds a diagram in fewer than 30 lines that flies to its goal and sees."""
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert sum(bool(line.strip()) for line in blocks[0].splitlines()) < 30
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    p_WS, p_WG = names["world"].p_WS, names["world"].p_WG
+    assert np.linalg.norm(names["p_WB"] - p_WG) < 0.5 * np.linalg.norm(p_WS - p_WG)
+    assert names["image"].shape == (240, 320, 4)
+    assert names["image"][..., :3].std() > 20
