@@ -9,7 +9,7 @@ README = Path(__file__).parents[1] / "README.md"
 
 
 def test_python_code_flies():
-    """The README's Python builds a diagram in fewer than 30 lines that flies to its goal and sees."""
+    """The Python there builds a diagram in fewer than 30 lines, flies to its goal and sees."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert sum(bool(line.strip()) for line in blocks[0].splitlines()) < 30
     names: dict = {}

@@ -1,12 +1,13 @@
 """The file format `esdf.npz`: a compressed numpy archive with a version number."""
 
-import os
 import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from flysplat.systems.files import written_atomically
 
 FORMAT_VERSION = 1
 
@@ -35,22 +36,16 @@ def write_esdf_arrays(
     Raises:
       OSError: if the folder is missing or not writable.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            np.savez_compressed(
-                file,
-                version=np.int64(FORMAT_VERSION),
-                distances=distances,
-                states=states,
-                lower_W=lower_W,
-                voxel_size=np.float64(voxel_size),
-                occupied_outside=np.bool_(occupied_outside),
-            )
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with written_atomically(Path(path)) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            version=np.int64(FORMAT_VERSION),
+            distances=distances,
+            states=states,
+            lower_W=lower_W,
+            voxel_size=np.float64(voxel_size),
+            occupied_outside=np.bool_(occupied_outside),
+        )
 
 
 def read_esdf_arrays(path: str | Path) -> dict[str, Any]:

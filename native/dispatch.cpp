@@ -1,0 +1,48 @@
+#include "dispatch.hpp"
+
+#include <stdexcept>
+
+namespace flysplat {
+namespace {
+
+std::vector<const Kernels*> usable_kernels() {
+  std::vector<const Kernels*> usable;
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  const bool v2 = __builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt");
+  const bool v3 = v2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                  __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2");
+  const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                  __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+                  __builtin_cpu_supports("avx512vl");
+  if (v4) usable.push_back(&kernels_v4());
+  if (v3) usable.push_back(&kernels_v3());
+  if (v2) usable.push_back(&kernels_v2());
+#else
+  usable.push_back(&kernels_generic());
+#endif
+  return usable;
+}
+
+}  // namespace
+
+std::vector<std::string> simd_levels() {
+  std::vector<std::string> names;
+  for (const Kernels* k : usable_kernels()) names.emplace_back(k->name);
+  return names;
+}
+
+const Kernels& kernels(const std::string& level) {
+  const std::vector<const Kernels*> usable = usable_kernels();
+  if (usable.empty()) throw std::invalid_argument("flysplat needs a CPU with SSE 4.2");
+  if (level.empty()) return *usable.front();
+  std::string names;
+  for (const Kernels* k : usable) {
+    if (level == k->name) return *k;
+    names += names.empty() ? k->name : std::string(", ") + k->name;
+  }
+  throw std::invalid_argument("SIMD level '" + level + "' is not available here; choose one of " +
+                              names + " (FLYSPLAT_SIMD or the argument simd)");
+}
+
+}  // namespace flysplat

@@ -1,0 +1,36 @@
+// The kernels of one SIMD level; compiled once per level with FLYSPLAT_LEVEL set to its name.
+#include "project_arrays.hpp"
+#include "project_baked.hpp"
+#include "raster.hpp"
+#include "tiles.hpp"
+
+namespace flysplat {
+namespace FLYSPLAT_LEVEL {
+
+static size_t first_nonfinite(const float* values, size_t count) {
+  size_t i = 0;
+  constexpr size_t kStride = 64 * kLanes;
+  for (; i + kStride <= count; i += kStride) {
+    // v * 0 is 0 for finite v and NaN otherwise, and NaN stays in a sum.
+    F16 sum = F16(0.0f);
+    for (size_t k = 0; k < kStride; k += kLanes) sum += load(values + i + k) * F16(0.0f);
+    if (lane_bits(sum >= F16(0.0f)) != 0xffff) break;
+  }
+  for (; i < count; ++i) {
+    if (!__builtin_isfinite(values[i])) return i;
+  }
+  return count;
+}
+
+#define FS_STRING_OF(name) #name
+#define FS_STRING(name) FS_STRING_OF(name)
+static const Kernels kTable = {FS_STRING(FLYSPLAT_LEVEL), project_arrays, project_baked,
+                               bin_splats, raster_tile, first_nonfinite};
+
+}  // namespace FLYSPLAT_LEVEL
+
+#define FS_JOIN_OF(a, b) a##b
+#define FS_JOIN(a, b) FS_JOIN_OF(a, b)
+const Kernels& FS_JOIN(kernels_, FLYSPLAT_LEVEL)() { return FLYSPLAT_LEVEL::kTable; }
+
+}  // namespace flysplat

@@ -1,0 +1,89 @@
+// Projection of baked scenes: boxes of neighbouring Gaussians are culled together, and what is left
+// is read straight as packs.
+#pragma once
+
+#include "projection.hpp"
+
+namespace flysplat::FLYSPLAT_LEVEL {
+
+// Whether boxes of Gaussians may touch the image, for the 16 boxes of one bound group.
+FS_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera, size_t group) {
+  const float* bounds = scene.bounds + group * 7 * kLanes;
+  const Vector16 p_C = to_camera(
+      camera, from_centre(camera, load(bounds), load(bounds + kLanes), load(bounds + 2 * kLanes)));
+  const F16 half[3] = {load(bounds + 3 * kLanes), load(bounds + 4 * kLanes),
+                       load(bounds + 5 * kLanes)};
+  const F16 largest_scale = load(bounds + 6 * kLanes);
+  const float* R = camera.R_CW;
+  // How far the box reaches along a direction n given in the camera frame.
+  const auto reach_along = [&](const float n[3]) {
+    F16 sum = F16(0.0f);
+    for (int axis = 0; axis < 3; ++axis) {
+      sum += F16(__builtin_fabsf(n[0] * R[axis] + n[1] * R[3 + axis] + n[2] * R[6 + axis])) *
+             half[axis];
+    }
+    return sum;
+  };
+  const float forward[3] = {0.0f, 0.0f, 1.0f};
+  const F16 depth_reach = reach_along(forward);
+  Mask16 visible = (p_C.z + depth_reach >= F16(camera.near_plane)) &
+                   (p_C.z - depth_reach <= F16(camera.far_plane));
+  for (int side = 0; side < 4; ++side) {
+    const F16 reach = reach_along(camera.side_normal[side]) +
+                      F16(camera.side_reach[side]) * largest_scale;
+    visible = visible & (dot(camera.side_normal[side], p_C) + reach > F16(0.0f));
+  }
+  return lane_bits(visible);
+}
+
+FS_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
+                                     Splat* splats, uint32_t* depth_bits) {
+  const float* geometry = scene.geometry + group * 10 * kLanes;
+  const auto field = [&](int f) { return load(geometry + f * kLanes); };
+  const Vector16 d_W = from_centre(camera, field(0), field(1), field(2));
+  const Vector16 p_C = to_camera(camera, d_W);
+  if (!any(in_depth_range(camera, p_C.z))) return 0;
+  const F16 inverse_z = F16(1.0f) / p_C.z;
+  Vector16 m[2], p[2];
+  projection_rows(camera, p_C, inverse_z, m);
+  for (int i = 0; i < 2; ++i) {  // p = m L with L lower triangular
+    p[i] = {m[i].x * field(3) + m[i].y * field(4) + m[i].z * field(6),
+            m[i].y * field(5) + m[i].z * field(7), m[i].z * field(8)};
+  }
+  SplatPack pack;
+  const uint32_t bits =
+      lane_bits(finish_projection(camera, p_C, inverse_z, p[0], p[1], field(9), pack));
+  if (!bits) return 0;
+
+  F16 color[3];
+  const int coefficients = (scene.sh_degree + 1) * (scene.sh_degree + 1);
+  const float* colors = scene.colors + group * (3 * coefficients) * kLanes;
+  if (scene.sh_degree == 0) {
+    for (int c = 0; c < 3; ++c) color[c] = load(colors + c * kLanes);
+  } else {
+    evaluate_sh(scene.sh_degree, colors, d_W.x, d_W.y, d_W.z, color);
+  }
+  uint32_t indices[kLanes];
+  for (int i = 0; i < kLanes; ++i) indices[i] = static_cast<uint32_t>(group * kLanes + i);
+  return append_splats(pack, color, bits, indices, splats, depth_bits);
+}
+
+// begin and end count Gaussians and are multiples of the chunk size, or the scene's end.
+inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size_t begin,
+                            size_t end, Splat* splats, uint32_t* depth_bits) {
+  constexpr size_t kGroupsPerBox = kBoundSize / kLanes;
+  const size_t last_group = end / kLanes;
+  size_t count = 0;
+  for (size_t box = begin / kBoundSize; box * kGroupsPerBox < last_group; box += kLanes) {
+    uint32_t boxes = visible_boxes(scene, camera, box / kLanes);
+    for (; boxes; boxes &= boxes - 1) {
+      const size_t first = (box + __builtin_ctz(boxes)) * kGroupsPerBox;
+      for (size_t group = first; group < first + kGroupsPerBox && group < last_group; ++group) {
+        count += project_baked_group(scene, camera, group, splats + count, depth_bits + count);
+      }
+    }
+  }
+  return count;
+}
+
+}  // namespace flysplat::FLYSPLAT_LEVEL

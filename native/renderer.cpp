@@ -1,0 +1,177 @@
+#include "renderer.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "dispatch.hpp"
+
+namespace flysplat {
+
+Camera make_camera(const CameraParameters& p) {
+  Camera c{};
+  c.width = p.width;
+  c.height = p.height;
+  const double fx = p.K[0], cx = p.K[2], fy = p.K[4], cy = p.K[5];
+  c.fx = static_cast<float>(fx);
+  c.fy = static_cast<float>(fy);
+  c.cx = static_cast<float>(cx);
+  c.cy = static_cast<float>(cy);
+  c.near_plane = static_cast<float>(p.near_plane);
+  c.far_plane = static_cast<float>(p.far_plane);
+  // A splat is clipped when its radius, rounded up, does not exceed the limit.
+  c.radius_clip = static_cast<float>(std::floor(p.radius_clip));
+  c.eps2d = static_cast<float>(p.eps2d);
+
+  // centre = -R^-1 t by cofactors: R may be a rotation only to single precision.
+  double R[3][3], t[3];
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      R[i][j] = p.X_CW[4 * i + j];
+      c.R_CW[3 * i + j] = static_cast<float>(R[i][j]);
+    }
+    t[i] = p.X_CW[4 * i + 3];
+  }
+  double cofactor[3][3], det = 0.0;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      const int i1 = (i + 1) % 3, i2 = (i + 2) % 3, j1 = (j + 1) % 3, j2 = (j + 2) % 3;
+      cofactor[i][j] = R[i1][j1] * R[i2][j2] - R[i1][j2] * R[i2][j1];
+    }
+  }
+  for (int j = 0; j < 3; ++j) det += R[0][j] * cofactor[0][j];
+  for (int j = 0; j < 3; ++j) {
+    double centre = 0.0;
+    for (int i = 0; i < 3; ++i) centre -= cofactor[i][j] * t[i] / det;
+    c.centre_high[j] = static_cast<float>(centre);
+    c.centre_low[j] = static_cast<float>(centre - c.centre_high[j]);
+  }
+
+  // The slopes x/z and y/z that enter the Jacobian stay within the image plus 15 % of its size.
+  const double margin_x = 0.15 * p.width / fx, margin_y = 0.15 * p.height / fy;
+  const double min_x = -cx / fx - margin_x, max_x = (p.width - cx) / fx + margin_x;
+  const double min_y = -cy / fy - margin_y, max_y = (p.height - cy) / fy + margin_y;
+  c.min_slope_x = static_cast<float>(min_x);
+  c.max_slope_x = static_cast<float>(max_x);
+  c.min_slope_y = static_cast<float>(min_y);
+  c.max_slope_y = static_cast<float>(max_y);
+
+  // |J_x| <= fx / z sqrt(1 + slope^2), so the extent is at most kMaxExtent (|J_x| s + sqrt(eps2d)):
+  // left of the image means fx x / z + cx + extent <= 0, which times z is linear. A pixel and 1 %
+  // are added for rounding.
+  const double steep_x = std::sqrt(1.0 + std::max(min_x * min_x, max_x * max_x));
+  const double steep_y = std::sqrt(1.0 + std::max(min_y * min_y, max_y * max_y));
+  const double blur = kMaxExtent * std::sqrt(p.eps2d) + 1.0;
+  const double sides[4][4] = {{fx, 0, cx + blur, fx * steep_x},
+                              {-fx, 0, p.width - cx + blur, fx * steep_x},
+                              {0, fy, cy + blur, fy * steep_y},
+                              {0, -fy, p.height - cy + blur, fy * steep_y}};
+  for (int side = 0; side < 4; ++side) {
+    for (int axis = 0; axis < 3; ++axis) {
+      c.side_normal[side][axis] = static_cast<float>(sides[side][axis]);
+    }
+    c.side_reach[side] = static_cast<float>(1.01 * kMaxExtent * sides[side][3]);
+  }
+  return c;
+}
+
+Renderer::Renderer(int threads, const std::string& simd_level)
+    : kernels_(flysplat::kernels(simd_level)), pool_(threads) {}
+
+void Renderer::render(const GaussianArrays& gaussians, const Camera& camera, const Image& image) {
+  project(gaussians.count, [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
+    return kernels_.project(gaussians, camera, begin, end, splats, depth_bits);
+  });
+  finish(camera, image);
+}
+
+void Renderer::render(const BakedArrays& scene, const Camera& camera, const Image& image) {
+  project(scene.groups * 16, [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
+    return kernels_.project_baked(scene, camera, begin, end, splats, depth_bits);
+  });
+  finish(camera, image);
+}
+
+void Renderer::for_each_splat(const std::function<void(const Splat&)>& visit) const {
+  for (size_t chunk = 0; chunk < chunk_counts_.size(); ++chunk) {
+    const Splat* first = splats_.data() + chunk * kChunkSize;
+    std::for_each(first, first + chunk_counts_[chunk], visit);
+  }
+}
+
+template <typename Project>
+void Renderer::project(size_t count, const Project& project) {
+  const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
+  chunk_counts_.resize(chunks);
+  if (splats_.size() < count) {
+    splats_.resize(count);
+    depth_bits_.resize(count);
+  }
+  pool_.for_each(chunks, [&](size_t chunk) {
+    const size_t begin = chunk * kChunkSize;
+    chunk_counts_[chunk] = project(begin, std::min(count, begin + kChunkSize),
+                                   splats_.data() + begin, depth_bits_.data() + begin);
+  });
+}
+
+// Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
+// consecutive ranges of the depth order, so the lists do not depend on how many there are.
+void Renderer::bin(int tiles_x, int tiles_y) {
+  const size_t tiles = static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y);
+  const size_t tasks = pool_.threads() == 1 ? 1 : 2 * static_cast<size_t>(pool_.threads());
+  const size_t visible = order_.size();
+  bin_tasks_.resize(tasks);
+  pool_.for_each(tasks, [&](size_t t) {
+    BinTask& task = bin_tasks_[t];
+    task.tile_counts.assign(tiles, 0);
+    task.count = 0;
+    const size_t end = visible * (t + 1) / tasks;
+    for (size_t i = visible * t / tasks; i < end;) {
+      i = kernels_.bin(splats_.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
+                       task.pairs.size(), &task.count, task.tile_counts.data());
+      if (i < end) task.pairs.resize(2 * task.pairs.size() + tiles + visible);
+    }
+  });
+
+  tile_offsets_.resize(tiles + 1);
+  uint32_t sum = 0;
+  for (size_t tile = 0; tile < tiles; ++tile) {
+    tile_offsets_[tile] = sum;
+    for (BinTask& task : bin_tasks_) {
+      const uint32_t count = task.tile_counts[tile];
+      task.tile_counts[tile] = sum;
+      sum += count;
+    }
+  }
+  tile_offsets_[tiles] = sum;
+  pairs_.resize(sum);
+  pool_.for_each(tasks, [&](size_t t) {
+    BinTask& task = bin_tasks_[t];
+    for (size_t i = 0; i < task.count; ++i) {
+      const TilePair& p = task.pairs[i];
+      pairs_[task.tile_counts[p.tile]++] = p.pair;
+    }
+  });
+}
+
+void Renderer::finish(const Camera& camera, const Image& image) {
+  items_.clear();
+  for (size_t chunk = 0; chunk < chunk_counts_.size(); ++chunk) {
+    const size_t first = chunk * kChunkSize;
+    for (size_t i = first; i < first + chunk_counts_[chunk]; ++i) {
+      items_.push_back({depth_bits_[i], static_cast<uint32_t>(i)});
+    }
+  }
+  radix_sort(items_, sort_scratch_);
+  order_.resize(items_.size());
+  for (size_t i = 0; i < items_.size(); ++i) order_[i] = items_[i].value;
+
+  const int tiles_x = (camera.width + kTileSize - 1) / kTileSize;
+  const int tiles_y = (camera.height + kTileSize - 1) / kTileSize;
+  bin(tiles_x, tiles_y);
+  const RasterInput input{splats_.data(),  pairs_.data(),  tile_offsets_.data(), camera.width,
+                          camera.height,   tiles_x,        image};
+  pool_.for_each(static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y),
+                 [&](size_t tile) { kernels_.raster_tile(input, static_cast<int>(tile)); });
+}
+
+}  // namespace flysplat

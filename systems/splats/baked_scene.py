@@ -1,0 +1,135 @@
+"""Rendering of scenes that do not change: the renderer of the flight path (numpy only, CPU)."""
+
+import os
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from flysplat import _native
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+    from pydrake.math import RigidTransform
+
+    from flysplat.systems.splats.gaussian_scene import GaussianScene
+
+EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gsplat
+
+
+class RenderedView(NamedTuple):
+    """What a pinhole camera sees of a scene, float32."""
+
+    color: "NDArray[np.float32]"  # (H, W, 3), over the background
+    depth: "NDArray[np.float32]"  # (H, W) [m] expected z: alpha-weighted mean; 0 where alpha is 0
+    alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
+
+
+def create_renderer(threads: int, simd: str = "") -> _native.Renderer:
+    """The native threads and scratch memory.
+
+    `simd` (default: the environment variable FLYSPLAT_SIMD, else the widest that the machine has)
+    is one of `flysplat._native.simd_levels()`.
+
+    Raises:
+        ValueError: `threads` is not a positive integer, or this machine lacks the SIMD level.
+    """
+    if not 1 <= int(threads) <= 1024:
+        raise ValueError(f"threads is {threads}; it must lie between 1 and 1024")
+    return _native.Renderer(int(threads), simd or os.environ.get("FLYSPLAT_SIMD", ""))
+
+
+def check_camera(K: "ArrayLike", width: int, height: int, near: float, far: float) -> np.ndarray:
+    """Returns `K` as a (3, 3) float64 array, or raises ValueError naming what is wrong."""
+    K = np.asarray(K, dtype=np.float64)
+    if K.shape != (3, 3):
+        raise ValueError(f"K has shape {K.shape}; it must be the 3x3 matrix of intrinsics [px]")
+    if not np.all(np.isfinite(K)):
+        raise ValueError(f"K has a NaN or infinite entry: {K.tolist()}")
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise ValueError(
+            f"focal lengths K[0, 0] = {K[0, 0]:g}, K[1, 1] = {K[1, 1]:g} must be positive [px]"
+        )
+    if not (0 < width <= 32768 and 0 < height <= 32768):
+        raise ValueError(f"image size is {width} x {height}; both must lie between 1 and 32768")
+    if not 0 < near < far:
+        raise ValueError(f"depth range is {near:g} to {far:g} m; it must satisfy 0 < near < far")
+    return K
+
+
+class BakedScene:
+    """A Gaussian scene prepared for fast repeated rendering.
+
+    Baking reorders the Gaussians so that neighbours in space are neighbours in memory (Morton
+    order), factors their covariances and bounds groups of them with boxes; each frame then skips
+    whole groups and starts from what is precomputed. Images agree with `rasterize` up to rounding,
+    except that Gaussians of exactly equal depth blend in Morton order.
+
+    The same scene, camera and size give the same bits, for any number of threads. Several Python
+    threads may call `render` at once; they take turns.
+    """
+
+    def __init__(self, scene: "GaussianScene", threads: int = 1, simd: str = ""):
+        """Bakes `scene`, of which no reference is kept.
+
+        Raises:
+            ValueError: see `create_renderer`.
+        """
+        self._renderer = create_renderer(threads, simd)
+        coefficients = scene.sh.shape[1]
+        self._scene = _native.BakedScene(
+            np.ascontiguousarray(scene.means, dtype=np.float32),
+            np.ascontiguousarray(scene.quats, dtype=np.float32),
+            np.ascontiguousarray(scene.scales, dtype=np.float32),
+            np.ascontiguousarray(scene.opacities, dtype=np.float32),
+            np.ascontiguousarray(scene.sh, dtype=np.float32),
+            {1: 0, 4: 1, 9: 2, 16: 3}[coefficients],
+        )
+
+    def render(
+        self,
+        K: "ArrayLike",
+        width: int,
+        height: int,
+        X_WC: "RigidTransform",
+        near: float = 0.01,
+        far: float = 1e10,
+        background: "ArrayLike" = (0.0, 0.0, 0.0),
+    ) -> RenderedView:
+        """Renders colour, expected depth and alpha.
+
+        Args:
+            K: (3, 3) pinhole intrinsics [px]; skew is ignored. Pixel (i, j) has its centre at
+                (i + 1/2, j + 1/2).
+            width: Image width [px].
+            height: Image height [px].
+            X_WC: Pose of the camera (x right, y down, z forward) in the world.
+            near: Gaussians whose centre is nearer than this along z are left out [m].
+            far: The same for those farther away [m].
+            background: (3,) colour behind everything.
+
+        Raises:
+            ValueError: intrinsics, image size, depth range or background make no sense.
+        """
+        K = check_camera(K, width, height, near, far)
+        background = np.ascontiguousarray(background, dtype=np.float32)
+        if background.shape != (3,) or not np.all(np.isfinite(background)):
+            raise ValueError(f"background is {background.tolist()}; it must be 3 finite numbers")
+        X_CW = np.ascontiguousarray(X_WC.inverse().GetAsMatrix4())
+        color = np.empty((height, width, 3), dtype=np.float32)
+        depth = np.empty((height, width, 1), dtype=np.float32)
+        alpha = np.empty((height, width, 1), dtype=np.float32)
+        self._scene.render(
+            self._renderer,
+            K,
+            X_CW,
+            width,
+            height,
+            near,
+            far,
+            EPS2D,
+            background,
+            color,
+            depth,
+            alpha,
+        )
+        return RenderedView(color, depth[..., 0], alpha[..., 0])

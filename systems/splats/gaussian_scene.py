@@ -1,0 +1,169 @@
+"""A place made of coloured 3D Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.systems.splats.spherical_harmonics import C0, degree_of, rotation_matrices
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianScene:
+    """N Gaussians in one frame, the world W unless said otherwise; all arrays float32, contiguous.
+
+    Gaussian i has the covariance R(quats[i]) diag(scales[i])^2 R(quats[i])^T about means[i], and
+    seen along the unit direction d (from camera to Gaussian) the colour
+    ``max(0, 0.5 + sum_k basis_k(d) sh[i, k])`` (see `spherical_harmonics`). Quaternions are
+    normalised on construction. Arrays that already are float32 and contiguous are shared, not
+    copied: scenes are held by reference, so do not write into them.
+
+    Raises:
+        ValueError: for arrays of the wrong shape or of different lengths, values that are not
+            finite, scales that are not positive, zero quaternions and opacities outside (0, 1].
+            The message names the array, the first bad index, its value and the remedy.
+    """
+
+    means: NDArray[np.float32]  # (N, 3) [m], centres
+    quats: NDArray[np.float32]  # (N, 4) wxyz, unit: orientation of the principal axes
+    scales: NDArray[np.float32]  # (N, 3) [m], standard deviations along the principal axes
+    opacities: NDArray[np.float32]  # (N,) in (0, 1]
+    sh: NDArray[np.float32]  # (N, K, 3), K in {1, 4, 9, 16}: coefficients of red, green, blue
+
+    def __post_init__(self):
+        shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (-1, 3)}
+        for name, shape in shapes.items():
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+            if array.ndim != 1 + len(shape) or any(
+                want not in (-1, have) for want, have in zip(shape, array.shape[1:], strict=True)
+            ):
+                expected = ", ".join(["N", *("K" if n == -1 else str(n) for n in shape)])
+                raise ValueError(
+                    f"{name} has shape {array.shape}, expected ({expected}): one row per Gaussian"
+                )
+            object.__setattr__(self, name, array)
+        lengths = {name: len(getattr(self, name)) for name in shapes}
+        if len(set(lengths.values())) > 1:
+            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise ValueError(
+                f"arrays of different lengths ({listed}): every Gaussian needs one row in each"
+            )
+        degree_of(self.sh.shape[1])
+
+        for name in shapes:
+            array = getattr(self, name)
+            _refuse(
+                ~np.isfinite(array),
+                name,
+                array,
+                "must be finite",
+                "remove this Gaussian or repair the file it comes from",
+            )
+        _refuse(
+            self.scales <= 0,
+            "scales",
+            self.scales,
+            "must be > 0 m",
+            "these are standard deviations; take the exponential of stored logarithms first",
+        )
+        _refuse(
+            (self.opacities <= 0) | (self.opacities > 1),
+            "opacities",
+            self.opacities,
+            "must be in (0, 1]",
+            "take the sigmoid of stored logits first, and remove invisible Gaussians",
+        )
+        norms = np.linalg.norm(self.quats.astype(np.float64), axis=1, keepdims=True)
+        _refuse(
+            norms[:, 0] < 1e-12,
+            "quats",
+            self.quats,
+            "must not be zero",
+            "use (1, 0, 0, 0) for no rotation",
+        )
+        if np.any(np.abs(norms - 1) > 1e-6):
+            object.__setattr__(self, "quats", (self.quats / norms).astype(np.float32))
+
+    @classmethod
+    def from_colors(
+        cls,
+        means: ArrayLike,
+        quats: ArrayLike,
+        scales: ArrayLike,
+        opacities: ArrayLike,
+        colors: ArrayLike,
+    ) -> GaussianScene:
+        """Builds a scene whose colours, (N, 3) in 0 to 1, are the same from every direction."""
+        sh = (np.asarray(colors, dtype=np.float64) - 0.5) / C0
+        return cls(means, quats, scales, opacities, sh[:, None, :])  # pyright: ignore[reportArgumentType]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return degree_of(self.sh.shape[1])
+
+    @property
+    def base_colors(self) -> NDArray[np.float32]:
+        """Colours without their dependence on direction, (N, 3), clipped to 0 to 1."""
+        return np.clip(0.5 + C0 * self.sh[:, 0], 0, 1)
+
+    def transformed_by(self, X_WO: RigidTransform) -> GaussianScene:
+        """Returns these Gaussians, standing in frame O, expressed in W."""
+        R_WO = X_WO.rotation().matrix()
+        sh = np.empty(self.sh.shape)
+        for l, matrix in enumerate(rotation_matrices(R_WO, self.sh_degree)):  # noqa: E741
+            band = slice(l * l, (l + 1) ** 2)
+            sh[:, band] = np.einsum("jk,nkc->njc", matrix, self.sh[:, band])
+        return GaussianScene(
+            means=(self.means @ R_WO.T + X_WO.translation()).astype(np.float32),
+            quats=_multiply(X_WO.rotation(), self.quats).astype(np.float32),
+            scales=self.scales,
+            opacities=self.opacities,
+            sh=sh.astype(np.float32),
+        )
+
+    def merged_with(
+        self, other: GaussianScene, X_WO: RigidTransform | None = None
+    ) -> GaussianScene:
+        """Returns this scene with `other`, whose frame O stands at `X_WO` (identity), put into it.
+
+        The result has the higher of the two degrees of spherical harmonics; the lower is padded
+        with zeros.
+        """
+        if X_WO is not None:
+            other = other.transformed_by(X_WO)
+        K = max(self.sh.shape[1], other.sh.shape[1])
+        merged = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in ("means", "quats", "scales", "opacities")
+        }
+        padded = [
+            np.pad(scene.sh, ((0, 0), (0, K - scene.sh.shape[1]), (0, 0)))
+            for scene in (self, other)
+        ]
+        return GaussianScene(**merged, sh=np.concatenate(padded))
+
+
+def _refuse(bad: NDArray, name: str, array: NDArray, limit: str, remedy: str) -> None:
+    """Raises ValueError for the first entry of `array` with a true value in `bad`."""
+    if not bad.any():
+        return
+    first = tuple(int(i) for i in np.argwhere(bad)[0])
+    rows = bad.reshape(len(bad), -1).any(axis=1)
+    raise ValueError(
+        f"{name}[{', '.join(map(str, first))}] = {array[first]} {limit} "
+        f"({rows.sum()} of {len(rows)} Gaussians are bad): {remedy}"
+    )
+
+
+def _multiply(R: RotationMatrix, quats: NDArray) -> NDArray[np.float64]:
+    """Returns the quaternions (N, 4) wxyz of R times the rotations `quats`."""
+    w, x, y, z = R.ToQuaternion().wxyz()
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return quats @ left.T

@@ -1,0 +1,285 @@
+"""Gaussian splatting with gsplat's interface: native kernels on the CPU, gsplat on CUDA."""
+
+import threading
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flysplat import _native
+from flysplat.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
+
+TILE_SIZE = 16  # [px]
+CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
+
+_scratch = (
+    threading.local()
+)  # one native renderer per thread and configuration, for its memory only
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = EPS2D,
+    sh_degree: int | None = None,
+    *,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    threads: int = 1,
+    simd: str = "",
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Renders N Gaussians into C pinhole cameras (Kerbl et al. 2023, with gsplat's conventions).
+
+    A Gaussian of colour c adds ``T a c`` to a pixel, where ``a = min(.99, o exp(-d^T S^-1 d / 2))``
+    and T is what those in front let through; S is its covariance projected by the Jacobian at its
+    centre, plus eps2d on the diagonal. Contributions with a < 1/255 are skipped, and a pixel is
+    finished before T would fall to 1e-4. Gaussians of equal depth blend in the order of the input.
+
+    Args:
+        means: (N, 3) centres [m].
+        quats: (N, 4) wxyz orientations, of any length but zero.
+        scales: (N, 3) standard deviations [m], positive.
+        opacities: (N,) in [0, 1].
+        colors: (N, 3) or (C, N, 3); with `sh_degree`, spherical-harmonic coefficients (N, K, 3) or
+            (C, N, K, 3), of which colours are ``max(0, 0.5 + sum_k Y_k c_k)``.
+        viewmats: (C, 4, 4) world to camera (x right, y down, z forward).
+        Ks: (C, 3, 3) intrinsics [px]; skew is ignored. Pixel centres lie at +1/2.
+        width: Image width [px].
+        height: Image height [px].
+        near_plane: Gaussians whose centre is nearer along z are left out [m].
+        far_plane: The same for those farther away [m].
+        radius_clip: Gaussians that reach no farther on the image are left out [px].
+        eps2d: Variance by which the pixel blurs every Gaussian [px^2].
+        sh_degree: Degree to evaluate, 0 to 3; None when `colors` are colours.
+        backgrounds: (C, 3) colours behind everything, black if None; depth has no background.
+        render_mode: "RGB"; "D", the accumulated depth sum w z [m]; "ED", the expected depth
+            sum w z / sum w; or "RGB+D", "RGB+ED".
+        threads: CPU threads; the result does not depend on it.
+        simd: See `create_renderer`.
+
+    Returns:
+        render_colors (C, H, W, X), X = 3, 1 or 4 by `render_mode`; render_alphas (C, H, W, 1);
+        and a dict on the M visible (camera, Gaussian) pairs, in that order, as gsplat's packed one:
+        camera_ids, gaussian_ids, depths, opacities (M,), radii, means2d (M, 2), conics (M, 3), and
+        width, height, tile_size, tile_width, tile_height, n_cameras.
+
+    Raises:
+        ValueError: a tensor has the wrong shape, dtype, device or values (the message names it),
+            or a CPU tensor requires a gradient.
+        ImportError: tensors are on a GPU and gsplat is not installed.
+    """
+    tensors = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+    }
+    if backgrounds is not None:
+        tensors["backgrounds"] = backgrounds
+    if render_mode not in CHANNELS:
+        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+    _check_shapes(tensors, sh_degree)
+    if means.device.type == "cuda":
+        return _gsplat().rasterization(
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            viewmats,
+            Ks,
+            width,
+            height,
+            near_plane=near_plane,
+            far_plane=far_plane,
+            radius_clip=radius_clip,
+            eps2d=eps2d,
+            sh_degree=sh_degree,
+            backgrounds=backgrounds,
+            render_mode=render_mode,
+        )
+    if means.device.type != "cpu":
+        raise ValueError(f"tensors are on {means.device}; move them to 'cpu' or 'cuda'")
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()):
+        names = ", ".join(name for name, t in tensors.items() if t.requires_grad)
+        raise ValueError(
+            f"gradients are not available on the CPU, but {names} require them; detach the tensors "
+            "or call under torch.no_grad()"
+        )
+
+    renderer = _renderer(threads, simd)
+    arrays = {
+        name: np.ascontiguousarray(tensor.detach().numpy()) for name, tensor in tensors.items()
+    }
+    _check_values(arrays, renderer)
+    for name, value in (("eps2d", eps2d), ("radius_clip", radius_clip)):
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} is {value}; it must be a finite number of pixels >= 0")
+    cameras = len(viewmats)
+    intrinsics = [check_camera(K, width, height, near_plane, far_plane) for K in arrays["Ks"]]
+    poses = arrays["viewmats"].astype(np.float64)
+    color_sets = arrays["colors"]
+    per_camera = color_sets.ndim == (3 if sh_degree is None else 4)
+    if sh_degree is None:
+        color_sets = color_sets[..., None, :]
+    black = np.zeros(3, dtype=np.float32)
+
+    render_colors = torch.empty((cameras, height, width, CHANNELS[render_mode]))
+    render_alphas = torch.empty((cameras, height, width, 1))
+    projected = []
+    for c in range(cameras):
+        renderer.render(
+            arrays["means"],
+            arrays["quats"],
+            arrays["scales"],
+            arrays["opacities"],
+            color_sets[c] if per_camera else color_sets,
+            -1 if sh_degree is None else sh_degree,
+            intrinsics[c],
+            poses[c],
+            width,
+            height,
+            near_plane,
+            far_plane,
+            radius_clip,
+            eps2d,
+            "ED" in render_mode,
+            arrays["backgrounds"][c] if backgrounds is not None else black,
+            render_colors[c].numpy(),
+            render_alphas[c].numpy(),
+        )
+        projected.append(renderer.projected())
+    return render_colors, render_alphas, _meta(projected, arrays["opacities"], width, height)
+
+
+def _meta(projected: list[tuple], opacities: np.ndarray, width: int, height: int) -> dict[str, Any]:
+    ids, radii, means2d, depths, conics = (
+        torch.from_numpy(np.concatenate(parts)) for parts in zip(*projected, strict=True)
+    )
+    return {
+        "camera_ids": torch.repeat_interleave(
+            torch.arange(len(projected)), torch.tensor([len(p[0]) for p in projected])
+        ),
+        "gaussian_ids": ids,
+        "radii": radii.int(),
+        "means2d": means2d,
+        "depths": depths,
+        "conics": conics,
+        "opacities": torch.from_numpy(opacities)[ids],
+        "width": width,
+        "height": height,
+        "tile_size": TILE_SIZE,
+        "tile_width": -(-width // TILE_SIZE),
+        "tile_height": -(-height // TILE_SIZE),
+        "n_cameras": len(projected),
+    }
+
+
+def _renderer(threads: int, simd: str) -> _native.Renderer:
+    renderers = _scratch.__dict__.setdefault("renderers", {})
+    if (threads, simd) not in renderers:
+        renderers[threads, simd] = create_renderer(threads, simd)
+    return renderers[threads, simd]
+
+
+def _gsplat():
+    try:
+        import gsplat  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            "rendering CUDA tensors needs gsplat, which is not installed: "
+            "pip install 'flysplat[cuda]', or move the tensors to the CPU"
+        ) from error
+    return gsplat
+
+
+def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None) -> None:
+    N = tensors["means"].shape[0] if tensors["means"].ndim else 0
+    C = tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
+    allowed: dict[str, tuple[tuple[int | str, ...], ...]] = {
+        "means": ((N, 3),),
+        "quats": ((N, 4),),
+        "scales": ((N, 3),),
+        "opacities": ((N,),),
+        "colors": ((N, 3), (C, N, 3)),
+        "viewmats": ((C, 4, 4),),
+        "Ks": ((C, 3, 3),),
+        "backgrounds": ((C, 3),),
+    }
+    if sh_degree is not None:
+        if sh_degree not in (0, 1, 2, 3):
+            raise ValueError(f"sh_degree is {sh_degree}; it must be 0, 1, 2, 3 or None")
+        allowed["colors"] = ((N, "K", 3), (C, N, "K", 3))
+    for name, tensor in tensors.items():
+        if not any(
+            len(shape) == tensor.ndim
+            and all(want in (have, "K") for want, have in zip(shape, tensor.shape, strict=True))
+            for shape in allowed[name]
+        ):
+            wanted = " or ".join("(" + ", ".join(map(str, s)) + ")" for s in allowed[name])
+            hint = "" if name != "colors" else f" with sh_degree={sh_degree}"
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it must be {wanted}{hint}")
+        if tensor.dtype != torch.float32:
+            raise ValueError(f"{name} is {tensor.dtype}; it must be torch.float32: use .float()")
+        if tensor.device != tensors["means"].device:
+            raise ValueError(
+                f"{name} is on {tensor.device} and means on {tensors['means'].device}; move them "
+                "to one device"
+            )
+    if C == 0:
+        raise ValueError("viewmats has shape (0, 4, 4); at least one camera is needed")
+    if sh_degree is not None and tensors["colors"].shape[-2] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"colors has {tensors['colors'].shape[-2]} coefficients; sh_degree={sh_degree} needs "
+            f"{(sh_degree + 1) ** 2}"
+        )
+
+
+def _check_values(arrays: dict[str, np.ndarray], renderer: _native.Renderer) -> None:
+    for name, array in arrays.items():
+        first = _native.first_nonfinite(array.reshape(-1), renderer)
+        if first >= 0:
+            raise _bad_value(name, array, first, "be finite")
+    limits = {
+        "scales": (lambda a: a <= 0, "be positive"),
+        "opacities": (lambda a: (a < 0) | (a > 1), "lie in [0, 1]"),
+    }
+    for name, (is_bad, requirement) in limits.items():
+        bad = is_bad(arrays[name])
+        if bad.any():
+            raise _bad_value(name, arrays[name], int(bad.argmax()), requirement)
+    quats = arrays["quats"]
+    first = _native.first_zero_quaternion(quats)
+    if first >= 0:
+        raise ValueError(
+            f"quats[{first}] is {quats[first].tolist()}, which cannot be normalised; use "
+            "(1, 0, 0, 0) for no rotation"
+        )
+    for c, X_CW in enumerate(arrays["viewmats"].astype(np.float64)):
+        R = X_CW[:3, :3]
+        error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(X_CW[3] - (0, 0, 0, 1)).max())
+        if error > 1e-3:
+            raise ValueError(
+                f"viewmats[{c}] is not a rigid transform: R R^T or the last row is off by "
+                f"{error:.3g}, more than 0.001"
+            )
+
+
+def _bad_value(name: str, array: np.ndarray, flat_index: int, requirement: str) -> ValueError:
+    index = np.unravel_index(flat_index, array.shape)
+    where = ", ".join(str(int(i)) for i in index)
+    return ValueError(f"{name}[{where}] is {array[index]:g}; it must {requirement}")

@@ -1,0 +1,190 @@
+"""Gaussian splatting in float64 torch, straight from the published equations, to test against.
+
+Written for clarity, not speed: covariances are multiplied out, every pixel sees every Gaussian
+whose generous bounding circle meets its tile, and everything is differentiable.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+ALPHA_CUT = 1 / 255
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
+TILE = 32  # [px]
+
+
+class Projection(NamedTuple):
+    """M visible Gaussians on the image plane, nearest first."""
+
+    mean: Tensor  # (M, 2) [px]
+    covariance: Tensor  # (M, 2, 2) [px^2]
+    depth: Tensor  # (M,) [m]
+    ids: Tensor  # (M,) in the input
+
+
+class Reference(NamedTuple):
+    color: Tensor  # (H, W, 3)
+    depth: Tensor  # (H, W) accumulated
+    alpha: Tensor  # (H, W)
+    margin: Tensor  # (H, W) least relative distance of an alpha or a T to the threshold it met
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """(N, 4) wxyz of any length -> (N, 3, 3)."""
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def sh_basis(degree: int, directions: Tensor) -> Tensor:
+    """Real spherical harmonics (N, (degree + 1)^2) of unit `directions` (N, 3).
+
+    Y_l^m = N_lm (-1)^m P_l^(m)(z) (x + i y)^m, with P_l^(m) the m-th derivative of the Legendre
+    polynomial of degree l; real parts for m >= 0, imaginary parts of Y_l^|m| for m < 0.
+    """
+    x, y, z = directions.unbind(1)
+    columns = []
+    for l in range(degree + 1):  # noqa: E741
+        legendre = np.polynomial.legendre.Legendre.basis(l).convert(kind=np.polynomial.Polynomial)
+        bands = {}
+        for m in range(l + 1):
+            derivative = legendre.deriv(m) if m else legendre
+            value = sum(c * z**k for k, c in enumerate(derivative.coef)) + 0 * z
+            norm = (2 * l + 1) / (4 * math.pi) * math.factorial(l - m) / math.factorial(l + m)
+            phase = torch.ones_like(torch.complex(x, y))
+            for _ in range(m):
+                phase = phase * torch.complex(x, y)
+            scale = math.sqrt(norm) * (-1) ** m * (math.sqrt(2) if m else 1)
+            bands[m] = scale * value * phase.real
+            if m:
+                bands[-m] = scale * value * phase.imag
+        columns += [bands[m] for m in range(-l, l + 1)]
+    return torch.stack(columns, 1)
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    far: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+) -> Projection:
+    """EWA projection: J R Sigma R^T J^T + eps2d I (Zwicker et al. 2001; Kerbl et al. 2023)."""
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    factor = rotation_matrices(quats) * scales[:, None, :]
+    sigma = R @ (factor @ factor.transpose(1, 2)) @ R.T
+    x, y, z = (means @ R.T + t).unbind(1)
+    inside = (z >= near) & (z <= far)
+    z = torch.where(inside, z, 1.0)
+
+    # The Jacobian is taken no farther out than 15 % of the image beyond its borders.
+    slope_x = (x / z).clamp(-cx / fx - 0.15 * width / fx, (width - cx) / fx + 0.15 * width / fx)
+    slope_y = (y / z).clamp(-cy / fy - 0.15 * height / fy, (height - cy) / fy + 0.15 * height / fy)
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1)
+    J = J.reshape(-1, 2, 3)
+    covariance = J @ sigma @ J.transpose(1, 2) + eps2d * torch.eye(2, dtype=means.dtype)
+    mean = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+
+    visible_opacity = opacities >= ALPHA_CUT
+    extent = torch.sqrt(2 * torch.log(opacities.clamp(min=ALPHA_CUT) / ALPHA_CUT))
+    radius = extent[:, None] * torch.sqrt(torch.diagonal(covariance, dim1=1, dim2=2))
+    size = torch.tensor([width, height])
+    on_image = ((mean + radius > 0) & (mean - radius < size)).all(1)
+    large = (torch.ceil(radius) > radius_clip).any(1)
+    index = torch.nonzero(inside & visible_opacity & on_image & large)[:, 0]
+    index = index[torch.argsort(z[index], stable=True)]
+    return Projection(mean[index], covariance[index], z[index], index)
+
+
+def composite(
+    projection: Projection, opacities: Tensor, colors: Tensor, width: int, height: int
+) -> Reference:
+    """Front-to-back blending; `opacities` (M,) and `colors` (M, 3) in the projection's order."""
+    conic = torch.linalg.inv(projection.covariance)
+    reach = 3.5 * torch.sqrt(torch.linalg.eigvalsh(projection.covariance)[:, 1])
+    rows = []
+    for top in range(0, height, TILE):
+        row = []
+        for left in range(0, width, TILE):
+            w, h = min(TILE, width - left), min(TILE, height - top)
+            centre = torch.tensor([left + w / 2, top + h / 2])
+            half = torch.tensor([w / 2, h / 2])
+            gap = ((projection.mean - centre).abs() - half).amax(1)
+            near = torch.nonzero(gap < reach)[:, 0]
+            v, u = torch.meshgrid(
+                torch.arange(top, top + h) + 0.5, torch.arange(left, left + w) + 0.5, indexing="ij"
+            )
+            pixels = torch.stack([u, v], -1).reshape(-1, 1, 2).to(conic)
+            d = pixels - projection.mean[near]  # (P, G, 2)
+            power = -0.5 * torch.einsum("pgi,gij,pgj->pg", d, conic[near], d)
+            raw = opacities[near] * torch.exp(power)
+            alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
+            after = torch.cumprod(1 - alpha, 1)
+            before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+            weight = torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
+
+            met = before > MIN_TRANSMITTANCE
+            margins = torch.where(met, (raw / ALPHA_CUT - 1).abs(), torch.inf)
+            stops = torch.where(met, (after / MIN_TRANSMITTANCE - 1).abs(), torch.inf)
+            infinite = torch.full((len(pixels), 1), torch.inf)
+            margin = torch.cat([margins, stops, infinite], 1).amin(1)
+            values = [
+                weight @ colors[near],
+                (weight @ projection.depth[near])[:, None],
+                weight.sum(1, keepdim=True),
+                margin[:, None],
+            ]
+            row.append(torch.cat(values, 1).reshape(h, w, 6))
+        rows.append(torch.cat(row, 1))
+    image = torch.cat(rows, 0)
+    return Reference(image[..., :3], image[..., 3], image[..., 4], image[..., 5])
+
+
+def render(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    sh_degree: int | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    dtype: torch.dtype = torch.float64,
+    **projection_options,
+) -> Reference:
+    """One camera; `colors` (N, 3), or (N, K, 3) with `sh_degree`."""
+    means, quats, scales, opacities, colors, viewmat, K = (
+        a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
+    )
+    p = project(means, quats, scales, opacities, viewmat, K, width, height, **projection_options)
+    if sh_degree is None:
+        seen = colors[p.ids]
+    else:
+        centre = -torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
+        direction = means[p.ids] - centre
+        basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
+        coefficients = colors[p.ids, : (sh_degree + 1) ** 2]
+        seen = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)
+    result = composite(p, opacities[p.ids], seen, width, height)
+    behind = (1 - result.alpha)[..., None] * torch.tensor(background, dtype=dtype)
+    return result._replace(color=result.color + behind)
