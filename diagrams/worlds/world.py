@@ -1,0 +1,29 @@
+"""What is flown in: a place to look at, the truth about its surfaces, and where to fly."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flysplat.systems.collision.distance_field import DistanceField
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.splats.gaussian_scene import GaussianScene
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A place, everything in world frame W (z up, metres)."""
+
+    name: str
+    gaussians: GaussianScene
+    """What cameras see."""
+    distance_field: DistanceField
+    """What collides: analytic in procedural worlds, the same object as `esdf` in others."""
+    esdf: Esdf
+    """The grid that planners and training read."""
+    background: tuple[float, float, float]
+    """Colour where no Gaussian is seen; red, green, blue in 0 to 1."""
+    p_WS: NDArray[np.float64]
+    """(3,) [m] default start."""
+    p_WG: NDArray[np.float64]
+    """(3,) [m] default goal."""
