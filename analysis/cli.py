@@ -17,7 +17,6 @@ def main(arguments: list[str] | None = None) -> int:
         The exit status: 0, or 1 after an error that one message on standard error explains.
     """
     options = _parser().parse_args(arguments)
-    logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         options.verb(options)
     except (ValueError, OSError) as error:
@@ -76,6 +75,7 @@ def _fly(options: argparse.Namespace) -> None:
     from flysplat.diagrams.scenario import Scenario
     from flysplat.diagrams.worlds.make_world import SceneConfig
 
+    logging.getLogger("drake").setLevel(logging.WARNING)
     scenario = load_config(Scenario(), options.scenario)
     if options.scene is not None:
         scenario.world = SceneConfig(path=str(options.scene))

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
@@ -46,7 +46,7 @@ def load_config[Config](
 
 def dump_config(config: Any) -> str:
     """The configuration as YAML, every field written out."""
-    return yaml_dump_typed(config)
+    return cast(str, yaml_dump_typed(config))
 
 
 def _updated[Config](config: Config, text: str, source: str) -> Config:

@@ -5,10 +5,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
+from pydrake.systems.primitives import VectorLogSink
 
 from flysplat.diagrams.flight_diagram import goal_of
 from flysplat.diagrams.scenario import Scenario
@@ -98,7 +100,7 @@ def fly(
     diagram: Diagram,
     scenario: Scenario,
     world: World,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] | None = None,
 ) -> Flight:
     """
     Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
@@ -136,11 +138,11 @@ def flight_outcome(
     diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
 ) -> Outcome | None:
     """How the flight ends at this instant; None while it goes on."""
-    if diagram.GetOutputPort("in_collision").Eval(context)[0]:
+    if _evaluated(diagram, "in_collision", context)[0]:
         return Outcome.COLLISION
-    if diagram.GetOutputPort("field_state").Eval(context)[0] >= FieldState.UNKNOWN:
+    if _evaluated(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
         return Outcome.LEFT_VOLUME
-    p_WB = diagram.GetOutputPort("state").Eval(context)[:3]
+    p_WB = _evaluated(diagram, "state", context)[:3]
     if np.linalg.norm(p_WG - p_WB) <= goal_radius:
         return Outcome.GOAL
     return None
@@ -150,28 +152,30 @@ def _record(
     diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
 ) -> Flight:
     logs = {
-        name: diagram.GetSubsystemByName(f"{name}_log").FindLog(root)
+        name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
         for name in ("state", "command", "hypotheses")
     }
-    times, states, commands = (
-        logs["state"].sample_times(),
-        logs["state"].data().T,
-        logs["command"].data().T,
-    )
+    times = logs["state"].sample_times().copy()
+    # Copies: what a log returns is a view of memory that the diagram owns.
+    states, commands, hypotheses = (log.data().T.copy() for log in logs.values())
     if root.get_time() > times[-1]:
         times = np.append(times, root.get_time())
-        states = np.vstack([states, diagram.GetOutputPort("state").Eval(root)])
-        commands = np.vstack([commands, diagram.GetOutputPort("command").Eval(root)])
+        states = np.vstack([states, _evaluated(diagram, "state", root)])
+        commands = np.vstack([commands, _evaluated(diagram, "command", root)])
     return Flight(
         outcome=outcome,
-        times=times.copy(),
-        states=states.copy(),
-        commands=commands.copy(),
+        times=times,
+        states=states,
+        commands=commands,
         clearances=world.distance_field.distance(states[:, :3]) - VEHICLE_RADIUS,
         plan_times=logs["hypotheses"].sample_times().copy(),
-        hypotheses=logs["hypotheses"].data().T.copy(),
+        hypotheses=hypotheses,
         wall_time=wall_time,
     )
+
+
+def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:
+    return np.asarray(diagram.GetOutputPort(port).Eval(context))
 
 
 def _is_free(world: World, p_WQ: np.ndarray) -> bool:

@@ -1,5 +1,7 @@
 """The closed loop: a vehicle that flies through what its camera sees."""
 
+from typing import cast
+
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder
@@ -169,7 +171,8 @@ def _AddMeshcat(
     meshcat.SetProperty("/flysplat/distance_slice", "visible", False)
 
     systems = {system.get_name(): system for system in builder.GetMutableSystems()}
-    plant, policy, camera = (systems[name] for name in ("plant", "policy", "camera"))
+    plant, policy = systems["plant"], systems["policy"]
+    camera = cast(SplatCamera, systems["camera"])
     flight = builder.AddNamedSystem(
         "flight_visualizer", FlightVisualizer(meshcat, scenario.policy.lattice.num_hypotheses)
     )

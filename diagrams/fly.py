@@ -4,6 +4,7 @@ import contextlib
 import json
 import time
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -18,6 +19,7 @@ from flysplat.diagrams.worlds.world import World
 from flysplat.systems.files import require_writable_folder, written_atomically
 from flysplat.systems.splats.splat_camera import SplatCamera
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from flysplat.systems.visualization.video_recorder import VideoRecorder
 
 
 def run(
@@ -72,9 +74,10 @@ def run(
     meshcat.PublishRecording()
 
     summary = flight.summary() | {
-        "render_ms": _render_ms(diagram.GetSubsystemByName("camera"), flight)
+        "render_ms": _render_ms(cast(SplatCamera, diagram.GetSubsystemByName("camera")), flight)
     }
-    diagram.GetSubsystemByName("video").save(out / "flight.mp4", max_depth=scenario.camera.z_far)
+    video = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
+    video.save(out / "flight.mp4", max_depth=scenario.camera.z_far)
     with written_atomically(out / "flight.html") as path:
         path.write_text(meshcat.StaticHtml())
     with written_atomically(out / "trajectory.npz") as path:

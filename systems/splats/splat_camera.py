@@ -1,7 +1,9 @@
 """A camera that sees Gaussians."""
 
+from typing import cast
+
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
@@ -96,7 +98,10 @@ class SplatCamera(LeafSystem):
         pose_ticket = self.input_port_ticket(pose_port.get_index())
         self._view_entry = self.DeclareCacheEntry(
             "rendered view",
-            ValueProducer(allocate=Value[object], calc=self._calc_view),
+            ValueProducer(
+                Value[object],  # pyright: ignore[reportArgumentType]
+                self._calc_view,
+            ),
             {pose_ticket},
         )
         width, height = camera_info.width(), camera_info.height()
@@ -145,36 +150,40 @@ class SplatCamera(LeafSystem):
             background=self._background,
         )
 
-    def _calc_view(self, context: Context, value: AbstractValue) -> None:
-        value.set_value(self.render(self.GetInputPort("body_pose").Eval(context)))
+    def _calc_view(self, context, value) -> None:
+        X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
+        value.set_value(self.render(X_WB))
 
-    def _calc_color(self, context: Context, value: AbstractValue) -> None:
+    def _view(self, context) -> RenderedView:
+        return cast(RenderedView, self._view_entry.Eval(context))
+
+    def _calc_color(self, context, value) -> None:
         pixels = value.get_mutable_value().mutable_data  # (H, W, 4)
-        color = self._view_entry.Eval(context).color
+        color = self._view(context).color
         pixels[..., :3] = np.clip(color * 255.0 + 0.5, 0.0, 255.0)
         pixels[..., 3] = 255
 
-    def _depth(self, context: Context) -> np.ndarray:
+    def _depth(self, context) -> np.ndarray:
         """(H, W) [m], with 0 and inf out of range."""
-        view = self._view_entry.Eval(context)
+        view = self._view(context)
         min_depth, max_depth = self._depth_range
         seen = (view.alpha >= OPAQUE_ALPHA) & (view.depth <= max_depth)
         return np.where(seen, np.where(view.depth < min_depth, 0.0, view.depth), np.inf)
 
-    def _calc_depth_32f(self, context: Context, value: AbstractValue) -> None:
+    def _calc_depth_32f(self, context, value) -> None:
         value.get_mutable_value().mutable_data[..., 0] = self._depth(context)
 
-    def _calc_depth_16u(self, context: Context, value: AbstractValue) -> None:
+    def _calc_depth_16u(self, context, value) -> None:
         millimetres = np.minimum(self._depth(context) * 1000.0 + 0.5, 65535.0)
         value.get_mutable_value().mutable_data[..., 0] = millimetres
 
-    def _calc_label(self, context: Context, value: AbstractValue) -> None:
-        surface = self._view_entry.Eval(context).alpha >= OPAQUE_ALPHA
+    def _calc_label(self, context, value) -> None:
+        surface = self._view(context).alpha >= OPAQUE_ALPHA
         value.get_mutable_value().mutable_data[..., 0] = np.where(
             surface, int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
         )
 
-    def _calc_body_pose(self, context: Context, value: AbstractValue) -> None:
+    def _calc_body_pose(self, context, value) -> None:
         value.set_value(self.GetInputPort("body_pose").Eval(context))
 
     def _calc_image_time(self, context: Context, output: BasicVector) -> None:

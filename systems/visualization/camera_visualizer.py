@@ -2,6 +2,7 @@
 
 import base64
 import json
+from typing import cast
 
 import cv2
 import numpy as np
@@ -71,8 +72,9 @@ class CameraVisualizer(LeafSystem):
         page, skipped = divmod(round(time / self._period), self._stride)
         if skipped:
             return EventStatus.DidNothing()
-        rgba = self.GetInputPort("color_image").Eval(context).data
-        gltf = MemoryFile(picture_gltf(rgba[..., :3], self._p_CCorners), ".gltf", "onboard picture")
+        image = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
+        rgb = np.asarray(image.data)[..., :3]
+        gltf = MemoryFile(picture_gltf(rgb, self._p_CCorners), ".gltf", "onboard picture")
         path = f"{self._path}/picture"
         self._meshcat.SetObject(page_path(path, page), Mesh(InMemoryMesh(mesh_file=gltf)))
         show_page(self._meshcat, path, page, time)

@@ -52,15 +52,17 @@ class FlightVisualizer(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember_position)
 
+    def _evaluated(self, port: str, context: Context) -> np.ndarray:
+        return np.asarray(self.GetInputPort(port).Eval(context))
+
     def _remember_position(self, context: Context, discrete_state) -> EventStatus:
-        p_WB = self.GetInputPort("state").Eval(context)[:3]
-        discrete_state.set_value(p_WB)
+        discrete_state.set_value(self._evaluated("state", context)[:3])
         return EventStatus.Succeeded()
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
         page = round(time / self._period)
-        X_WB = pose_from_state(self.GetInputPort("state").Eval(context))
+        X_WB = pose_from_state(self._evaluated("state", context))
         self._meshcat.SetTransform(f"{self._path}/vehicle", X_WB, time)
         self._draw_trail(context, page, time, X_WB)
         self._draw_fan(context, page, time)
@@ -77,7 +79,7 @@ class FlightVisualizer(LeafSystem):
 
     def _draw_fan(self, context: Context, page: int, time: float) -> None:
         hypotheses = Hypotheses.from_vector(
-            self.GetInputPort("hypotheses").Eval(context), self._num_hypotheses
+            self._evaluated("hypotheses", context), self._num_hypotheses
         )
         path = f"{self._path}/hypotheses"
         if hypotheses is not None:

@@ -1,6 +1,7 @@
 """A video of what the camera saw: colour beside depth."""
 
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -46,9 +47,9 @@ class VideoRecorder(LeafSystem):
         return EventStatus.Succeeded()
 
     def _record(self, context: Context) -> EventStatus:
-        rgba = self.GetInputPort("color_image").Eval(context).data
-        depth = self.GetInputPort("depth_image_16u").Eval(context).data
-        self._frames.append((rgba[..., :3].copy(), depth[..., 0].copy()))
+        color = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
+        depth = cast(ImageDepth16U, self.GetInputPort("depth_image_16u").Eval(context))
+        self._frames.append((np.array(color.data)[..., :3], np.array(depth.data)[..., 0]))
         return EventStatus.Succeeded()
 
     def save(self, path: Path, max_depth: float) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_flies_round_the_post_to_the_goal(post_world):
     assert np.all(np.diff(flight.times) > 0)
     assert seen[-1] == flight.times[-1]
 
-    summary = flight.summary()
+    summary: dict[str, Any] = flight.summary()
     assert summary["outcome"] == "goal"
     assert summary["flight_time_s"] == flight.times[-1]
     # At least the way there, and 0.1 m of start_radius and 0.3 m of goal_radius less.

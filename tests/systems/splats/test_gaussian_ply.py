@@ -13,11 +13,11 @@ from flysplat.systems.splats.gaussian_scene import GaussianScene
 def random_scene(N: int = 7, K: int = 4, seed: int = 0) -> GaussianScene:
     rng = np.random.default_rng(seed)
     return GaussianScene(
-        means=rng.normal(size=(N, 3)),
-        quats=rng.normal(size=(N, 4)),
-        scales=np.exp(rng.normal(size=(N, 3))),
-        opacities=rng.uniform(1e-3, 1, size=N),
-        sh=rng.normal(size=(N, K, 3)),
+        means=rng.normal(size=(N, 3)).astype(np.float32),
+        quats=rng.normal(size=(N, 4)).astype(np.float32),
+        scales=np.exp(rng.normal(size=(N, 3))).astype(np.float32),
+        opacities=rng.uniform(1e-3, 1, size=N).astype(np.float32),
+        sh=rng.normal(size=(N, K, 3)).astype(np.float32),
     )
 
 
@@ -61,7 +61,8 @@ def test_layout_is_that_of_the_original_code(tmp_path):
 
 def test_opaque_and_nearly_invisible_gaussians_survive(tmp_path):
     """An opacity of exactly 1 comes back as 1, and tiny ones stay positive."""
-    opacities = np.array([1.0, np.nextafter(np.float32(1), np.float32(0)), 0.5, 1e-30])
+    below_one = np.nextafter(np.float32(1), np.float32(0))
+    opacities = np.array([1.0, below_one, 0.5, 1e-30], dtype=np.float32)
     scene = random_scene(N=4)
     scene = GaussianScene(scene.means, scene.quats, scene.scales, opacities, scene.sh)
     write_ply(scene, tmp_path / "scene.ply")

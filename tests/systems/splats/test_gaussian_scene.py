@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
@@ -7,7 +9,7 @@ from flysplat.systems.splats.gaussian_scene import GaussianScene
 from flysplat.systems.splats.spherical_harmonics import C0, evaluate_sh
 
 
-def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, np.ndarray]:
+def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     return {
         "means": rng.normal(size=(N, 3)),
@@ -44,7 +46,7 @@ def test_arrays_are_float32_contiguous_with_unit_quaternions():
 def test_tiny_quaternions_are_normalised():
     """A quaternion of length 1e-6 is a rotation like any other."""
     arrays = random_arrays()
-    scene = GaussianScene(**arrays | {"quats": arrays["quats"] * 1e-6})
+    scene = GaussianScene(**arrays | {"quats": (arrays["quats"] * 1e-6).astype(np.float32)})
     np.testing.assert_allclose(scene.quats, GaussianScene(**arrays).quats, atol=1e-6)
 
 
@@ -86,17 +88,17 @@ def test_wrong_shapes_and_lengths_are_refused():
     with pytest.raises(ValueError, match=r"quats has shape \(6, 3\), expected \(N, 4\)"):
         GaussianScene(**arrays | {"quats": arrays["means"]})
     with pytest.raises(ValueError, match=r"sh has shape \(6, 4\), expected \(N, K, 3\)"):
-        GaussianScene(**arrays | {"sh": np.zeros((6, 4))})
+        GaussianScene(**arrays | {"sh": np.zeros((6, 4), np.float32)})
     with pytest.raises(ValueError, match=r"different lengths .*means 6.*scales 5"):
         GaussianScene(**arrays | {"scales": arrays["scales"][:5]})
     with pytest.raises(ValueError, match="5 spherical-harmonic coefficients"):
-        GaussianScene(**arrays | {"sh": np.zeros((6, 5, 3))})
+        GaussianScene(**arrays | {"sh": np.zeros((6, 5, 3), np.float32)})
 
 
 def test_transform_moves_points_shapes_and_view_dependence():
     """A moved scene has moved centres, rotated covariances, and looks the same from moved eyes."""
     scene = GaussianScene(**random_arrays(K=16))
-    X_WO = RigidTransform(RollPitchYaw(0.4, -1.1, 2.3), [1, -2, 3])
+    X_WO = RigidTransform(RollPitchYaw(0.4, -1.1, 2.3), np.array([1.0, -2.0, 3.0]))
     moved = scene.transformed_by(X_WO)
     R = X_WO.rotation().matrix()
     np.testing.assert_allclose(moved.means, X_WO.multiply(scene.means.T).T, atol=1e-5)
@@ -113,7 +115,7 @@ def test_transform_moves_points_shapes_and_view_dependence():
 def test_transform_there_and_back_is_the_identity():
     """Moving by X and by its inverse gives the scene back."""
     scene = GaussianScene(**random_arrays(K=9))
-    X = RigidTransform(RollPitchYaw(1, 2, 3), [0.5, 0.25, -1])
+    X = RigidTransform(RollPitchYaw(1, 2, 3), np.array([0.5, 0.25, -1.0]))
     back = scene.transformed_by(X).transformed_by(X.inverse())
     for name in ("means", "scales", "opacities", "sh"):
         np.testing.assert_allclose(getattr(back, name), getattr(scene, name), atol=1e-5)
@@ -124,7 +126,7 @@ def test_merge_places_the_other_scene_and_pads_the_lower_degree():
     """Merging keeps the first scene as it is and puts the other, zero padded, at X_WO."""
     first = GaussianScene(**random_arrays(N=3, K=9))
     other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
-    X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [10, 0, 0])
+    X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
     merged = first.merged_with(other, X_WO)
     placed = other.transformed_by(X_WO)
     assert (len(merged), merged.sh_degree) == (5, 2)

@@ -1,0 +1,83 @@
+"""Where to fly from and to in a place of which only the free space is known."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from flysplat.systems.collision.esdf import Esdf
+
+_MAX_NODES = 250_000
+
+
+def choose_start_and_goal(
+    esdf: Esdf, radius: float, margin: float = 0.2
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
+
+    The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
+    [m] to spare can fly through space known to be free: in the largest connected part of a grid,
+    the node farthest from any node, and the node farthest from that (the double sweep, exact on
+    trees). If no space has that much margin, half of it is tried, and then none.
+
+    Raises:
+        ValueError: if no free space holds a sphere of `radius`.
+    """
+    field = esdf.conservative()
+    extent = esdf.upper_W - esdf.lower_W
+    spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
+    axes = [
+        low + spacing * (np.arange(max(int(size / spacing), 1)) + 0.5)
+        for low, size in zip(esdf.lower_W, extent, strict=True)
+    ]
+    p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
+    clearance = field.distance(p_WN) - radius  # [m]
+    for need in (margin, margin / 2, 0.0):
+        if np.count_nonzero(clearance > need) < 2:
+            continue
+        graph, nodes = _grid_graph(clearance > need, spacing)
+        p_WF = p_WN.reshape(-1, 3)[nodes]
+        _, label = connected_components(graph, directed=False)
+        inner = int(np.argmax(label == np.bincount(label).argmax()))
+        start, _ = _farthest(graph, inner)
+        goal, length = _farthest(graph, start)
+        if length > 0:
+            return p_WF[start], p_WF[goal], length
+    raise ValueError(
+        f"no free space for a vehicle of radius {radius} m: the largest clearance is "
+        f"{np.max(clearance) + radius:.2f} m, and unknown space counts as occupied; capture more "
+        "of the place"
+    )
+
+
+def _grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
+    """Returns the graph that joins each free node to its free neighbours among the 26 around it,
+    weighted by distance [m], and the flat index of each of its nodes."""
+    nodes = np.flatnonzero(free)
+    number = np.full(free.shape, -1)
+    number.flat[nodes] = np.arange(len(nodes))
+    rows, columns, weights = [], [], []
+    for offset in np.ndindex(3, 3, 3):
+        step = np.array(offset) - 1
+        if tuple(step) <= (0, 0, 0):
+            continue  # the other half of the neighbours follows by symmetry
+        here = tuple(
+            slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, free.shape, strict=True)
+        )
+        there = tuple(
+            slice(max(s, 0), n - max(-s, 0)) for s, n in zip(step, free.shape, strict=True)
+        )
+        both = free[here] & free[there]
+        rows.append(number[here][both])
+        columns.append(number[there][both])
+        weights.append(np.full(len(rows[-1]), spacing * np.linalg.norm(step)))
+    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+    return csr_array(coo_array(entries, shape=(len(nodes), len(nodes)))), nodes
+
+
+def _farthest(graph: csr_array, node: int) -> tuple[int, float]:
+    """Returns the node with the longest shortest path from `node`, and its length [m]."""
+    lengths = dijkstra(graph, directed=False, indices=node)
+    lengths[np.isinf(lengths)] = -1
+    farthest = int(np.argmax(lengths))
+    return farthest, float(lengths[farthest])

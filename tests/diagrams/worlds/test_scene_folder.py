@@ -1,0 +1,214 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flysplat.diagrams.worlds import scene_folder
+from flysplat.diagrams.worlds.scene_folder import (
+    check_scene_target,
+    read_scene,
+    read_scene_folder,
+    read_scene_metadata,
+    write_scene_folder,
+)
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+from flysplat.systems.splats.gaussian_ply import write_ply
+from flysplat.systems.splats.gaussian_scene import GaussianScene
+
+
+def box_of_gaussians(size=(6.0, 3.0, 3.0), step=0.1) -> GaussianScene:
+    """The walls of a box with its lower corner in the origin, as round Gaussians."""
+    axes = [np.arange(step / 2, length, step) for length in size]
+    sides = []
+    for axis, length in enumerate(size):
+        for at in (0, length):
+            grids = [np.array([at]) if a == axis else axes[a] for a in range(3)]
+            sides.append(np.stack(np.meshgrid(*grids, indexing="ij"), -1).reshape(-1, 3))
+    means = np.concatenate(sides)
+    N = len(means)
+    return GaussianScene.from_colors(
+        means,
+        np.tile([1, 0, 0, 0], (N, 1)),
+        np.full((N, 3), step),
+        np.full(N, 0.99),
+        np.full((N, 3), 0.3),
+    )
+
+
+@pytest.fixture
+def world() -> World:
+    occupied = np.zeros((20, 10, 10), bool)
+    occupied[0] = True
+    unknown = np.zeros_like(occupied)
+    unknown[15:] = True
+    esdf = esdf_from_occupancy(occupied, unknown, np.array([1.0, 2.0, 3.0]), 0.2)
+    return World(
+        name="box",
+        gaussians=box_of_gaussians(step=0.5),
+        distance_field=esdf,
+        esdf=esdf,
+        background=(0.1, 0.2, 0.3),
+        p_WS=np.array([2.0, 3.0, 4.0]),
+        p_WG=np.array([3.0, 3.0, 4.0]),
+    )
+
+
+def test_round_trip(tmp_path, world):
+    """A written scene reads back as the same world, with its metadata."""
+    folder = tmp_path / "scene"
+    written = write_scene_folder(
+        folder, world, provenance="a test", gains=[1.0, 1.25], vignetting=-0.5
+    )
+    assert {file.name for file in folder.iterdir()} == {"gaussians.ply", "esdf.npz", "scene.yaml"}
+    back = read_scene(folder)
+    assert (back.name, back.background) == ("box", (0.1, 0.2, 0.3))
+    np.testing.assert_array_equal(back.p_WS, world.p_WS)
+    np.testing.assert_array_equal(back.p_WG, world.p_WG)
+    np.testing.assert_array_equal(back.gaussians.means, world.gaussians.means)
+    np.testing.assert_array_equal(back.esdf.distances, world.esdf.distances)
+    np.testing.assert_array_equal(back.esdf.states, world.esdf.states)
+    assert back.distance_field is back.esdf
+    metadata = read_scene_metadata(folder)
+    assert metadata == written
+    assert (metadata.provenance, metadata.metric) == ("a test", True)
+    assert (metadata.gains, metadata.vignetting) == ([1.0, 1.25], -0.5)
+    np.testing.assert_allclose(metadata.lower_W, [1, 2, 3])
+    np.testing.assert_allclose(metadata.upper_W, [5, 4, 5])
+    assert metadata.observed_free_volume == pytest.approx(14 * 10 * 10 * 0.2**3)
+
+
+def test_a_scene_is_replaced_whole(tmp_path, world):
+    """Writing over a scene leaves nothing of the old one."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="first")
+    (folder / "metrics.json").write_text("{}")
+    write_scene_folder(folder, world, provenance="second")
+    assert read_scene_metadata(folder).provenance == "second"
+    assert not (folder / "metrics.json").exists()
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+@pytest.mark.parametrize("failing", ["write_ply", "yaml_dump_typed"])
+def test_failed_write_keeps_the_old_scene(tmp_path, world, monkeypatch, failing):
+    """A write that fails at any file leaves the old scene as it was, and nothing beside it."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="first")
+
+    def fail(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(scene_folder, failing, fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_scene_folder(folder, world, provenance="second")
+    assert read_scene_metadata(folder).provenance == "first"
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_failed_renaming_brings_the_old_scene_back(tmp_path, world, monkeypatch):
+    """If the new folder cannot take its place, the old one returns to it."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="first")
+    rename = Path.rename
+
+    def rename_old_only(self, target):
+        if self.name.endswith(".new"):
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", rename_old_only)
+    with pytest.raises(OSError, match="Input/output"):
+        write_scene_folder(folder, world, provenance="second")
+    assert read_scene_metadata(folder).provenance == "first"
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_other_folders_are_not_overwritten(tmp_path, world):
+    """A folder with other files, or a file, is refused and left alone."""
+    folder = tmp_path / "holiday"
+    folder.mkdir()
+    (folder / "photo.jpg").write_bytes(b"x")
+    for target in (folder, folder / "photo.jpg"):
+        with pytest.raises(ValueError, match="exists and is no scene"):
+            write_scene_folder(target, world, provenance="")
+    assert (folder / "photo.jpg").read_bytes() == b"x"
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    check_scene_target(empty)
+
+
+def test_unwritable_place(tmp_path, world, monkeypatch):
+    """A missing or write-protected parent folder is named before any work is done."""
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
+        check_scene_target(tmp_path / "nowhere" / "scene")
+    monkeypatch.setattr(scene_folder.os, "access", lambda path, mode: False)
+    with pytest.raises(PermissionError, match=rf"{tmp_path.name}: not writable"):
+        check_scene_target(tmp_path / "scene")
+
+
+@pytest.mark.parametrize("missing", ["gaussians.ply", "esdf.npz", "scene.yaml"])
+def test_missing_file(tmp_path, world, missing):
+    """A scene without one of its files is refused with the name of the file."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="")
+    (folder / missing).unlink()
+    with pytest.raises(FileNotFoundError, match=rf"{missing}: does not exist; a scene is"):
+        read_scene(folder)
+
+
+def test_missing_scene(tmp_path):
+    """A path with nothing there is refused."""
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_scene(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="nowhere: does not exist"):
+        read_scene_folder(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("metric: true", "metric: false", "scale of this scene is unknown"),
+        ("metric: true", "metrik: true", "metrik"),
+        ("format_version: 1", "format_version: 2", "format version 2, this program knows 1"),
+        ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS is .*three finite numbers"),
+        ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG is .*three finite numbers"),
+        ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS is \[\]"),
+        ("vignetting: 0.0", "vignetting: dark", "dark"),
+        ("metric: true", "metric: [", "scene.yaml"),
+    ],
+)
+def test_bad_metadata(tmp_path, world, old, new, message):
+    """Wrong, unknown and missing entries of scene.yaml are refused with file and reason."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="")
+    text = (folder / "scene.yaml").read_text()
+    assert old in text
+    (folder / "scene.yaml").write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=rf"(?s)scene\.yaml: .*{message}"):
+        read_scene(folder)
+
+
+def test_bare_ply(tmp_path):
+    """Gaussians alone become a world whose walls collide and whose inside can be flown."""
+    path = tmp_path / "hall.ply"
+    write_ply(box_of_gaussians(), path)
+    world = read_scene(path)
+    assert world.name == "hall"
+    assert len(world.gaussians) > 1000
+    assert world.distance_field is world.esdf
+    # In the middle the walls are 1.5 m away, less their thickness.
+    assert world.esdf.distance(np.array([3.0, 1.5, 1.5])) == pytest.approx(1.3, abs=0.2)
+    assert world.esdf.distance(np.array([0.0, 1.5, 1.5])) < 0
+    for p in (world.p_WS, world.p_WG):
+        assert (p > 0.354).all() and (p < np.array([6.0, 3.0, 3.0]) - 0.354).all()
+    assert np.linalg.norm(world.p_WS - world.p_WG) > 4
+
+
+def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
+    """A few Gaussians a kilometre away leave the grid as it is."""
+    scene = box_of_gaussians()
+    stray = GaussianScene.from_colors(
+        [[1000, 0, 0]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.9], [[1, 1, 1]]
+    )
+    write_ply(scene.merged_with(stray), tmp_path / "hall.ply")
+    assert (read_scene(tmp_path / "hall.ply").esdf.upper_W < 10).all()

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+
+from flysplat.diagrams.worlds.start_and_goal import choose_start_and_goal
+from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+
+RADIUS = 0.354
+
+
+def corridors(*boxes, unknown=(), size=(60, 60, 20), voxel_size=0.1):
+    """A solid block of voxels with free (or unknown) boxes, given in metres as (lower, upper)."""
+    occupied = np.ones(size, bool)
+    hidden = np.zeros(size, bool)
+    for grid, value, some in ((occupied, False, (*boxes, *unknown)), (hidden, True, unknown)):
+        for lower, upper in some:
+            first, last = (np.round(np.array(x) / voxel_size).astype(int) for x in (lower, upper))
+            grid[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = value
+    return esdf_from_occupancy(occupied, hidden, np.zeros(3), voxel_size)
+
+
+ALONG_X = ((0.2, 0.2, 0.2), (5.8, 1.8, 1.8))
+ALONG_Y = ((4.2, 0.2, 0.2), (5.8, 5.8, 1.8))
+
+
+def test_ends_of_a_corridor():
+    """In a straight corridor start and goal are at its two ends, clear of the walls."""
+    esdf = corridors(ALONG_X)
+    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
+    ends = sorted([p_WS[0], p_WG[0]])
+    reach = 0.2 + RADIUS + 0.2
+    assert ends[0] == pytest.approx(reach, abs=0.2) and ends[1] == pytest.approx(6 - reach, abs=0.2)
+    assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS + 0.2).all()
+    assert length >= np.linalg.norm(p_WS - p_WG) - 1e-9
+
+
+def test_length_is_measured_around_the_corner():
+    """In an L-shaped place the path goes around the corner, longer than the straight line."""
+    p_WS, p_WG, length = choose_start_and_goal(corridors(ALONG_X, ALONG_Y), RADIUS, margin=0.1)
+    straight = np.linalg.norm(p_WS - p_WG)
+    assert straight < length < 9
+    ends = np.array(sorted([p_WS.tolist(), p_WG.tolist()]))
+    assert ends[0, 0] < 1 and ends[1, 1] > 5
+
+
+def test_unknown_space_is_not_flown_through():
+    """A stretch of unknown space cuts the corridor; the longer part is used."""
+    esdf = corridors(ALONG_X, unknown=[((1.5, 0.2, 0.2), (2.0, 1.8, 1.8))])
+    p_WS, p_WG, _ = choose_start_and_goal(esdf, RADIUS, margin=0.1)
+    assert min(p_WS[0], p_WG[0]) > 2.0 + RADIUS
+
+
+def test_narrow_places_get_less_margin():
+    """Where no space has the margin, less is asked for, but never less than the radius."""
+    esdf = corridors(((0.2, 0.2, 0.2), (5.8, 1.1, 1.1)))
+    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
+    assert length > 3
+    assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS).all()
+
+
+def test_no_room_at_all():
+    """A place too narrow for the vehicle is an error that names radius and largest clearance."""
+    with pytest.raises(ValueError, match=r"radius 0\.354 m: the largest clearance is 0\.\d\d m"):
+        choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.7, 0.7))), RADIUS)
+
+
+def test_same_field_same_choice():
+    """The choice is deterministic."""
+    esdf = corridors(ALONG_X, ALONG_Y)
+    first, second = (choose_start_and_goal(esdf, RADIUS) for _ in range(2))
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
