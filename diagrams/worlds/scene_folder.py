@@ -130,7 +130,7 @@ def check_scene_target(path: str | Path) -> None:
 
     Raises:
         ValueError: if something else is there.
-        OSError: if the folder in which it would stand is missing or not writable.
+        OSError: if the folder in which it would stand cannot be made or written to.
     """
     path = Path(path).absolute()
     if path.exists() and not (path / "scene.yaml").is_file():
@@ -138,10 +138,11 @@ def check_scene_target(path: str | Path) -> None:
             raise ValueError(
                 f"{path}: exists and is no scene, so it is not overwritten; choose another folder"
             )
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder; create it to write {path.name}")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path.parent}: not writable; choose another folder")
+    parent = next(parent for parent in path.parents if parent.exists())
+    if not parent.is_dir():
+        raise NotADirectoryError(f"{parent}: is a file, so {path} cannot stand in it")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{parent}: not writable; choose another folder")
 
 
 def write_scene_folder(
@@ -178,7 +179,7 @@ def write_scene_folder(
     new = path.with_name(f".{path.name}.{os.getpid()}.new")
     old = path.with_name(f".{path.name}.{os.getpid()}.old")
     try:
-        new.mkdir()
+        new.mkdir(parents=True)
         write_ply(world.gaussians, new / "gaussians.ply")
         esdf.save(new / "esdf.npz")
         yaml_dump_typed(metadata, filename=str(new / "scene.yaml"))

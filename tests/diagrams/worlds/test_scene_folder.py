@@ -138,9 +138,14 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
 
 
 def test_unwritable_place(tmp_path, world, monkeypatch):
-    """A missing or write-protected parent folder is named before any work is done."""
-    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
-        check_scene_target(tmp_path / "nowhere" / "scene")
+    """Parent folders are made; a file or a write-protected folder in their place is named before
+    any work is done.
+    """
+    write_scene_folder(tmp_path / "new" / "folder" / "scene", world, provenance="")
+    assert read_scene(tmp_path / "new" / "folder" / "scene").name == world.name
+    (tmp_path / "file").write_text("")
+    with pytest.raises(NotADirectoryError, match="file: is a file"):
+        check_scene_target(tmp_path / "file" / "scene")
     monkeypatch.setattr(scene_folder.os, "access", lambda path, mode: False)
     with pytest.raises(PermissionError, match=rf"{tmp_path.name}: not writable"):
         check_scene_target(tmp_path / "scene")
