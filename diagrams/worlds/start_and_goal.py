@@ -11,14 +11,15 @@ _MAX_NODES = 250_000
 
 
 def choose_start_and_goal(
-    esdf: Esdf, radius: float, margin: float = 0.2
+    esdf: Esdf, radius: float, margin: float = 0.2, longest: float = 40.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
     [m] to spare can fly through space known to be free: in the largest connected part of a grid,
     the node farthest from any node, and the node farthest from that (the double sweep, exact on
-    trees). If no space has that much margin, half of it is tried, and then none.
+    trees). If no space has that much margin, half of it is tried, and then none. Paths longer than
+    `longest` [m] are not considered: a flight should end in good time.
 
     Raises:
         ValueError: if no free space holds a sphere of `radius`.
@@ -40,7 +41,7 @@ def choose_start_and_goal(
         _, label = connected_components(graph, directed=False)
         inner = int(np.argmax(label == np.bincount(label).argmax()))
         start, _ = _farthest(graph, inner)
-        goal, length = _farthest(graph, start)
+        goal, length = _farthest(graph, start, longest)
         if length > 0:
             return p_WF[start], p_WF[goal], length
     raise ValueError(
@@ -75,9 +76,10 @@ def _grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDA
     return csr_array(coo_array(entries, shape=(len(nodes), len(nodes)))), nodes
 
 
-def _farthest(graph: csr_array, node: int) -> tuple[int, float]:
-    """Returns the node with the longest shortest path from `node`, and its length [m]."""
-    lengths = dijkstra(graph, directed=False, indices=node)
+def _farthest(graph: csr_array, node: int, longest: float = np.inf) -> tuple[int, float]:
+    """Returns the node with the longest shortest path from `node` of at most `longest` [m], and the
+    length of that [m]."""
+    lengths = dijkstra(graph, directed=False, indices=node, limit=longest)
     lengths[np.isinf(lengths)] = -1
     farthest = int(np.argmax(lengths))
     return farthest, float(lengths[farthest])

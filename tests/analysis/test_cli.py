@@ -1,6 +1,8 @@
 """The command line, as a user meets it."""
 
 import json
+import os
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -118,3 +120,18 @@ def test_reconstruct_without_capture_is_refused(tmp_path, capsys):
     error = fails(["reconstruct", missing, "--out", str(tmp_path / "scene")], capsys)
     assert missing in error
     assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+def test_flight_through_a_real_capture(tmp_path):
+    """TartanAir's hospital, reconstructed without optimisation, is flown for at least 6 m to the
+    goal without touching anything.
+    """
+    capture = Path(os.environ["FLYSPLAT_DATA"]) / "tartanair" / "hospital"
+    scene, out = tmp_path / "hospital", tmp_path / "flight"
+    assert main(["reconstruct", str(capture), "--out", str(scene), "--iterations", "0"]) == 0
+    assert main(["fly", "--scene", str(scene), "--out", str(out)]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["outcome"] == "goal"
+    assert summary["path_length_m"] >= 6.0
+    assert summary["min_clearance_m"] > 0.0

@@ -12,6 +12,7 @@ import pytest
 from flysplat.diagrams.flight import Outcome, flight_outcome, fly, sample_initial_state
 from flysplat.diagrams.flight_diagram import BuildFlightDiagram
 from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.make_world import make_world
 from flysplat.systems.policies.hypotheses import Hypotheses
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 
@@ -163,3 +164,15 @@ def test_flight_path_does_not_import_torch():
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0
+
+
+@pytest.mark.parametrize("seed", [10, 11, 12])
+def test_forests_are_flown_through_at_nominal_speed(seed):
+    """The default scenario reaches its goal 33 m away at nearly 2 m/s without touching a tree."""
+    scenario = Scenario(seed=seed)
+    world = make_world(scenario.world, scenario.seed)
+    flight = fly(BuildFlightDiagram(scenario, world), scenario, world)
+    assert flight.outcome == Outcome.GOAL
+    assert np.nanmin(flight.clearances) > 0
+    summary: dict[str, Any] = flight.summary()
+    assert summary["mean_speed_m_s"] > 1.7

@@ -42,6 +42,14 @@ def test_length_is_measured_around_the_corner():
     assert ends[0, 0] < 1 and ends[1, 1] > 5
 
 
+def test_longest_path_is_bounded():
+    """No path is longer than asked for, and one nearly as long is found."""
+    esdf = corridors(ALONG_X)
+    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.1, longest=3.0)
+    assert 2.7 < length <= 3.0
+    assert np.linalg.norm(p_WS - p_WG) <= length + 1e-9
+
+
 def test_unknown_space_is_not_flown_through():
     """A stretch of unknown space cuts the corridor; the longer part is used."""
     esdf = corridors(ALONG_X, unknown=[((1.5, 0.2, 0.2), (2.0, 1.8, 1.8))])
