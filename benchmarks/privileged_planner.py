@@ -21,8 +21,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from flysplat.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
+from flysplat.systems.collision.shapes import Cylinder, HalfSpace
 from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
 from flysplat.systems.policies.privileged_planner import (
     PrivilegedPlanner,

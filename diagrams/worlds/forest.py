@@ -9,8 +9,8 @@ from flysplat.diagrams.worlds.forest_layout import MARGIN, lay_out
 from flysplat.diagrams.worlds.light import Daylight
 from flysplat.diagrams.worlds.surfaces import merged
 from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.esdf_build import esdf_from_distance_field
-from flysplat.systems.collision.shapes import AnalyticDistanceField
 
 
 def make_forest(config: ForestConfig, seed: int = 0) -> World:

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.esdf_build import esdf_from_distance_field
-from flysplat.systems.collision.shapes import AnalyticDistanceField, Cylinder
+from flysplat.systems.collision.shapes import Cylinder
 from flysplat.systems.splats.gaussian_scene import GaussianScene
 
 

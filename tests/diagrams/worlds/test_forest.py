@@ -13,7 +13,8 @@ from flysplat.diagrams.worlds.forest import make_forest
 from flysplat.diagrams.worlds.forest_config import CLEARANCE, PASSAGE, ForestConfig
 from flysplat.diagrams.worlds.forest_layout import lay_out
 from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.shapes import AnalyticDistanceField, Capsule, Sphere
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.shapes import Capsule, Sphere
 from flysplat.systems.splats.baked_scene import BakedScene
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 

@@ -8,13 +8,13 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.distance_field import FieldState
 from flysplat.systems.collision.esdf_from_depth import (
     bounds_of_depth_images,
     esdf_from_depth_images,
 )
 from flysplat.systems.collision.shapes import (
-    AnalyticDistanceField,
     Box,
     Cylinder,
     HalfSpace,

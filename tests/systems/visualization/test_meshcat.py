@@ -14,7 +14,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
-from flysplat.systems.collision.shapes import AnalyticDistanceField, Sphere
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.shapes import Sphere
 from flysplat.systems.policies.hypotheses import Hypotheses
 from flysplat.systems.splats.gaussian_scene import GaussianScene
 from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
