@@ -37,32 +37,37 @@ def _parser() -> argparse.ArgumentParser:
     fly = verbs.add_parser("fly", help="fly to a goal and leave a page, a video and a trajectory")
     fly.set_defaults(verb=_fly)
     fly.add_argument("--scenario", type=Path, metavar="FILE.yaml", help="the scenario to fly")
-    fly.add_argument("--scene", type=Path, metavar="DIR_OR_PLY", help="fly in this scene")
+    fly.add_argument(
+        "--scene",
+        type=Path,
+        metavar="DIR_OR_PLY",
+        help="fly in this scene folder, or PLY in metres, z up",
+    )
     fly.add_argument("--seed", type=int, help="seed of the world and the start")
     fly.add_argument(
         "--out", type=Path, default=Path("out/fly"), help="output folder (%(default)s)"
     )
     fly.add_argument("--live", action="store_true", help="serve Meshcat while flying, in real time")
     fly.add_argument("--graphviz", type=Path, metavar="FILE", help="write the diagram as Graphviz")
-    _add_overrides(fly)
+    _add_overrides(fly, "policy.lattice.speed=3")
 
     reconstruct = verbs.add_parser("reconstruct", help="make a scene to fly in from a capture")
     reconstruct.set_defaults(verb=_reconstruct)
     reconstruct.add_argument("capture", type=Path, help="folder of a TartanAir V1 sequence")
     reconstruct.add_argument("--out", type=Path, required=True, help="scene folder to write")
     reconstruct.add_argument("--iterations", type=int, help="optimisation steps")
-    _add_overrides(reconstruct)
+    _add_overrides(reconstruct, "voxel_size=0.1")
     return parser
 
 
-def _add_overrides(parser: argparse.ArgumentParser) -> None:
+def _add_overrides(parser: argparse.ArgumentParser, example: str) -> None:
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         dest="overrides",
         metavar="FIELD=VALUE",
-        help="override one field of the configuration, for example policy.speed=3 (repeatable)",
+        help=f"override one field of the configuration, for example {example} (repeatable)",
     )
 
 
@@ -78,7 +83,7 @@ def _fly(options: argparse.Namespace) -> None:
     logging.getLogger("drake").setLevel(logging.WARNING)
     scenario = load_config(Scenario(), options.scenario)
     if options.scene is not None:
-        scenario.world = SceneConfig(path=str(options.scene))
+        scenario.world = SceneConfig(path=str(options.scene.absolute()))
     if options.seed is not None:
         scenario.seed = options.seed
     scenario = load_config(scenario, overrides=options.overrides)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import re
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,14 +23,17 @@ def load_config[Config](
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: for text that is not YAML, unknown fields and values of another type; the
-            message
-            names the file or override, the field and its likely spelling.
+            message names the file or override, the field and its likely spelling.
     """
     config = defaults
     if path is not None:
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: there is no such configuration file")
-        config = _updated(config, path.read_text(), str(path))
+            raise FileNotFoundError(f"{path}: there is no such file")
+        try:
+            text = path.read_text()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path} is not text: {error}") from None
+        config = _updated(config, text, str(path))
     for override in overrides or []:
         name, equals, value = override.partition("=")
         if not equals:
@@ -52,32 +54,42 @@ def dump_config(config: Any) -> str:
 def _updated[Config](config: Config, text: str, source: str) -> Config:
     """`config` with the fields that the YAML `text` gives; `source` names the text in errors."""
     try:
+        _check_names(config, yaml.load(text, _NamesLoader), "")
         return yaml_load_typed(schema=type(config), data=text, defaults=config)
     except yaml.YAMLError as error:
         raise ValueError(f"{source} is not YAML: {error}") from None
+    except AssertionError:  # How Drake's reader refuses a plain value where fields belong.
+        raise ValueError(f"{source}: null stands where fields belong") from None
     except (RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{source}: {error}{_suggestion(config, str(error))}") from None
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{source}: {reason}") from None
 
 
-def _suggestion(config: Any, error: str) -> str:
-    """What an unknown field might have been meant to be."""
-    if "unknown to the schema" not in error:
-        return ""
+class _NamesLoader(yaml.SafeLoader):
+    """Reads only for the names of fields: what tagged values hold is left to Drake's reader."""
+
+
+_NamesLoader.add_multi_constructor("!", lambda loader, tag, node: None)
+
+
+def _check_names(config: Any, given: Any, prefix: str) -> None:
+    """Raises ValueError for a field that `config` does not have, and says which it might be."""
     known = _field_names(config)
-    close = {
-        name
-        for field in re.findall(r"'(\w+)'", error)
-        for name in difflib.get_close_matches(field, known)
-    }
-    if close:
-        return f"; did you mean {' or '.join(sorted(close))}?"
-    return f"; the fields are {', '.join(sorted(known))}"
+    if not known or given is None:
+        return
+    if not isinstance(given, dict):
+        raise ValueError(f"{prefix.rstrip('.') or 'the file'} is {given}; it must be fields")
+    for name, value in given.items():
+        if name not in known:
+            close = difflib.get_close_matches(str(name), known)
+            hint = f"did you mean {' or '.join(prefix + other for other in close)}?"
+            listed = f"the fields are {', '.join(sorted(prefix + other for other in known))}"
+            raise ValueError(f"there is no field {prefix}{name}; {hint if close else listed}")
+        _check_names(getattr(config, name), value, f"{prefix}{name}.")
 
 
 def _field_names(config: Any) -> set[str]:
-    """The names of the fields of a configuration and of the configurations within it."""
+    """The names of the fields of a configuration, empty for plain values."""
     if dataclasses.is_dataclass(config):
-        names = {field.name for field in dataclasses.fields(config)}
-    else:  # Drake's own configurations.
-        names = {field.name for field in getattr(config, "__fields__", ())}
-    return names.union(*(_field_names(getattr(config, name)) for name in names))
+        return {field.name for field in dataclasses.fields(config)}
+    return {field.name for field in getattr(config, "__fields__", ())}  # Drake's own.

@@ -38,8 +38,8 @@ class Flight:
     commands: np.ndarray  # (N, 4): thrust [m/s^2], body rates [rad/s]
     # (N,) [m] Distance to the nearest surface less the vehicle's radius; NaN outside the world.
     clearances: np.ndarray
-    plan_times: np.ndarray  # (M,) [s]
-    hypotheses: np.ndarray  # (M, size): see flysplat.systems.policies.hypotheses
+    # (M, size) One row a plan, its time first; see flysplat.systems.policies.hypotheses.
+    hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialisation
 
     def summary(self) -> dict[str, float | str]:
@@ -63,7 +63,6 @@ class Flight:
             states=self.states,
             commands=self.commands,
             clearances=self.clearances,
-            plan_times=self.plan_times,
             hypotheses=self.hypotheses,
         )
 
@@ -101,6 +100,7 @@ def fly(
     scenario: Scenario,
     world: World,
     progress: Callable[[float], object] | None = None,
+    realtime_rate: float = 0.0,
 ) -> Flight:
     """
     Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
@@ -108,9 +108,11 @@ def fly(
     Args:
         diagram, scenario, world: as built.
         progress: called with the simulated time [s] now and then.
+        realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
     """
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
+    simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
     plant_context = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant_context.SetContinuousState(sample_initial_state(scenario, world))
@@ -158,6 +160,10 @@ def _record(
     times = logs["state"].sample_times().copy()
     # Copies: what a log returns is a view of memory that the diagram owns.
     states, commands, hypotheses = (log.data().T.copy() for log in logs.values())
+    # A log samples before the policy updates at the same instant: it lacks the last plan.
+    last_plan = _evaluated(diagram, "hypotheses", root)
+    if last_plan[0] != hypotheses[-1, 0]:
+        hypotheses = np.vstack([hypotheses, last_plan])
     if root.get_time() > times[-1]:
         times = np.append(times, root.get_time())
         states = np.vstack([states, _evaluated(diagram, "state", root)])
@@ -168,8 +174,7 @@ def _record(
         states=states,
         commands=commands,
         clearances=world.distance_field.distance(states[:, :3]) - VEHICLE_RADIUS,
-        plan_times=logs["hypotheses"].sample_times().copy(),
-        hypotheses=hypotheses,
+        hypotheses=hypotheses[np.isfinite(hypotheses[:, 0])],
         wall_time=wall_time,
     )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, MeshcatParams
 from tqdm import tqdm
 
 from flysplat.diagrams.configuration import dump_config
@@ -47,16 +47,17 @@ def run(
     """
     scenario.validate()
     require_writable_folder(out)
+    if graphviz is not None:
+        require_writable_folder(graphviz.parent)
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
     sample_initial_state(scenario, world)  # Refuses a start or goal without room before the rest.
 
-    meshcat = Meshcat()
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     _look_along(meshcat, scenario, world)
     if live:
-        scenario.simulator.target_realtime_rate = 1.0
         print(f"Meshcat shows the flight at {meshcat.web_url()}", flush=True)
 
     diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
@@ -69,7 +70,13 @@ def run(
     with tqdm(
         total=scenario.timeout, desc="flying", bar_format=layout, leave=False, disable=None
     ) as bar:
-        flight = fly(diagram, scenario, world, lambda now: bar.update(now - bar.n))
+        flight = fly(
+            diagram,
+            scenario,
+            world,
+            progress=lambda now: bar.update(now - bar.n),
+            realtime_rate=1.0 if live else 0.0,
+        )
     meshcat.StopRecording()
     meshcat.PublishRecording()
 

@@ -1,9 +1,11 @@
 """A scenario: everything one flight depends on, as a dataclass and as YAML."""
 
 from dataclasses import dataclass, field
+from math import inf
 
+import numpy as np
 from pydrake.common.schema import Rotation, Transform
-from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
 
 from flysplat.diagrams.worlds.forest import ForestConfig
@@ -11,6 +13,8 @@ from flysplat.diagrams.worlds.make_world import WorldConfig
 from flysplat.systems.policies.privileged_planner import PrivilegedPlannerConfig
 from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+
+_MAX_PIXELS = 4096 * 4096
 
 # Fields of Drake's CameraConfig about render engines and LCM, which a splat camera has no use for.
 # Its background is the world's, and its depth image is registered with its colour image.
@@ -71,37 +75,53 @@ class Scenario:
 
     def validate(self) -> None:
         """
-        Checks what can be checked without building the world.
+        Checks what can be checked without building the world; systems check their own parts.
 
         Raises:
             ValueError: naming the field, its value and its limit.
         """
-        for name in ("goal_radius", "timeout"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
-        for name in ("seed", "start_radius"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
+        _check("seed", self.seed, self.seed >= 0, "at least 0")
+        _check("start_radius", self.start_radius, 0 <= self.start_radius <= 1, "0 to 1 m")
+        _check("goal_radius", self.goal_radius, 0 < self.goal_radius < inf, "positive")
+        _check("timeout", self.timeout, 0 < self.timeout <= 3600, "more than 0, at most 3600 s")
         for name in ("start", "goal"):
             point = getattr(self, name)
-            if point is not None and len(point) != 3:
-                raise ValueError(f"{name} is {point}; it must be three numbers x, y, z in metres")
-        camera = self.camera
-        if camera.width < 1 or camera.height < 1:
-            raise ValueError(
-                f"camera is {camera.width}x{camera.height} pixels; both must be at least 1"
-            )
-        focal_lengths = (camera.focal_x(), camera.focal_y())
-        if not all(0 < focal < float("inf") for focal in focal_lengths):
-            raise ValueError(
-                f"camera.focal gives focal lengths of {focal_lengths} pixels; they must be "
-                "positive and finite"
-            )
-        if not camera.fps > 0:
-            raise ValueError(f"camera.fps is {camera.fps}; it must be positive")
-        for name in _WITHOUT_EFFECT:
-            value, default = (repr(getattr(c, name)) for c in (camera, CameraConfig()))
-            if value != default:
-                raise ValueError(
-                    f"camera.{name} is {value}, but a splat camera ignores it; leave it out"
-                )
+            valid = point is None or (len(point) == 3 and np.isfinite(point).all())
+            _check(name, point, valid, "three finite numbers x, y, z in metres")
+        self.world.validate()
+        _check_camera(self.camera)
+        _check_simulator(self.simulator)
+
+
+def _check(name: str, value: object, valid: bool | np.bool_, limit: str) -> None:
+    if not valid:
+        raise ValueError(f"{name} is {value}; it must be {limit}")
+
+
+def _check_camera(camera: CameraConfig) -> None:
+    pixels = camera.width * camera.height
+    valid = camera.width > 0 and camera.height > 0 and pixels <= _MAX_PIXELS
+    size = f"{camera.width}x{camera.height} pixels"
+    _check("camera", size, valid, f"at least 1x1 and at most {_MAX_PIXELS} pixels")
+    focal = (camera.focal_x(), camera.focal_y())
+    _check("camera.focal", focal, all(0 < f < inf for f in focal), "positive and finite [pixels]")
+    center = camera.principal_point()
+    valid = np.all((center > 0) & (center < [camera.width, camera.height]))
+    _check("camera's principal point", center.tolist(), valid, "inside the image [pixels]")
+    _check("camera.fps", camera.fps, 0 < camera.fps <= 1000, "more than 0, at most 1000 Hz")
+    for name in _WITHOUT_EFFECT:
+        value, default = (repr(getattr(c, name)) for c in (camera, CameraConfig()))
+        _check(f"camera.{name}", value, value == default, "left out: a splat camera ignores it")
+
+
+def _check_simulator(simulator: SimulatorConfig) -> None:
+    known = GetIntegrationSchemes()
+    scheme = simulator.integration_scheme
+    _check("simulator.integration_scheme", scheme, scheme in known, f"one of {', '.join(known)}")
+    step = simulator.max_step_size
+    _check("simulator.max_step_size", step, 1e-5 <= step <= 1, "1e-5 to 1 s")
+    accuracy = simulator.accuracy
+    _check("simulator.accuracy", accuracy, 0 < accuracy < 1, "between 0 and 1")
+    for name in ("start_time", "target_realtime_rate"):
+        value = getattr(simulator, name)
+        _check(f"simulator.{name}", value, value == 0, "0: flights start then, as fast as they can")

@@ -45,8 +45,8 @@ class ForestConfig:
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)} m must be positive and finite")
         for name in ("rocks", "logs"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} = {getattr(self, name)} must be 0 or more")
+            if not 0 <= getattr(self, name) <= 1000:
+                raise ValueError(f"{name} = {getattr(self, name)} must be 0 to 1000")
         if not 0 <= self.lean_max <= 10:
             raise ValueError(f"lean_max = {self.lean_max} deg must be between 0 and 10 deg")
         least = 2 * (INSET + CLEARANCE)

@@ -14,6 +14,14 @@ class SceneConfig:
     # A scene folder, or a PLY file of Gaussians.
     path: str = ""
 
+    def validate(self) -> None:
+        """
+        Raises:
+            ValueError: if no path is given.
+        """
+        if not self.path:
+            raise ValueError("world.path is empty; name a scene folder or a PLY file")
+
 
 WorldConfig = ForestConfig | SceneConfig
 

@@ -23,8 +23,10 @@ from flysplat.systems.splats.gaussian_ply import read_ply, write_ply
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 FORMAT_VERSION = 1
+WORLD_FRAME = "z up"
 
 _MAX_VOXELS = 2e7
+_COARSEST = 0.25  # [m], voxels at which a vehicle of 0.354 m radius still finds its way
 
 
 @dataclass(kw_only=True)
@@ -36,7 +38,7 @@ class SceneMetadata:
     name: str = ""
     provenance: str = ""
     """What the scene was made from, and how."""
-    world_frame: str = "z up"
+    world_frame: str = WORLD_FRAME
     metric: bool = True
     """Whether the unit of length is the metre."""
     lower_W: list[float] = field(default_factory=list)
@@ -89,6 +91,13 @@ def read_scene_folder(path: str | Path) -> World:
             "distance in it can be trusted; reconstruct it with a scale"
         )
     esdf = Esdf.load(path / "esdf.npz")
+    for name in ("lower_W", "upper_W"):
+        said, found = getattr(metadata, name), getattr(esdf, name)
+        if not np.allclose(said, found, atol=1e-6):
+            raise ValueError(
+                f"{path}: scene.yaml has {name} {said}, but esdf.npz has {found.tolist()}; "
+                "the files are of different scenes"
+            )
     red, green, blue = metadata.background
     return World(
         name=metadata.name,
@@ -122,6 +131,13 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
         value = getattr(metadata, name)
         if len(value) != 3 or not np.isfinite(value).all():
             raise ValueError(f"{file}: {name} is {value}, three finite numbers are needed")
+    if metadata.world_frame != WORLD_FRAME:
+        raise ValueError(
+            f"{file}: world_frame is {metadata.world_frame!r}, it must be {WORLD_FRAME!r}; "
+            "turn the scene and reconstruct it again"
+        )
+    if not all(0 <= value <= 1 for value in metadata.background):
+        raise ValueError(f"{file}: background is {metadata.background}, 0 to 1 is needed")
     return metadata
 
 
@@ -197,11 +213,16 @@ def write_scene_folder(
 def _read_bare_ply(path: Path) -> World:
     """Builds a world from Gaussians alone: every place that no Gaussian fills counts as free."""
     gaussians = read_ply(path)
-    # A few stray Gaussians far away must not stretch the grid.
-    lower_W, upper_W = np.percentile(gaussians.means, [1, 99], axis=0)
-    margin = 0.05 * (upper_W - lower_W) + 0.5
-    lower_W, upper_W = lower_W - margin, upper_W + margin
+    # A few stray Gaussians far away must not stretch the grid; beyond it all counts as occupied.
+    lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
+    lower_W, upper_W = lower_W - 0.1, upper_W + 0.1
     voxel_size = max(0.1, float(np.cbrt(np.prod(upper_W - lower_W) / _MAX_VOXELS)))
+    if voxel_size > _COARSEST:
+        raise ValueError(
+            f"{path}: 98 % of the Gaussians span {np.round(upper_W - lower_W, 1).tolist()} m, for "
+            f"which voxels of {voxel_size:.2f} m would be needed, more than {_COARSEST} m; crop "
+            "far Gaussians away, and scale the scene if its unit is not the metre"
+        )
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
     p_WS, p_WG, _ = choose_start_and_goal(esdf, VEHICLE_RADIUS)
     return World(

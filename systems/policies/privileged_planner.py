@@ -1,6 +1,5 @@
 """The planner that knows the scene: hypotheses from the distance field and the time of arrival."""
 
-import math
 import weakref
 from dataclasses import dataclass, field
 from typing import cast
@@ -13,7 +12,7 @@ from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
 from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from flysplat.systems.vehicle.quadrotor_dynamics import GRAVITY, VEHICLE_RADIUS, QuadrotorParams
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 _STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
@@ -30,15 +29,15 @@ class PrivilegedPlannerConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.0 < self.rate < math.inf:
+        if not 0.0 < self.rate <= 1000.0:
             raise ValueError(
-                f"PrivilegedPlannerConfig.rate is {self.rate} Hz but must be positive and finite; "
-                f"the default is {PrivilegedPlannerConfig.rate}."
+                f"PrivilegedPlannerConfig.rate is {self.rate} Hz but must be positive and at most "
+                f"1000; the default is {PrivilegedPlannerConfig.rate}."
             )
         self.lattice.validate()
 
 
-def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, drag: float) -> np.ndarray:
+def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, params: QuadrotorParams) -> np.ndarray:
     """The acceleration a_WB (3,) [m/s^2] of level flight at this attitude and velocity.
 
     The thrust that carries the weight, c = g / (z_B · e_z), accelerates along the horizontal part
@@ -46,7 +45,7 @@ def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, drag: float) -> np.nd
     smoothly from the last.
     """
     tilt = R_WB[:2, 2] / max(R_WB[2, 2], _STEEPEST)
-    return np.append(GRAVITY * tilt - drag * v_WB[:2], 0.0)
+    return np.append(params.gravity * tilt - params.drag * v_WB[:2], 0.0)
 
 
 def plan(
@@ -55,7 +54,7 @@ def plan(
     field: Esdf,
     toa: TimeOfArrival,
     lattice: TrajectoryLattice,
-    drag: float = QuadrotorParams.drag,
+    params: QuadrotorParams | None = None,
 ) -> Hypotheses:
     """The best K distinct trajectories from a state, cheapest first.
 
@@ -68,7 +67,7 @@ def plan(
         field: a conservative distance field.
         toa: the time of arrival at the goal, over the same grid.
         lattice: the trajectories to choose from.
-        drag: linear drag over mass [1/s].
+        params: the vehicle's; drag and gravity tell its acceleration from its attitude.
 
     Raises:
         ValueError: if the state is not finite or its quaternion zero, or if no way leads from the
@@ -83,7 +82,7 @@ def plan(
     X_WB = pose_from_state(state)
     R_WB, p_WB, v_WB = X_WB.rotation().matrix(), state[0:3], state[3:6]
     _check_way_exists(p_WB, field, toa)
-    a_WB = level_acceleration(R_WB, v_WB, drag)
+    a_WB = level_acceleration(R_WB, v_WB, params or QuadrotorParams())
     positions_W, costs = lattice.best(p_WB, v_WB, a_WB, field, toa)
     waypoints_B = (positions_W[:, :NUM_WAYPOINTS] - p_WB) @ R_WB
     return Hypotheses(time, X_WB, waypoints_B, costs)
@@ -144,14 +143,13 @@ class PrivilegedPlanner(LeafSystem):
         Args:
             esdf: the scene; unknown space and all outside its box count as occupied.
             config: see `PrivilegedPlannerConfig`.
-            params: the vehicle's; its drag tells its acceleration from its attitude.
+            params: the vehicle's, see `plan`.
         """
         super().__init__()
         self._config = config or PrivilegedPlannerConfig()
         self._config.validate()
-        params = params or QuadrotorParams()
-        params.validate()
-        self._drag = params.drag
+        self._params = params or QuadrotorParams()
+        self._params.validate()
         self._field = esdf if esdf.occupied_outside else esdf.conservative()
         self._lattice = TrajectoryLattice(self._config.lattice)
         self._state_port = self.DeclareVectorInputPort("state", 13)
@@ -191,6 +189,6 @@ class PrivilegedPlanner(LeafSystem):
             self._field,
             cast(TimeOfArrival, self.get_cache_entry(self._time_of_arrival).Eval(context)),
             self._lattice,
-            self._drag,
+            self._params,
         )
         discrete_state.set_value(hypotheses.to_vector())

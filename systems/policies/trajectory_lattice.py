@@ -79,6 +79,9 @@ class LatticeConfig:
         in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
         _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
         trajectories = self.num_yaws * self.num_pitches * len(self.speed_fractions)
+        _check(
+            "num_yaws and num_pitches", trajectories, trajectories <= 10**5, "at most 1e5 in all"
+        )
         few = self.num_hypotheses <= trajectories
         _check(
             "num_hypotheses",

@@ -48,8 +48,9 @@ class FlatnessControllerConfig:
     def validate(self, gravity: float) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy.
 
-        All must be positive and finite, min_thrust < max_thrust, max_tilt < pi/2, the vertical part
-        of max_thrust at max_tilt above ``gravity`` [m/s^2], and lookahead at least 2 / tilt_gain.
+        All must be positive and finite, period at least 1e-4, min_thrust < max_thrust,
+        max_tilt < pi/2, the vertical part of max_thrust at max_tilt above ``gravity`` [m/s^2], and
+        lookahead at least 2 / tilt_gain.
         """
         name = "FlatnessControllerConfig"
         for field in fields(self):
@@ -59,6 +60,11 @@ class FlatnessControllerConfig:
                     f"{name}.{field.name} is {value} but must be positive and finite; "
                     f"the default is {field.default}"
                 )
+        if self.period < 1e-4:
+            raise ValueError(
+                f"{name}.period is {self.period} s but must be at least 1e-4; the default is "
+                f"{FlatnessControllerConfig.period}"
+            )
         if self.min_thrust >= self.max_thrust:
             raise ValueError(
                 f"{name}.min_thrust is {self.min_thrust} m/s^2 but must be below max_thrust, "

@@ -1,5 +1,6 @@
 """A video of what the camera saw: colour beside depth."""
 
+import tempfile
 from pathlib import Path
 from typing import cast
 
@@ -24,8 +25,9 @@ class VideoRecorder(LeafSystem):
         - color_image
         - depth_image_16u
 
-    The images wait in memory (0.4 MB each at 320x240) and are encoded after the flight, because
-    encoding takes longer than rendering them and would be charged to the simulation.
+    The images wait in a temporary file (0.4 MB each at 320x240) and are encoded after the flight,
+    because encoding takes longer than rendering and would be charged to the simulation. Like every
+    recorder it writes outside the Context: one recorder is for one simulation at a time.
     """
 
     def __init__(self, width: int, height: int, fps: float):
@@ -36,20 +38,27 @@ class VideoRecorder(LeafSystem):
         """
         super().__init__()
         self._fps = fps
-        self._frames: list[tuple[np.ndarray, np.ndarray]] = []
+        self._frame = np.dtype(
+            [("rgb", np.uint8, (height, width, 3)), ("depth", np.uint16, (height, width))]
+        )
+        self._file = tempfile.TemporaryFile()
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
         self.DeclareAbstractInputPort("depth_image_16u", Value(ImageDepth16U(width, height)))
         self.DeclareInitializationPublishEvent(self._clear)
         self.DeclarePeriodicPublishEvent(1 / fps, 0.0, self._record)
 
     def _clear(self, context: Context) -> EventStatus:
-        self._frames.clear()
+        self._file.seek(0)
+        self._file.truncate()
         return EventStatus.Succeeded()
 
     def _record(self, context: Context) -> EventStatus:
         color = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
         depth = cast(ImageDepth16U, self.GetInputPort("depth_image_16u").Eval(context))
-        self._frames.append((np.array(color.data)[..., :3], np.array(depth.data)[..., 0]))
+        frame = np.empty((), self._frame)
+        frame["rgb"] = np.asarray(color.data)[..., :3]
+        frame["depth"] = np.asarray(depth.data)[..., 0]
+        self._file.write(frame.tobytes())
         return EventStatus.Succeeded()
 
     def save(self, path: Path, max_depth: float) -> None:
@@ -63,15 +72,19 @@ class VideoRecorder(LeafSystem):
         Raises:
             OSError: if the file cannot be written.
         """
-        height, width = self._frames[0][1].shape
+        height, width = self._frame["depth"].shape
         size = (2 * width, height)
+        frames = self._file.tell() // self._frame.itemsize
+        self._file.seek(0)
         fourcc = cv2.VideoWriter.fourcc(*"vp09")
         with written_atomically(path) as partial:
             writer = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, self._fps, size)
             if not writer.isOpened():
                 raise OSError(f"{path}: OpenCV cannot write a video here; is the folder writable?")
-            for rgb, depth in tqdm(self._frames, "video", unit="frame", leave=False, disable=None):
-                writer.write(np.hstack([rgb[..., ::-1], colorize_depth(depth * 1e-3, max_depth)]))
+            for _ in tqdm(range(frames), "video", unit="frame", leave=False, disable=None):
+                frame = np.frombuffer(self._file.read(self._frame.itemsize), self._frame)[0]
+                depth = colorize_depth(frame["depth"] * 1e-3, max_depth)
+                writer.write(np.hstack([frame["rgb"][..., ::-1], depth]))
             writer.release()
 
 

@@ -79,7 +79,7 @@ def fails(arguments: list[str], capsys) -> str:
         (["--set", "goal=[100, 0, 2]"], "goal [100.0, 0.0, 2.0] is outside the world"),
         (["--set", "start=[1.5, 0, -1]"], "start [1.5, 0.0, -1.0] is"),
         (["--set", "start=[1.5, 0, 0.2]"], "0.200 m from the nearest surface"),
-        (["--set", "camera.focal=!FocalLength {x: 0}"], "they must be positive"),
+        (["--set", "camera.focal=!FocalLength {x: 0}"], "it must be positive"),
         (["--set", "worl.length=3"], "did you mean world"),
         (["--set", "world.spacing=0.5"], "spacing"),
         (["--scenario", "nowhere.yaml"], "nowhere.yaml: there is no such"),

@@ -276,7 +276,7 @@ def test_the_config_loads_from_yaml():
         ({"voxel_size": 0.0}, r"voxel_size = 0.0 m must be positive"),
         ({"radius_max": float("nan")}, r"radius_max = nan m must be positive"),
         ({"radius_min": -0.1}, r"radius_min = -0.1 m must be positive"),
-        ({"rocks": -1}, r"rocks = -1 must be 0 or more"),
+        ({"rocks": -1}, r"rocks = -1 must be 0 to 1000"),
         ({"lean_max": 40.0}, r"lean_max = 40.0 deg must be between 0 and 10"),
         ({"length": 4.0}, r"length = 4.0 m must be at least 5 m"),
         ({"width": 2.0}, r"width = 2.0 m must be at least 2.5"),

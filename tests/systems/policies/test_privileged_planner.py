@@ -26,10 +26,11 @@ from flysplat.systems.vehicle.flatness_controller import (
     FlatnessController,
     FlatnessControllerConfig,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams, hover_state
 from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 MARGIN = LatticeConfig().margin
+PARAMS = QuadrotorParams(drag=0.4, gravity=3.7)
 
 
 def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
@@ -204,10 +205,10 @@ def pillar_plan(pillar):
 def test_level_acceleration():
     """Tilt accelerates by g tan(tilt) along the tilt; in steady flight the drag takes it away."""
     R_WB = RollPitchYaw(0.0, 0.3, 1.0).ToRotationMatrix().matrix()
-    expected = 9.81 * np.tan(0.3) * np.array([np.cos(1.0), np.sin(1.0), 0.0])
-    np.testing.assert_allclose(level_acceleration(R_WB, np.zeros(3), 0.4), expected, atol=1e-12)
+    expected = 3.7 * np.tan(0.3) * np.array([np.cos(1.0), np.sin(1.0), 0.0])
+    np.testing.assert_allclose(level_acceleration(R_WB, np.zeros(3), PARAMS), expected, atol=1e-12)
     v_WB = np.array([*expected[:2] / 0.4, -3.0])
-    np.testing.assert_allclose(level_acceleration(R_WB, v_WB, 0.4), 0.0, atol=1e-12)
+    np.testing.assert_allclose(level_acceleration(R_WB, v_WB, PARAMS), 0.0, atol=1e-12)
 
 
 def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
@@ -298,7 +299,7 @@ def test_config_in_yaml():
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (PrivilegedPlannerConfig(rate=0.0), "rate is 0.0 Hz but must be positive"),
+        (PrivilegedPlannerConfig(rate=0.0), "rate is 0.0 Hz but must be positive and at most 1000"),
         (PrivilegedPlannerConfig(lattice=LatticeConfig(speed=-1.0)), "speed is -1.0"),
     ],
 )
