@@ -19,7 +19,7 @@ lint: .venv/installed
 	.venv/bin/pyright
 
 clean:
-	rm -rf .venv build out
+	rm -rf .venv build
 
 .venv/installed: $(BUILT_FROM)
 	@test -n "$(PYTHON)" || { echo "No Python 3.12 or newer found; install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }

@@ -75,9 +75,8 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
     the start.
 
     Raises:
-        ValueError: if the start or the goal is outside the known free volume, or nearer to a
-            surface
-            than the vehicle's radius.
+        ValueError: if the start or the goal is outside known space, or nearer to a surface than the
+            vehicle's radius.
     """
     p_WG = goal_of(scenario, world)
     p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)

@@ -46,12 +46,12 @@ def run(
         OSError: if `out` cannot be written; nothing is flown then.
     """
     scenario.validate()
-    require_writable_folder(out)
-    if graphviz is not None:
-        require_writable_folder(graphviz.parent)
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
     sample_initial_state(scenario, world)  # Refuses a start or goal without room before the rest.
+    require_writable_folder(out)
+    if graphviz is not None:
+        require_writable_folder(graphviz.parent)
 
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     meshcat.SetProperty("/Grid", "visible", False)

@@ -55,8 +55,12 @@ class ReconstructConfig:
             ("max_extent", 0.001),
             ("voxel_size", 0.005),
         ):
-            if not getattr(self, name) >= limit:
-                raise ValueError(f"{name} is {getattr(self, name)}, at least {limit} is needed")
+            if not limit <= getattr(self, name) < np.inf:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, at least {limit} and finite is needed"
+                )
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}, at least 0 is needed")
         if self.iterations != 0:
             raise ValueError(
                 f"iterations is {self.iterations}: optimisation is not available yet, use 0"

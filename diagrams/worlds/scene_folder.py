@@ -19,6 +19,7 @@ from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.distance_field import FieldState
 from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.collision.esdf_build import esdf_from_gaussians
+from flysplat.systems.files import require_writable_folder
 from flysplat.systems.splats.gaussian_ply import read_ply, write_ply
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -157,8 +158,7 @@ def check_scene_target(path: str | Path) -> None:
     parent = next(parent for parent in path.parents if parent.exists())
     if not parent.is_dir():
         raise NotADirectoryError(f"{parent}: is a file, so {path} cannot stand in it")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{parent}: not writable; choose another folder")
+    require_writable_folder(parent)
 
 
 def write_scene_folder(

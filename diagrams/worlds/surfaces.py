@@ -35,11 +35,6 @@ class Surfels:
         """Returns the patches of a mask or of indices."""
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def raised(self, height: ArrayLike) -> Surfels:
-        """Returns the patches moved by `height` [m], a number or (N,), along their normals."""
-        moved = self.p + self.n * np.broadcast_to(height, len(self))[:, None]
-        return Surfels(moved, self.n, self.t, self.extent)
-
     @classmethod
     def joined(cls, parts: list[Surfels]) -> Surfels:
         """Returns all patches of `parts` in order."""

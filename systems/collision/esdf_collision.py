@@ -1,5 +1,6 @@
 """A distance field as a Drake system: how near a vehicle is to the obstacles."""
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -59,19 +60,25 @@ class EsdfCollision(LeafSystem):
             raise ValueError(f"EsdfCollision: beta is {beta} 1/m; it must be positive.")
         self._field = field
         state = self.DeclareVectorInputPort("state", 13)
+        # Drake would never free a system that its own callbacks or a kept cache entry refer to:
+        # hence a weak reference, and the entry's index.
+        collision = weakref.proxy(self)
         cache = self.DeclareCacheEntry(
             description="sample of the distance field at p_WB",
             value_producer=ValueProducer(
-                allocate=lambda: AbstractValue.Make(object()), calc=self._sample
+                allocate=lambda: AbstractValue.Make(object()),
+                calc=lambda context, sample: collision._sample(context, sample),
             ),
             prerequisites_of_calc={self.input_port_ticket(state.get_index())},
         )
+        index, ticket = cache.cache_index(), cache.ticket()
 
         def declare(name, size, value_of):
             def calc(context, output):
-                output.SetFromVector(np.atleast_1d(value_of(cache.Eval(context))))
+                sample = collision.get_cache_entry(index).Eval(context)
+                output.SetFromVector(np.atleast_1d(value_of(sample)))
 
-            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={cache.ticket()})
+            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={ticket})
 
         declare("distance", 1, lambda sample: sample.distance)
         declare("gradient", 3, lambda sample: sample.gradient)

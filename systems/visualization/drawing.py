@@ -81,7 +81,7 @@ def draw_distance_slice(
     """
     lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
     counts = np.maximum(2, np.ceil((upper_W[:2] - lower_W[:2]) / spacing).astype(int))
-    # Half a cell inside, where every field has an answer.
+    # A little inside, where every field has an answer.
     margin = 1e-3 * (upper_W[:2] - lower_W[:2])
     xs, ys = (
         np.linspace(lower_W[i] + margin[i], upper_W[i] - margin[i], counts[i]) for i in range(2)

@@ -1,5 +1,6 @@
 """The command line, as a user meets it."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from flysplat.analysis.cli import main
+from flysplat.systems.splats.gaussian_ply import write_ply
+from flysplat.systems.splats.gaussian_scene import GaussianScene
 
 SHORT = ["--set", "world.length=10", "--set", "world.width=6", "--set", "timeout=15"]
 
@@ -91,13 +94,42 @@ def test_bad_input_is_one_message_and_nothing_written(arguments, message, tmp_pa
     """Every user error ends with one message, exit status 1 and an output folder without files."""
     out = tmp_path / "out"
     assert message in fails(["fly", "--out", str(out), *arguments], capsys)
-    assert not out.exists() or not list(out.iterdir())
+    assert not out.exists()
+
+
+def make_scene(xs) -> GaussianScene:
+    """Gaussians in a row along x."""
+    means = np.array([[x, 0.0, 0.0] for x in xs])
+    count = len(means)
+    return GaussianScene.from_colors(
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), 0.1),
+        np.full(count, 0.9),
+        np.full((count, 3), 0.5),
+    )
+
+
+def test_scene_of_another_unit_is_refused(tmp_path, capsys):
+    """A PLY that spans kilometres is not flown with voxels larger than the vehicle."""
+    ply = tmp_path / "millimetres.ply"
+    generator = np.random.default_rng(0)
+    scene = make_scene(generator.uniform(0, 1, 500))
+    means = generator.uniform(0, 2e4, scene.means.shape).astype(np.float32)
+    write_ply(dataclasses.replace(scene, means=means), ply)
+    error = fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
+    assert "if its unit is not the metre" in error
 
 
 def test_foreign_scene_is_refused(tmp_path, capsys):
-    """A PLY that is no Gaussian scene, and a folder that is no scene, are refused by name."""
+    """A PLY that is no Gaussian scene, a truncated one, and a folder that is no scene are refused
+    by name.
+    """
     ply = tmp_path / "mesh.ply"
     ply.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    assert str(ply) in fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
+    write_ply(make_scene([1.0, 2.0]), ply)
+    ply.write_bytes(ply.read_bytes()[:-20])
     assert str(ply) in fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
     ply.write_bytes(b"\x00\x01 this is not a PLY")
     assert str(ply) in fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)

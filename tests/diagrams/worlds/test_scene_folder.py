@@ -13,6 +13,7 @@ from flysplat.diagrams.worlds.scene_folder import (
 )
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+from flysplat.systems.policies.time_of_arrival import time_of_arrival
 from flysplat.systems.splats.gaussian_ply import write_ply
 from flysplat.systems.splats.gaussian_scene import GaussianScene
 
@@ -137,7 +138,7 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
     check_scene_target(empty)
 
 
-def test_unwritable_place(tmp_path, world, monkeypatch):
+def test_unwritable_place(tmp_path, world):
     """Parent folders are made; a file or a write-protected folder in their place is named before
     any work is done.
     """
@@ -146,9 +147,8 @@ def test_unwritable_place(tmp_path, world, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(NotADirectoryError, match="file: is a file"):
         check_scene_target(tmp_path / "file" / "scene")
-    monkeypatch.setattr(scene_folder.os, "access", lambda path, mode: False)
-    with pytest.raises(PermissionError, match=rf"{tmp_path.name}: not writable"):
-        check_scene_target(tmp_path / "scene")
+    with pytest.raises(OSError, match="cannot write to the output folder /proc"):
+        check_scene_target("/proc/scene")
 
 
 @pytest.mark.parametrize("missing", ["gaussians.ply", "esdf.npz", "scene.yaml"])
@@ -217,3 +217,43 @@ def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
     )
     write_ply(scene.merged_with(stray), tmp_path / "hall.ply")
     assert (read_scene(tmp_path / "hall.ply").esdf.upper_W < 10).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("world_frame: z up", "world_frame: y up", "world_frame is 'y up', it must be 'z up'"),
+        ("background: [", "background: [7.0, -1.0, 0.5] #", "background is .*0 to 1 is needed"),
+        ("lower_W: [", "lower_W: [-99.0, -99.0, -99.0] #", "files are of different scenes"),
+    ],
+)
+def test_metadata_is_believed_or_refused(tmp_path, world, old, new, message):
+    """What scene.yaml says and the scene does not bear out is refused."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="")
+    file = folder / "scene.yaml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        read_scene(folder)
+
+
+def test_space_beside_a_bare_ply_is_not_flown_through(tmp_path):
+    """In the box around three parallel walls, outside counts as occupied: there is no way round."""
+    y, z = (grid.ravel() for grid in np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 8, 0.1)))
+    walls = [np.column_stack([np.full(y.size, x), y, z]) for x in (0.0, 3.0, 6.0)]
+    means = np.concatenate(walls)
+    count = len(means)
+    scene = GaussianScene.from_colors(
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), 0.08),
+        np.full(count, 0.95),
+        np.full((count, 3), 0.5),
+    )
+    write_ply(scene, tmp_path / "walls.ply")
+    walled = read_scene(tmp_path / "walls.ply")
+    times = time_of_arrival(walled.esdf.conservative(), np.array([1.5, 5.0, 4.0]))
+    assert times.is_reachable(np.array([1.5, 2.0, 2.0]))
+    assert not times.is_reachable(np.array([4.5, 5.0, 4.0]))

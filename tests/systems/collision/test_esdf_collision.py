@@ -1,5 +1,8 @@
 """The collision system."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
@@ -119,3 +122,13 @@ def test_bad_parameters_are_refused(name, value):
     """A negative radius or a barrier without sharpness ends in a message with the value."""
     with pytest.raises(ValueError, match=f"{name} is {value}"):
         EsdfCollision(CountingField(), **{name: value})
+
+
+def test_is_freed():
+    """A system that has answered is freed when nobody holds it."""
+    system = EsdfCollision(CountingField())
+    outputs_at(system, [2.5, 0.0, 0.0])
+    held = weakref.ref(system)
+    del system
+    gc.collect()
+    assert held() is None
