@@ -3,8 +3,8 @@ the trunks.
 
     python -m flysplat.diagrams.examples.splat_background --out out/splat_background
 
-Nothing here but `SplatRenderEngine` is particular to splats: a MultibodyPlant with a SceneGraph, and an
-RgbdSensor that names the renderer.
+Nothing here but `SplatRenderEngine` is particular to splats: a MultibodyPlant, a SceneGraph and
+an RgbdSensor that names the renderer.
 """
 
 import argparse
@@ -107,8 +107,8 @@ def _make_camera(world: World, width: int, height: int) -> RgbdSensor:
 
 def widest_lane(world: World, nearest: float, farthest: float, half_length: float) -> float:
     """
-    Where to throw: the x [m], from `nearest` to `farthest` beyond the start, at which a line along y,
-    `half_length` to either side of the start, keeps the greatest distance from all surfaces.
+    Where to throw: the x [m], from `nearest` to `farthest` beyond the start, at which a line along
+    y, `half_length` to either side of the start, keeps the greatest distance from all surfaces.
     """
     x = world.p_WS[0] + np.arange(nearest, farthest, 0.1)
     y = world.p_WS[1] + np.arange(-half_length, half_length, 0.1)

@@ -41,7 +41,7 @@ _SHAPES = "shapes"
 # The sky, and enough from the camera that no side of a shape is black.
 _LIGHTS = [
     LightParameter(type="directional", frame="world", direction=[0.3, 0.2, -1], intensity=0.7),
-    LightParameter(type="directional", frame="camera", direction=[0, 0, 1], intensity=0.6),
+    LightParameter(type="point", frame="camera", position=[0, 0, 0], intensity=0.8),
 ]
 
 
@@ -53,8 +53,8 @@ class SplatRenderEngine(RenderEngine):
     Add it with `scene_graph.AddRenderer("splats", SplatRenderEngine(scene))` and name "splats" in
     the cameras of `RgbdSensor`. The frame of the Gaussians is SceneGraph's world frame.
 
-    The shapes are rendered by a second engine with the same camera. Per pixel, with its colour c and
-    depth d (infinite where there is no shape) and the Gaussians' colour C, alpha A and expected
+    The shapes are rendered by a second engine with the same camera. Per pixel, with its colour c
+    and depth d (infinite where there is no shape) and the Gaussians' colour C, alpha A and expected
     depth D:
 
     - colour is c where d <= D, else C + (1 - A) c: a shape behind thin leaves shines through them,
@@ -82,8 +82,8 @@ class SplatRenderEngine(RenderEngine):
             scene: the Gaussians, held by reference.
             shapes: renders SceneGraph's shapes, and what is behind everything; it is copied.
                 RenderEngineVtk in front of `background` when None, which needs an OpenGL that works
-                without a display (Debian: libegl1 libegl-mesa0 libgl1-mesa-dri libglib2.0-0 libx11-6
-                libsm6).
+                without a display (Debian: libegl1 libegl-mesa0 libgl1-mesa-dri libglib2.0-0
+                libx11-6 libsm6).
             background: colour behind everything, red, green, blue in [0, 1], for the default
                 `shapes`; any other engine has its own.
 
