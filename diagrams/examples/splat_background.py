@@ -9,6 +9,7 @@ an RgbdSensor that names the renderer.
 
 import argparse
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.sensors import CameraInfo, RgbdSensor
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from flysplat.diagrams.worlds.forest import make_forest
 from flysplat.diagrams.worlds.forest_config import ForestConfig
@@ -67,8 +68,8 @@ def BuildSplatBackgroundDiagram(world: World, width: int = 640, height: int = 48
     )
     _add_bodies(plant)
     plant.Finalize()
-    camera = builder.AddSystem(_make_camera(world, width, height))
-    camera.set_name("camera")
+    camera = _make_camera(world, width, height)
+    builder.AddNamedSystem("camera", camera)
     builder.Connect(scene_graph.get_query_output_port(), camera.query_object_input_port())
     for name in ("color_image", "depth_image_32f", "label_image"):
         builder.ExportOutput(camera.GetOutputPort(name), name)
@@ -79,14 +80,18 @@ def _add_bodies(plant: MultibodyPlant) -> None:
     friction = CoulombFriction(0.6, 0.5)
     # The ground is seen as Gaussians already: it needs to collide only.
     plant.RegisterCollisionGeometry(
-        plant.world_body(), RigidTransform([0, 0, -0.5]), Box(200, 200, 1), "ground", friction
+        plant.world_body(),
+        RigidTransform(np.array([0, 0, -0.5])),
+        Box(200, 200, 1),
+        "ground",
+        friction,
     )
     for name, shape, inertia, color in (
         ("ball", Sphere(RADIUS), UnitInertia.SolidSphere(RADIUS), [0.85, 0.08, 0.05, 1]),
         ("box", Box(*[2 * RADIUS] * 3), UnitInertia.SolidCube(2 * RADIUS), [0.1, 0.25, 0.9, 1]),
     ):
         body = plant.AddRigidBody(name, SpatialInertia(1.0, np.zeros(3), inertia))
-        plant.RegisterVisualGeometry(body, RigidTransform(), shape, name, color)
+        plant.RegisterVisualGeometry(body, RigidTransform(), shape, name, np.array(color))
         plant.RegisterCollisionGeometry(body, RigidTransform(), shape, name, friction)
 
 
@@ -129,9 +134,9 @@ def throw(diagram: Diagram, world: World) -> Simulator:
         lane = widest_lane(world, nearest, farthest, abs(start))
         body = plant.GetBodyByName(name)
         plant.SetFloatingBaseBodyPoseInWorldFrame(
-            context, body, RigidTransform([lane, world.p_WS[1] + start, 1.0])
+            context, body, RigidTransform(np.array([lane, world.p_WS[1] + start, 1.0]))
         )
-        velocity = SpatialVelocity([speed / 2, 0, 0.5], [0, speed, 3.0])
+        velocity = SpatialVelocity(np.array([speed / 2, 0, 0.5]), np.array([0, speed, 3.0]))
         plant.SetFreeBodySpatialVelocity(context, body, velocity)
     return simulator
 
@@ -150,11 +155,11 @@ def run(*, out: Path, frames: int = 8, seconds: float = 2.1) -> None:
     for k, moment in enumerate(np.linspace(0, seconds, frames)):
         simulator.AdvanceTo(moment)
         context = simulator.get_context()
-        color = diagram.GetOutputPort("color_image").Eval(context).data[..., :3]
-        depth = diagram.GetOutputPort("depth_image_32f").Eval(context).data[..., 0]
+        color = cast(ImageRgba8U, diagram.GetOutputPort("color_image").Eval(context))
+        depth = cast(ImageDepth32F, diagram.GetOutputPort("depth_image_32f").Eval(context))
         for name, picture in (
-            (f"color_{k}.png", np.ascontiguousarray(color[..., ::-1])),
-            (f"depth_{k}.png", colorize_depth(depth, MAX_DEPTH)),
+            (f"color_{k}.png", cv2.cvtColor(np.asarray(color.data), cv2.COLOR_RGBA2BGR)),
+            (f"depth_{k}.png", colorize_depth(np.asarray(depth.data)[..., 0], MAX_DEPTH)),
         ):
             with written_atomically(out / name) as partial:
                 if not cv2.imwrite(str(partial), picture):
@@ -163,6 +168,6 @@ def run(*, out: Path, frames: int = 8, seconds: float = 2.1) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Drake's bodies in a forest of Gaussians.")
     parser.add_argument("--out", type=Path, default=Path("out/splat_background"))
     run(out=parser.parse_args().out)

@@ -1,6 +1,6 @@
 """Gaussians as the background of any Drake simulation."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +117,7 @@ class SplatRenderEngine(RenderEngine):
     def __deepcopy__(self, memo: dict) -> "SplatRenderEngine":
         copy = type(self).__new__(type(self))
         RenderEngine.__init__(copy)
-        copy._share(self._scene, self._scene_graph.Clone())
+        copy._share(self._scene, cast(SceneGraph, self._scene_graph.Clone()))
         copy._source = self._source
         copy._frames = dict(self._frames)
         copy._X_WG = dict(self._X_WG)
@@ -182,31 +182,31 @@ class SplatRenderEngine(RenderEngine):
 
     def DoRenderColorImage(self, camera: ColorRenderCamera, color_image_out: ImageRgba8U) -> None:
         view = self._view(camera.core())
-        behind = self._shapes().RenderColorImage(*self._same(camera)).data[..., :3]
+        behind = np.asarray(self._shapes().RenderColorImage(*self._same(camera)).data)
         shape_in_front = self._shape_depth(camera.core()) <= view.depth  # (H, W)
-        behind = behind.astype(np.float32) / 255
+        behind = behind[..., :3].astype(np.float32) / 255
         blended = view.color + (1 - view.alpha[..., None]) * behind
         color = np.where(shape_in_front[..., None], behind, blended)
-        color_image_out.mutable_data[..., :3] = color_pixels(color)
-        color_image_out.mutable_data[..., 3] = 255
+        out = np.asarray(color_image_out.mutable_data)  # (H, W, 4)
+        out[..., :3] = color_pixels(color)
+        out[..., 3] = 255
 
     def DoRenderDepthImage(self, camera: DepthRenderCamera, depth_image_out: ImageDepth32F) -> None:
         depth_range = camera.depth_range()
-        shapes = self._shapes().RenderDepthImage(*self._same(camera)).data[..., 0]
+        shapes = np.asarray(self._shapes().RenderDepthImage(*self._same(camera)).data)[..., 0]
         splats = ranged_depth(
             self._view(camera.core()), depth_range.min_depth(), depth_range.max_depth()
         )
-        depth_image_out.mutable_data[..., 0] = np.minimum(shapes, splats)
+        np.asarray(depth_image_out.mutable_data)[..., 0] = np.minimum(shapes, splats)
 
     def DoRenderLabelImage(self, camera: ColorRenderCamera, label_image_out: ImageLabel16I) -> None:
         view = self._view(camera.core())
-        shapes = self._shapes().RenderLabelImage(*self._same(camera)).data[..., 0]
+        shapes = np.asarray(self._shapes().RenderLabelImage(*self._same(camera)).data)[..., 0]
         splats = surface_labels(view)
         empty = int(RenderLabel.kEmpty)
         shape_seen = (self._shape_depth(camera.core()) <= view.depth) | (splats == empty)
-        label_image_out.mutable_data[..., 0] = np.where(
-            shape_seen & (shapes != empty), shapes, splats
-        )
+        labels = np.where(shape_seen & (shapes != empty), shapes, splats)
+        np.asarray(label_image_out.mutable_data)[..., 0] = labels
 
     # The two halves of an image.
 
@@ -227,7 +227,7 @@ class SplatRenderEngine(RenderEngine):
         for frame, X_WG in self._X_WG.items():
             poses.set_value(frame, X_WG)
         self._scene_graph.get_source_pose_port(self._source).FixValue(self._context, poses)
-        return self._scene_graph.get_query_output_port().Eval(self._context)
+        return cast(QueryObject, self._scene_graph.get_query_output_port().Eval(self._context))
 
     def _same(self, camera: Any) -> tuple[Any, FrameId, RigidTransform]:
         """Arguments of QueryObject's functions that give `camera`, where it is, to our shapes."""
@@ -243,4 +243,4 @@ class SplatRenderEngine(RenderEngine):
         """Depth of the shapes wherever the camera sees any  # (H, W) [m]."""
         clipping = core.clipping()
         camera = DepthRenderCamera(core, DepthRange(clipping.near(), clipping.far()))
-        return self._shapes().RenderDepthImage(*self._same(camera)).data[..., 0]
+        return np.asarray(self._shapes().RenderDepthImage(*self._same(camera)).data)[..., 0]

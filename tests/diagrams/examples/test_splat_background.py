@@ -26,7 +26,7 @@ def test_runs(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(list(tmp_path.glob("depth_*.png"))) == 8
-    colors = [cv2.imread(str(tmp_path / f"color_{k}.png")).astype(int) for k in range(8)]
+    colors = [np.array(cv2.imread(str(tmp_path / f"color_{k}.png")), dtype=int) for k in range(8)]
     red = [int(np.sum(c[..., 2] > 100 + c[..., :2].max(axis=-1))) for c in colors]
     blue = [int(np.sum(c[..., 0] > 60 + c[..., 1:].max(axis=-1))) for c in colors]
     assert red[0] == 0 and max(red) > 2000  # the ball starts behind the nearest trunk
