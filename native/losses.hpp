@@ -19,7 +19,7 @@ struct PhotometricInput {
 };
 
 struct PhotometricSums {
-  double l1, ssim;  // sums of |rendered - target| and of SSIM over pixels and channels
+  double l1, dissimilarity;  // sums of |rendered - target| and 1 - SSIM over pixels and channels
 };
 
 // Pixels of depth [m], valid where epsilon < depth < far.

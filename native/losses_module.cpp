@@ -71,9 +71,9 @@ double photometric_loss(Images rendered, Images target, float ssim_weight,
     in.gradient = gradient ? gradient->data() + i * size : nullptr;
     const PhotometricSums image = kernels.photometric(in);
     sums.l1 += image.l1;
-    sums.ssim += image.ssim;
+    sums.dissimilarity += image.dissimilarity;
   }
-  return (1.0 - ssim_weight) * sums.l1 / count + ssim_weight * (1.0 - sums.ssim / count);
+  return ((1.0 - ssim_weight) * sums.l1 + ssim_weight * sums.dissimilarity) / count;
 }
 
 double log_depth_loss(Pixels rendered, Pixels depth, std::optional<Pixels> weights, float epsilon,

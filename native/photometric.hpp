@@ -162,7 +162,7 @@ static PhotometricSums photometric(const PhotometricInput& in) {
     const int middle = step - kWindowRadius;
     if (middle >= 0 && middle < in.height) {  // along y: SSIM and its derivatives
       rows_about(middle, in.height, moments, moment_row, zeros, rows);
-      F16 ssim_sum = F16(0.0f);
+      F16 dissimilarity = F16(0.0f);
       for (size_t i = 0; i < l.values; i += kLanes) {
         F16 m[4];
         filter_columns<4>(rows, 4 * i, m);
@@ -171,20 +171,21 @@ static PhotometricSums photometric(const PhotometricInput& in) {
         const F16 var_u = m[1] - uu, var_v = m[3] - vv;
         const F16 inv_b1 = F16(1.0f) / (half * (uu + vv) + c1);
         const F16 inv_b2 = F16(1.0f) / (half * (var_u + var_v) + c2);
-        const F16 luminance = (half * (uu - vv) + c1) * inv_b1;
-        const F16 structure = (half * (var_u - var_v) + c2) * inv_b2;
-        ssim_sum += first_lanes(luminance * structure, l.values - i);
+        // One minus either factor of SSIM, free of the cancellation that 1 - SSIM has for good renders.
+        const F16 e1 = vv * inv_b1, e2 = var_v * inv_b2;
+        dissimilarity += first_lanes(e1 + e2 - e1 * e2, l.values - i);
         if (!in.gradient) continue;
-        const F16 one = F16(1.0f);
-        const F16 by_uu = luminance * (one - structure) * inv_b2;
-        const F16 by_vv = -(luminance * (one + structure) * inv_b2);
-        const F16 by_mean = m[0] * (structure * (one - luminance) * inv_b1 - by_uu) -
-                            m[2] * (structure * (one + luminance) * inv_b1 + by_vv);
+        const F16 one = F16(1.0f), two = F16(2.0f);
+        const F16 luminance = one - e1, structure = one - e2;
+        const F16 by_uu = luminance * e2 * inv_b2;
+        const F16 by_vv = -(luminance * (two - e2) * inv_b2);
+        const F16 by_mean = m[0] * (structure * e1 * inv_b1 - by_uu) -
+                            m[2] * (structure * (two - e1) * inv_b1 + by_vv);
         store_first(padded[2] + i, by_mean, l.values - i);
         store_first(padded[3] + i, by_uu, l.values - i);
         store_first(padded[4] + i, by_vv, l.values - i);
       }
-      sums.ssim += sum_of(ssim_sum);
+      sums.dissimilarity += sum_of(dissimilarity);
       if (in.gradient) {
         float* out = slopes + (middle % kWindow) * slope_row;
         for (size_t i = 0; i < l.values; i += kLanes, out += 3 * kLanes) {

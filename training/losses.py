@@ -144,21 +144,17 @@ def depth_edge_weights(
 def photometric_loss_torch(rendered: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     """`photometric_loss` by torch alone, on any device and dtype, unchecked."""
     height, width, channels = rendered.shape[-3:]
-    x, y = (
-        t.reshape(-1, height, width, channels).movedim(-1, 1).reshape(-1, 1, height, width)
-        for t in (rendered, target)
-    )
+    x, y = (t.reshape(-1, height, width, channels).movedim(-1, 1) for t in (rendered, target))
     offset = torch.arange(WINDOW, dtype=x.dtype, device=x.device) - WINDOW // 2
     window = torch.exp(-(offset**2) / (2 * SIGMA**2))
-    window = window / window.sum()
-
-    def mean(image: Tensor) -> Tensor:
-        along_x = conv2d(image, window.view(1, 1, 1, -1), padding=(0, WINDOW // 2))
-        return conv2d(along_x, window.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
-
-    mean_x, mean_y = mean(x), mean(y)
-    variances = mean(x * x) + mean(y * y) - mean_x**2 - mean_y**2
-    covariance = mean(x * y) - mean_x * mean_y
+    window = (window / window.sum()).expand(5 * channels, 1, 1, WINDOW)
+    # One channel for each of five windowed means.
+    maps = torch.cat([x, y, x * x, y * y, x * y], dim=1)
+    maps = conv2d(maps, window, padding=(0, WINDOW // 2), groups=5 * channels)
+    maps = conv2d(maps, window.mT, padding=(WINDOW // 2, 0), groups=5 * channels)
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = maps.chunk(5, dim=1)
+    variances = mean_xx + mean_yy - mean_x**2 - mean_y**2
+    covariance = mean_xy - mean_x * mean_y
     ssim = ((2 * mean_x * mean_y + C1) * (2 * covariance + C2)) / (
         (mean_x**2 + mean_y**2 + C1) * (variances + C2)
     )
@@ -195,7 +191,7 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_value: Tensor) -> Any:
+    def backward(ctx: Any, grad_value: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return ctx.gradient * grad_value, None, None
 
 
@@ -224,7 +220,7 @@ class _LogDepth(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_value: Tensor) -> Any:
+    def backward(ctx: Any, grad_value: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return ctx.gradient * grad_value, None, None, None, None
 
 
