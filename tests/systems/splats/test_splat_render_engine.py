@@ -235,6 +235,8 @@ def test_copies_share_the_scene_and_nothing_else(duplicate):
     assert other.RemoveGeometry(id)
     assert depth(other)[CENTRE] == pytest.approx(3.0, rel=2e-3)
     assert depth(engine)[CENTRE] == pytest.approx(2.0, abs=1e-4)
+    assert engine.RemoveGeometry(id)
+    assert depth(engine)[CENTRE] == pytest.approx(4.0, rel=2e-3)
 
 
 def test_a_given_engine_renders_the_shapes():
