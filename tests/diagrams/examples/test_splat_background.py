@@ -16,9 +16,8 @@ from flysplat.diagrams.examples.splat_background import (
 from flysplat.diagrams.worlds.forest import make_forest
 from flysplat.diagrams.worlds.forest_config import ForestConfig
 
-pytestmark = pytest.mark.usefixtures("opengl")
 
-
+@pytest.mark.usefixtures("opengl")
 def test_runs(tmp_path):
     """The command writes its pictures, in which red and blue come and go between trunks."""
     module = "flysplat.diagrams.examples.splat_background"
@@ -33,6 +32,7 @@ def test_runs(tmp_path):
     assert min(blue[1:]) < 0.4 * max(blue)  # the box is partly hidden on its way
 
 
+@pytest.mark.usefixtures("opengl")
 def test_bodies_bounce_and_keep_clear_of_trunks():
     """Ball and box stay above the ground, move across the view, and never touch what is seen."""
     world = make_forest(ForestConfig())
