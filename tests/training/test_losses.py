@@ -244,7 +244,7 @@ def test_layout_in_memory_does_not_matter():
         lambda t, y: photometric_loss(t.permute(1, 2, 0), y), planar.permute(2, 0, 1), y
     )
     assert value == other[0] and torch.equal(gradient, other[1].permute(1, 2, 0))
-    image = torch.rand(9, 12, 4, requires_grad=True)
+    image = image_pair((9, 12, 4))[0].clamp(0.1, 0.9).requires_grad_()
     log_depth_loss(image[..., 3], torch.ones(9, 12)).backward()
     assert image.grad is not None
     assert image.grad[..., 3].all() and not image.grad[..., :3].any()
@@ -287,7 +287,7 @@ def test_jump_is_the_least_step(factor, edge):
     assert bool((depth_edge_weights(depth, jump=0.1) > 1).any()) == edge
 
 
-IMAGE = torch.rand(4, 5, 3)
+IMAGE = torch.full((4, 5, 3), 0.5)
 
 
 @pytest.mark.parametrize(
