@@ -12,6 +12,7 @@
 
 #include "baked_scene.hpp"
 #include "dispatch.hpp"
+#include "losses_module.hpp"
 #include "renderer.hpp"
 
 namespace nb = nanobind;
@@ -197,6 +198,8 @@ NB_MODULE(_native, m) {
           },
           "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a)
       .def("render", &render_baked);
+
+  bind_losses(m);
 }
 
 }  // namespace flysplat

@@ -4,7 +4,6 @@ from typing import cast
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import (
@@ -16,10 +15,12 @@ from pydrake.systems.sensors import (
 )
 
 from flysplat.systems.splats.baked_scene import BakedScene, RenderedView
-
-# Below one half, more of the light along a ray comes from behind the surface than from it: no depth
-# to speak of.
-OPAQUE_ALPHA = 0.5
+from flysplat.systems.splats.drake_images import (
+    color_pixels,
+    ranged_depth,
+    render_view,
+    surface_labels,
+)
 
 
 class SplatCamera(LeafSystem):
@@ -139,14 +140,11 @@ class SplatCamera(LeafSystem):
         """The view from body pose X_WB: float colour, depth and alpha, before they become Drake
         images.
         """
-        info = self._camera_info
-        return self._scene.render(
-            info.intrinsic_matrix(),
-            info.width(),
-            info.height(),
+        return render_view(
+            self._scene,
+            self._camera_info,
             X_WB @ self._X_BC,
-            near=self._clipping[0],
-            far=self._clipping[1],
+            *self._clipping,
             background=self._background,
         )
 
@@ -159,16 +157,12 @@ class SplatCamera(LeafSystem):
 
     def _calc_color(self, context, value) -> None:
         pixels = value.get_mutable_value().mutable_data  # (H, W, 4)
-        color = self._view(context).color
-        pixels[..., :3] = np.clip(color * 255.0 + 0.5, 0.0, 255.0)
+        pixels[..., :3] = color_pixels(self._view(context).color)
         pixels[..., 3] = 255
 
     def _depth(self, context) -> np.ndarray:
         """(H, W) [m], with 0 and inf out of range."""
-        view = self._view(context)
-        min_depth, max_depth = self._depth_range
-        seen = (view.alpha >= OPAQUE_ALPHA) & (view.depth <= max_depth)
-        return np.where(seen, np.where(view.depth < min_depth, 0.0, view.depth), np.inf)
+        return ranged_depth(self._view(context), *self._depth_range)
 
     def _calc_depth_32f(self, context, value) -> None:
         value.get_mutable_value().mutable_data[..., 0] = self._depth(context)
@@ -178,10 +172,7 @@ class SplatCamera(LeafSystem):
         value.get_mutable_value().mutable_data[..., 0] = millimetres
 
     def _calc_label(self, context, value) -> None:
-        surface = self._view(context).alpha >= OPAQUE_ALPHA
-        value.get_mutable_value().mutable_data[..., 0] = np.where(
-            surface, int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
-        )
+        value.get_mutable_value().mutable_data[..., 0] = surface_labels(self._view(context))
 
     def _calc_body_pose(self, context, value) -> None:
         value.set_value(self.GetInputPort("body_pose").Eval(context))

@@ -1,0 +1,61 @@
+"""Views of Gaussians as Drake's images: its cameras, depth ranges and labels."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import RenderLabel
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo
+
+from flysplat.systems.splats.baked_scene import BakedScene, RenderedView
+
+# Below one half, more of the light along a ray comes from behind the surface than from it: no depth
+# to speak of.
+OPAQUE_ALPHA = 0.5
+
+
+def render_view(
+    scene: BakedScene,
+    camera_info: CameraInfo,
+    X_WC: RigidTransform,
+    near: float,
+    far: float,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> RenderedView:
+    """What the pinhole camera of `camera_info` at X_WC sees; see `BakedScene.render`.
+
+    Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so the
+    intrinsics are taken as they are.
+    """
+    width, height = camera_info.width(), camera_info.height()
+    return scene.render(
+        camera_info.intrinsic_matrix(),
+        width,
+        height,
+        X_WC,
+        near=near,
+        far=far,
+        background=background,
+    )
+
+
+def color_pixels(color: NDArray) -> NDArray[np.uint8]:
+    """Colours in [0, 1], clipped, as the nearest of 0 to 255."""
+    return np.clip(color * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+
+
+def ranged_depth(view: RenderedView, min_depth: float, max_depth: float) -> NDArray[np.float32]:
+    """Planar depth of the surfaces in `view`  # (H, W) [m].
+
+    As in Drake, nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so
+    does a pixel whose alpha stays below one half.
+    """
+    seen = (view.alpha >= OPAQUE_ALPHA) & (view.depth <= max_depth)
+    return np.where(seen, np.where(view.depth < min_depth, np.float32(0), view.depth), np.inf)
+
+
+def surface_labels(view: RenderedView) -> NDArray[np.int16]:
+    """`RenderLabel.kUnspecified` where there is a surface and `RenderLabel.kEmpty` elsewhere:
+    Gaussians carry no semantics  # (H, W).
+    """
+    unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
+    return np.where(view.alpha >= OPAQUE_ALPHA, unspecified, empty).astype(np.int16)
