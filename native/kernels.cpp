@@ -1,7 +1,8 @@
 // The kernels of one SIMD level; compiled once per level with FLYSPLAT_LEVEL set to its name.
 #include "project_arrays.hpp"
 #include "project_baked.hpp"
-#include "raster.hpp"
+#include "projection_backward.hpp"
+#include "raster_backward.hpp"
 #include "tiles.hpp"
 
 namespace flysplat {
@@ -25,7 +26,9 @@ static size_t first_nonfinite(const float* values, size_t count) {
 #define FS_STRING_OF(name) #name
 #define FS_STRING(name) FS_STRING_OF(name)
 static const Kernels kTable = {FS_STRING(FLYSPLAT_LEVEL), project_arrays, project_baked,
-                               bin_splats, raster_tile, first_nonfinite};
+                               bin_splats, raster_tile,
+                               raster_tile_backward, gather_gradients, project_backward,
+                               first_nonfinite};
 
 }  // namespace FLYSPLAT_LEVEL
 
