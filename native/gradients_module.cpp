@@ -1,4 +1,5 @@
 // Python bindings of the backward pass.
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/vector.h>
 
 #include "bindings.hpp"
@@ -24,7 +25,7 @@ void check_pixels(const Pixels& array, const Camera& camera, size_t channels) {
           "an image has the wrong shape");
 }
 
-void raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image, Pixels v_alpha,
+size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image, Pixels v_alpha,
                      Pixels image, Pixels alpha, Floats<nb::shape<3>> background,
                      bool expected_depth, bool absolute,
                      Writable<nb::shape<-1, 16>> splat_gradients) {
@@ -48,8 +49,8 @@ void raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image, 
 
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
-  renderer.raster_backward(*kept.frame, g,
-                           reinterpret_cast<SplatGradient*>(splat_gradients.data()));
+  return renderer.raster_backward(*kept.frame, g,
+                                  reinterpret_cast<SplatGradient*>(splat_gradients.data()));
 }
 
 // Returns PoseSums.
@@ -92,7 +93,15 @@ void bind_gradients(nb::module_& m) {
         return KeptFrame{frame, frame->splat_count(), frame->gaussians};
       },
       "renderer"_a, "The last frame, if it was rendered with keep=True.");
-  m.def("raster_backward", &raster_backward);
+  m.def("raster_backward", &raster_backward,
+        "Writes (n, 16) gradients; returns how many (Gaussian, 4x4 block) were composited.");
+  m.def(
+      "multiply_add",
+      [](Renderer& renderer, size_t rounds) {
+        const nb::gil_scoped_release release;
+        return std::pair(renderer.kernels().multiply_add(rounds), 16 * kFmaChains * rounds);
+      },
+      "renderer"_a, "rounds"_a, "Does float multiply-adds; returns a sum and how many they were.");
   m.def("project_backward", &project_backward);
 }
 

@@ -148,7 +148,7 @@ FS_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
 }
 
 template <bool kColor, bool kDepth, bool kAbsolute>
-void raster_tile_backward_channels(const RasterInput& in, const ImageGradient& g, int tile,
+size_t raster_tile_backward_channels(const RasterInput& in, const ImageGradient& g, int tile,
                                    BackwardScratch& s, PairGradient* gradients) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const uint32_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
@@ -165,6 +165,7 @@ void raster_tile_backward_channels(const RasterInput& in, const ImageGradient& g
 
   const uint32_t reached = first + stages * kStageSize < last ? first + stages * kStageSize : last;
   std::memset(static_cast<void*>(gradients + reached), 0, (last - reached) * sizeof(PairGradient));
+  size_t records = 0;
   for (uint32_t stage = stages; stage-- > 0;) {
     const uint32_t begin = first + stage * kStageSize;
     const int count = static_cast<int>(last - begin < kStageSize ? last - begin : kStageSize);
@@ -182,31 +183,29 @@ void raster_tile_backward_channels(const RasterInput& in, const ImageGradient& g
       if (any(s.blocks[b].transmittance > F16(kMinTransmittance))) live |= 1u << b;
     }
     const BlockRecord* record = replay(s, in.pairs + begin, count, live);
+    records += static_cast<size_t>(record - s.records);
     for (int i = count; i-- > 0;) {
       record -= __builtin_popcount(s.touched[i]);
       backward_pair<kColor, kDepth, kAbsolute>(s.splats[i], s.touched[i], record, s.blocks,
                                                gradients[begin + i]);
     }
   }
+  return records;
 }
 
-inline void raster_tile_backward(const RasterInput& in, const ImageGradient& g, int tile,
-                                 void* scratch, PairGradient* gradients) {
+inline size_t raster_tile_backward(const RasterInput& in, const ImageGradient& g, int tile,
+                                   void* scratch, PairGradient* gradients) {
   BackwardScratch& s = *static_cast<BackwardScratch*>(scratch);
   const auto run = [&]<bool kAbsolute>() {
     if (g.color && g.depth) {
-      raster_tile_backward_channels<true, true, kAbsolute>(in, g, tile, s, gradients);
-    } else if (g.color) {
-      raster_tile_backward_channels<true, false, kAbsolute>(in, g, tile, s, gradients);
-    } else {
-      raster_tile_backward_channels<false, true, kAbsolute>(in, g, tile, s, gradients);
+      return raster_tile_backward_channels<true, true, kAbsolute>(in, g, tile, s, gradients);
     }
+    if (g.color) {
+      return raster_tile_backward_channels<true, false, kAbsolute>(in, g, tile, s, gradients);
+    }
+    return raster_tile_backward_channels<false, true, kAbsolute>(in, g, tile, s, gradients);
   };
-  if (g.absolute) {
-    run.operator()<true>();
-  } else {
-    run.operator()<false>();
-  }
+  return g.absolute ? run.operator()<true>() : run.operator()<false>();
 }
 
 // Adds up each splat's pairs, tile after tile, and turns sums over u and v into gradients.

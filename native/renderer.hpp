@@ -59,8 +59,8 @@ class Renderer {
   std::shared_ptr<const Frame> frame() const { return frame_; }
 
   // From the image to the frame's splats, in the order of the input; `gradients` holds
-  // frame.splat_count().
-  void raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients);
+  // frame.splat_count(). Returns how many (splat, 4x4 block) were composited.
+  size_t raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients);
   // From the splats to the Gaussians, which must be those of the frame; `means2d` (n, 2) stands in
   // for SplatGradient::mean. Adds to `out`.
   PoseSums project_backward(const Frame& frame, const GaussianArrays& gaussians,

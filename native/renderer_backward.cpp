@@ -1,4 +1,5 @@
 // The backward half of Renderer.
+#include <atomic>
 #include <memory>
 
 #include "renderer.hpp"
@@ -31,16 +32,17 @@ std::vector<size_t> chunk_starts(const Frame& frame) {
 
 // Every pair has a place of its own to write to, and a splat's pairs are added in the order of the
 // tiles: the sums do not depend on the threads.
-void Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
-                               SplatGradient* gradients) {
+size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
+                                 SplatGradient* gradients) {
+  std::atomic<size_t> composited{0};
   RasterInput input = raster_input(frame);
   input.later_stages = frame.later_stages.data();
   input.transmittance = const_cast<float*>(frame.transmittance.data());
   input.stages_done = const_cast<uint32_t*>(frame.stages_done.data());
   if (pair_gradients_.size() < frame.pairs.size()) pair_gradients_.resize(frame.pairs.size());
   pool_.for_each(frame.stages_done.size(), [&](size_t tile) {
-    kernels_.raster_tile_backward(input, image, static_cast<int>(tile), thread_scratch(),
-                                  pair_gradients_.data());
+    composited += kernels_.raster_tile_backward(input, image, static_cast<int>(tile),
+                                                thread_scratch(), pair_gradients_.data());
   });
   const std::vector<size_t> starts = chunk_starts(frame);
   pool_.for_each(starts.size(), [&](size_t chunk) {
@@ -49,6 +51,7 @@ void Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
                               frame.ranges.data() + first, frame.slots.data(),
                               pair_gradients_.data(), gradients + starts[chunk]);
   });
+  return composited;
 }
 
 PoseSums Renderer::project_backward(const Frame& frame, const GaussianArrays& gaussians,

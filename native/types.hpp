@@ -178,8 +178,9 @@ struct Kernels {
   size_t (*bin)(const Splat*, const uint32_t* order, size_t begin, size_t end, int tiles_x,
                 int tiles_y, TilePair*, size_t capacity, size_t* pair_count, uint32_t* tile_counts);
   void (*raster_tile)(const RasterInput&, int tile);
-  // Writes the gradients of a tile's pairs; `scratch` has kBackwardScratchBytes, aligned to 64.
-  void (*raster_tile_backward)(const RasterInput&, const ImageGradient&, int tile, void* scratch,
+  // Writes the gradients of a tile's pairs and returns how many (splat, block) it composited;
+  // `scratch` has kBackwardScratchBytes, aligned to 64.
+  size_t (*raster_tile_backward)(const RasterInput&, const ImageGradient&, int tile, void* scratch,
                                PairGradient*);
   // Adds up the pairs of `count` splats.
   void (*gather_gradients)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
@@ -190,7 +191,10 @@ struct Kernels {
                            PoseSums*);
   // Index of the first value that is NaN or infinite, or count.
   size_t (*first_nonfinite)(const float*, size_t count);
+  // kFmaChains independent products and sums of packs, `rounds` times: what the machine can do.
+  float (*multiply_add)(size_t rounds);
 };
+constexpr int kFmaChains = 12;
 
 #if defined(__x86_64__)
 const Kernels& kernels_v2();
