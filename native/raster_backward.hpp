@@ -164,7 +164,7 @@ size_t raster_tile_backward_channels(const RasterInput& in, const ImageGradient&
   }
 
   const uint32_t reached = first + stages * kStageSize < last ? first + stages * kStageSize : last;
-  std::memset(static_cast<void*>(gradients + reached), 0, (last - reached) * sizeof(PairGradient));
+  for (uint32_t slot = reached; slot < last; ++slot) gradients[slot] = {};
   size_t records = 0;
   for (uint32_t stage = stages; stage-- > 0;) {
     const uint32_t begin = first + stage * kStageSize;

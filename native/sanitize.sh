@@ -8,13 +8,13 @@ root=$(cd "$(dirname "$0")/.." && pwd)
 python=${1:-$root/.venv/bin/python}
 [ $# -gt 0 ] && shift
 build=$root/build/sanitize
-"$python" -m cmake -S "$root" -B "$build" -G Ninja -DCMAKE_BUILD_TYPE=RelWithDebInfo \
+"$python" -m cmake -S "$root" -B "$build" -G Ninja -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG= \
   -DCMAKE_MAKE_PROGRAM="$(dirname "$python")/ninja" -DPython_EXECUTABLE="$python" \
   -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" \
-  -DCMAKE_CXX_FLAGS="-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer"
+  -DCMAKE_CXX_FLAGS="-O1 -g1 -fsanitize=address,undefined -fno-sanitize-recover=all"
 "$python" -m cmake --build "$build"
 # The interpreter is not instrumented: the run-time library goes first, leaks are Python's own, and
-# flysplat._native comes from the build folder.
+# flysplat._native comes from the build folder. pytest must not swallow the report (-s).
 cd "$root"
 LD_PRELOAD="$(${CXX:-c++} -print-file-name=libasan.so) $(${CXX:-c++} -print-file-name=libstdc++.so)" \
 ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH="$build" \
@@ -34,5 +34,5 @@ import flysplat
 
 flysplat._native = module
 print("sanitized:", module.__file__)
-sys.exit(pytest.main([*(sys.argv[1:] or ["tests/systems/splats"]), "-p", "no:cacheprovider"]))
+sys.exit(pytest.main([*(sys.argv[1:] or ["tests/systems/splats"]), "-s"]))
 END
