@@ -259,6 +259,32 @@ def peak_growth(call: Callable[[], object]) -> float:
     return value("VmHWM") - before
 
 
+def print_gradient_agreement(scene: GaussianScene, X_WC: RigidTransform, reference: Any) -> None:
+    """Row by row, |gradient - float64 gradient| / |float64 gradient|; at 160x120, for memory."""
+    viewmats, Ks = cameras_of(X_WC, 160, 120)
+    view: dict[str, Any] = {"viewmat": viewmats[0], "K": Ks[0], "width": 160, "height": 120}
+    wide = {name: t.double().requires_grad_() for name, t in tensors_of(scene).items()}
+    expected = reference.render(**wide, **view)
+    clear = expected.margin > 1e-3
+    upstream = torch.randn(120, 160, 3) * clear[..., None]
+    expected.color.backward(upstream.double())
+    narrow = {name: t.requires_grad_() for name, t in tensors_of(scene).items()}
+    rasterize(**narrow, viewmats=viewmats, Ks=Ks, width=160, height=120)[0].backward(upstream[None])
+    print(
+        "\ngradients against float64's at 160x120, relative, by Gaussian (left out: "
+        f"{int((~clear).sum())} of {clear.numel()} pixels within 1e-3 of a threshold):"
+    )
+    for name in wide:
+        got, want = (x.grad.reshape(len(scene), -1).double() for x in (narrow[name], wide[name]))
+        size = want.norm(dim=1)
+        # The rest have gradients of rounding alone: the isotropic Gaussians' turn nothing.
+        large = size > 1e-6 * size.max().clamp(min=1e-3)
+        error = ((got - want).norm(dim=1) / size)[large]
+        if len(error):
+            p50, p99 = np.quantile(error.numpy(), (0.5, 0.99))
+            print(f"  {name}: median {p50:.1e}, p99 {p99:.1e}, of {len(error):,}")
+
+
 def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -310,6 +336,7 @@ def main() -> None:
             f"within rounding of a threshold {int((~clear).sum())} of {clear.numel()} pixels, "
             f"max there {error[~clear].max() if (~clear).any() else 0:.1e}"
         )
+    print_gradient_agreement(scene, X_WC, reference)
 
 
 if __name__ == "__main__":

@@ -150,8 +150,8 @@ FS_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indice
 
 // Gathers 16 splats and their gradients; lanes from `lanes` on repeat the first, without gradient.
 FS_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients,
-                             const float* means2d, int lanes, uint32_t* indices,
-                             SplatGradientPack& s) {
+                             const float* means2d, int lanes, bool colors_cut_off,
+                             uint32_t* indices, SplatGradientPack& s) {
   alignas(64) float soa[13][kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     const int i = lane < lanes ? lane : 0;
@@ -168,8 +168,11 @@ FS_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients
     soa[6][lane] = keep * g.uu;
     soa[7][lane] = keep * g.uv;
     soa[8][lane] = keep * g.vv;
-    // A colour that was cut off at 0 does not change.
-    for (int c = 0; c < 3; ++c) soa[9 + c][lane] = splat.color[c] > 0.0f ? keep * g.color[c] : 0.0f;
+    for (int c = 0; c < 3; ++c) {
+      // A colour that was cut off at 0 does not change with its coefficients.
+      const bool constant = colors_cut_off && !(splat.color[c] > 0.0f);
+      soa[9 + c][lane] = constant ? 0.0f : keep * g.color[c];
+    }
     soa[12][lane] = keep * g.depth;
   }
   s = {load(soa[0]), load(soa[1]), load(soa[2]), load(soa[3]), load(soa[4]), load(soa[5]),
@@ -187,7 +190,8 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     const int lanes = count - first < kLanes ? static_cast<int>(count - first) : kLanes;
     uint32_t indices[kLanes];
     SplatGradientPack s;
-    gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes, indices, s);
+    gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes,
+                  g.sh_degree >= 0, indices, s);
     alignas(64) float soa[11][kLanes];
     for (int lane = 0; lane < kLanes; ++lane) {
       const size_t i = indices[lane];

@@ -208,6 +208,14 @@ def test_odd_sizes_agree_with_reference(size):
     raise AssertionError("too many pixels at thresholds in every scene")
 
 
+def test_colors_are_not_cut_off():
+    """Black and negative colours are as free to move as any; only harmonics are cut off at 0."""
+    scene = random_scene(seed=30)
+    scene["colors"] = torch.round(3 * scene["colors"] - 1)
+    assert (scene["colors"] == 0).any() and (scene["colors"] < 0).any()
+    assert_agree(compare(scene))
+
+
 def test_directional_derivatives_agree_with_finite_differences():
     """The gradient along random directions equals the float64 reference's central difference."""
     scene = random_scene(count=12, seed=13, size=(19, 14))
