@@ -214,9 +214,11 @@ inline void gather_gradients(const Splat* splats, size_t count, const PairRange*
                              SplatGradient* gradients) {
   const float two_ln2 = 1.3862943611f;  // the exponent is in base 2
   for (size_t i = 0; i < count; ++i) {
-    if (i + kPrefetchAhead < count) __builtin_prefetch(slots + ranges[i + kPrefetchAhead].begin);
-    if (i + kPrefetchAhead / 2 < count) {
-      const PairRange& next = ranges[i + kPrefetchAhead / 2];
+    if (i + 3 * kPrefetchAhead < count) {
+      __builtin_prefetch(slots + ranges[i + 3 * kPrefetchAhead].begin);
+    }
+    if (i + kPrefetchAhead < count) {
+      const PairRange& next = ranges[i + kPrefetchAhead];
       for (uint32_t k = next.begin; k < next.end && k < next.begin + 4; ++k) {
         __builtin_prefetch(pairs + slots[k]);
       }
