@@ -5,7 +5,7 @@ PYTHON ?= $(shell for python in python3.12 python3.13 python3 python; do \
 BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 FLYSPLAT := .venv/bin/flysplat
 
-.PHONY: fly test lint clean
+.PHONY: fly test lint sanitize clean
 
 fly: .venv/installed
 	$(FLYSPLAT) fly --out out/fly
@@ -17,6 +17,11 @@ lint: .venv/installed
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/pyright
+
+# The splat tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
+sanitize: .venv/installed
+	.venv/bin/uv pip install --quiet --python .venv/bin/python cmake ninja nanobind
+	native/sanitize.sh
 
 clean:
 	rm -rf .venv build

@@ -1,7 +1,8 @@
 // The kernels of one SIMD level; compiled once per level with FLYSPLAT_LEVEL set to its name.
 #include "project_arrays.hpp"
 #include "project_baked.hpp"
-#include "raster.hpp"
+#include "projection_backward.hpp"
+#include "raster_backward.hpp"
 #include "tiles.hpp"
 
 namespace flysplat {
@@ -22,10 +23,27 @@ static size_t first_nonfinite(const float* values, size_t count) {
   return count;
 }
 
+static float multiply_add(size_t rounds) {
+  Register sums[kFmaChains];
+  for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = Register{} + 1.0f * chain;
+  const Register a = Register{} + 0.5f, b = Register{} + 1.0f;
+  for (size_t i = 0; i < rounds; ++i) {
+    for (int k = 0; k < kRegisters; ++k) {
+#pragma GCC unroll 12
+      for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = sums[chain] * a + b;
+    }
+  }
+  float total = 0.0f;
+  for (int chain = 0; chain < kFmaChains; ++chain) total += sums[chain][0];
+  return total;
+}
+
 #define FS_STRING_OF(name) #name
 #define FS_STRING(name) FS_STRING_OF(name)
 static const Kernels kTable = {FS_STRING(FLYSPLAT_LEVEL), project_arrays, project_baked,
-                               bin_splats, raster_tile, first_nonfinite};
+                               bin_splats, raster_tile,
+                               raster_tile_backward, gather_gradients, project_backward,
+                               first_nonfinite, multiply_add};
 
 }  // namespace FLYSPLAT_LEVEL
 

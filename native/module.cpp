@@ -1,82 +1,30 @@
 // Python bindings. Arguments are checked in Python, where errors can name tensors; here only what
 // memory safety needs is checked again.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include <algorithm>
 #include <cmath>
-#include <optional>
-#include <stdexcept>
 
 #include "baked_scene.hpp"
+#include "bindings.hpp"
 #include "dispatch.hpp"
 #include "losses_module.hpp"
-#include "renderer.hpp"
-
-namespace nb = nanobind;
-using namespace nb::literals;
 
 namespace flysplat {
 namespace {
 
-template <typename... Shape>
-using Floats = nb::ndarray<const float, Shape..., nb::c_contig, nb::device::cpu>;
-template <typename... Shape>
-using Doubles = nb::ndarray<const double, Shape..., nb::c_contig, nb::device::cpu>;
-using Output = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-
-using Means = Floats<nb::shape<-1, 3>>;
-using Quats = Floats<nb::shape<-1, 4>>;
-using Opacities = Floats<nb::ndim<1>>;
-using Colors = Floats<nb::shape<-1, -1, 3>>;
-
-void require(bool condition, const char* message) {
-  if (!condition) throw std::invalid_argument(message);
-}
-
-GaussianArrays gaussian_arrays(const Means& means, const Quats& quats, const Means& scales,
-                               const Opacities& opacities, const Colors& colors, int sh_degree) {
-  const size_t n = means.shape(0);
-  require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n &&
-              colors.shape(0) == n,
-          "arrays of Gaussians differ in length");
-  require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
-  const int coefficients = static_cast<int>(colors.shape(1));
-  require(sh_degree <= 3 && coefficients >= (sh_degree + 1) * (sh_degree + 1),
-          "too few spherical-harmonic coefficients for the degree");
-  return {n, means.data(), quats.data(), scales.data(), opacities.data(), colors.data(), sh_degree,
-          coefficients};
-}
-
-Camera camera_from(const Doubles<nb::shape<3, 3>>& K, const Doubles<nb::shape<4, 4>>& X_CW,
-                   int width, int height, double near_plane, double far_plane, double radius_clip,
-                   double eps2d) {
-  require(width > 0 && height > 0, "the image must have pixels");
-  require(width <= 32768 && height <= 32768, "the image is larger than 32768 pixels");
-  CameraParameters p{width, height, {}, {}, near_plane, far_plane, radius_clip, eps2d};
-  std::copy_n(K.data(), 9, p.K);
-  std::copy_n(X_CW.data(), 16, p.X_CW);
-  return make_camera(p);
-}
-
-void check_size(const Output& out, int width, int height, size_t channels) {
-  require(out.shape(0) == static_cast<size_t>(height) &&
-              out.shape(1) == static_cast<size_t>(width) && out.shape(2) == channels,
-          "an output array has the wrong shape");
-}
+using namespace nb::literals;
 
 // What gsplat calls meta, for the splats of the last frame, in the order of the input.
 nb::tuple projected(Renderer& renderer) {
   const std::scoped_lock lock(renderer.mutex());
   const size_t n = renderer.splat_count();
-  auto* values = new float[8 * n];
+  auto* values = new float[9 * n];
   auto* ids = new int64_t[n];
   nb::capsule value_owner(values, [](void* p) noexcept { delete[] static_cast<float*>(p); });
   nb::capsule id_owner(ids, [](void* p) noexcept { delete[] static_cast<int64_t*>(p); });
   float *radii = values, *means = values + 2 * n;
-  float *depths = values + 4 * n, *conics = values + 5 * n;
+  float *depths = values + 4 * n, *conics = values + 5 * n, *opacities = values + 8 * n;
   size_t i = 0;
   renderer.for_each_splat([&](const Splat& s) {
     ids[i] = s.index;
@@ -89,6 +37,7 @@ nb::tuple projected(Renderer& renderer) {
     conics[3 * i] = s.ux * s.ux * scale;
     conics[3 * i + 1] = s.ux * s.uy * scale;
     conics[3 * i + 2] = (s.uy * s.uy + s.vy * s.vy) * scale;
+    opacities[i] = std::exp2(s.log2_opacity);
     ++i;
   });
   const auto matrix = [&](float* data, size_t columns) {
@@ -97,19 +46,21 @@ nb::tuple projected(Renderer& renderer) {
   return nb::make_tuple(nb::ndarray<nb::numpy, int64_t, nb::ndim<1>>(ids, {n}, id_owner),
                         matrix(radii, 2), matrix(means, 2),
                         nb::ndarray<nb::numpy, float, nb::ndim<1>>(depths, {n}, value_owner),
-                        matrix(conics, 3));
+                        matrix(conics, 3),
+                        nb::ndarray<nb::numpy, float, nb::ndim<1>>(opacities, {n}, value_owner));
 }
 
 // Channels are colour (3), depth (1) or colour and depth (4), by the shape of `image`.
 size_t render(Renderer& renderer, Means means, Quats quats, Means scales, Opacities opacities,
               Colors colors, int sh_degree, Doubles<nb::shape<3, 3>> K,
               Doubles<nb::shape<4, 4>> X_CW, int width, int height, double near_plane,
-              double far_plane, double radius_clip, double eps2d, bool expected_depth,
-              Floats<nb::shape<3>> background, Output image, Output alpha) {
+              double far_plane, double radius_clip, double eps2d, bool antialiased,
+              bool expected_depth, Floats<nb::shape<3>> background, Output image, Output alpha,
+              bool keep) {
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  const Camera camera =
-      camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, eps2d);
+  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip,
+                                    eps2d, antialiased);
   const size_t channels = image.shape(2);
   require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
   check_size(image, width, height, channels);
@@ -124,7 +75,7 @@ size_t render(Renderer& renderer, Means means, Quats quats, Means scales, Opacit
 
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
-  renderer.render(gaussians, camera, out);
+  renderer.render(gaussians, camera, out, keep);
   return renderer.splat_count();
 }
 
@@ -184,7 +135,8 @@ NB_MODULE(_native, m) {
       .def_prop_ro("pair_count", &Renderer::pair_count,
                    "(Gaussian, tile) pairs of the last frame.")
       .def("projected", &projected,
-           "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) of the last frame.")
+           "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3), "
+           "opacities (n,) of the last frame.")
       .def("render", &render);
 
   nb::class_<BakedScene>(m, "BakedScene", "A static scene in the order and form frames need.")
@@ -200,6 +152,7 @@ NB_MODULE(_native, m) {
       .def("render", &render_baked);
 
   bind_losses(m);
+  bind_gradients(m);
 }
 
 }  // namespace flysplat

@@ -70,7 +70,7 @@ FS_INLINE F16 largest_component(const Vector16& a) {
 // from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
 // of large entries. Returns the lanes that are visible.
 FS_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
-                                   Vector16 p0, Vector16 p1, const F16& log2_opacity,
+                                   Vector16 p0, Vector16 p1, F16 log2_opacity,
                                    SplatPack& out) {
   // Scaling by g keeps the squares of huge Gaussians within range; it is exactly 1 for all others.
   const F16 largest = max(max(largest_component(p0), largest_component(p1)), F16(1e8f));
@@ -86,8 +86,12 @@ FS_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
   const F16 cross_x = p0.y * p1.z - p0.z * p1.y;
   const F16 cross_y = p0.z * p1.x - p0.x * p1.z;
   const F16 cross_z = p0.x * p1.y - p0.y * p1.x;
-  const F16 det = (cross_x * cross_x + cross_y * cross_y + cross_z * cross_z) +
-                  blur * (raw00 + raw11 + blur);
+  const F16 raw_det = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z;
+  const F16 det = raw_det + blur * (raw00 + raw11 + blur);
+  if (camera.antialiased) {
+    // What the blur adds to the area is taken from the opacity (Yu et al. 2024).
+    log2_opacity += F16(0.5f) * log2(max(raw_det / det, F16(1e-30f)));
+  }
 
   const F16 inverse_sigma_y = F16(1.0f) / sqrt(s11);
   out.vy = F16(kExponentScale) * inverse_sigma_y * g;

@@ -6,7 +6,6 @@
 
 namespace flysplat::FLYSPLAT_LEVEL {
 
-constexpr int kStageSize = 256;  // splats of a tile held at a time
 constexpr int kStageWords = kStageSize / 64;
 
 // A splat in the tile's own coordinates: u = ux x + uy y + u0, v = vy y + v0.
@@ -27,6 +26,12 @@ struct alignas(64) StagedTile {
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
 };
 
+FS_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
+  const float x = s.mean_x - left, y = s.mean_y - top;
+  return {s.ux, s.uy, -(s.ux * x + s.uy * y), s.vy, -(s.vy * y),
+          s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
+}
+
 FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float left, float top,
                      StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
@@ -34,10 +39,7 @@ FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float 
   for (int i = 0; i < count; ++i) {
     const Pair* pair = in.pairs + begin + i;
     if (i + kPrefetchAhead < count) __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
-    const Splat& s = in.splats[pair->splat];
-    const float x = s.mean_x - left, y = s.mean_y - top;
-    staged.splats[i] = {s.ux, s.uy, -(s.ux * x + s.uy * y), s.vy, -(s.vy * y),
-                        s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
+    staged.splats[i] = in_tile(in.splats[pair->splat], left, top);
     blocks[i] = static_cast<int32_t>(pair->blocks);
   }
   // Transposes the bits, 16 splats at a time: a bit shifted into the sign shows in the lane bits.
@@ -54,6 +56,13 @@ FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float 
   }
 }
 
+FS_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
+  const F16 u = F16(splat.ux) * x + (F16(splat.uy) * y + F16(splat.u0));
+  const F16 v = F16(splat.vy) * y + F16(splat.v0);
+  const F16 exponent = (F16(splat.log2_opacity) - u * u) - v * v;
+  return zero_unless(exponent >= F16(kLog2AlphaCut), min(exp2(exponent), F16(kMaxAlpha)));
+}
+
 // Composites the staged splats of one block; returns whether any pixel is still open.
 template <bool kColor, bool kDepth>
 FS_INLINE bool composite(const StagedTile& staged, int words, int b, const F16& x, const F16& y,
@@ -63,11 +72,7 @@ FS_INLINE bool composite(const StagedTile& staged, int words, int b, const F16& 
   for (int word = 0; word < words && open; ++word) {
     for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
       const StagedSplat& splat = staged.splats[64 * word + __builtin_ctzll(bits)];
-      const F16 u = F16(splat.ux) * x + (F16(splat.uy) * y + F16(splat.u0));
-      const F16 v = F16(splat.vy) * y + F16(splat.v0);
-      const F16 exponent = (F16(splat.log2_opacity) - u * u) - v * v;
-      const F16 alpha =
-          zero_unless(exponent >= F16(kLog2AlphaCut), min(exp2(exponent), F16(kMaxAlpha)));
+      const F16 alpha = alpha_at(splat, x, y);
       const F16 rest = s.transmittance * (F16(1.0f) - alpha);
       const Mask16 keep = rest > F16(kMinTransmittance);
       const F16 weight = zero_unless(keep, s.transmittance * alpha);
@@ -143,42 +148,64 @@ FS_INLINE void write_block(const Image& image, const BlockState& state, int widt
   }
 }
 
+// Pixel centres of the 16 lanes of a block, from its corner.
+struct LaneCentres {
+  F16 x, y;
+};
+
+FS_INLINE LaneCentres lane_centres() {
+  alignas(64) float x[kLanes], y[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
+    y[lane] = static_cast<float>(lane / kBlockSize) + 0.5f;
+  }
+  return {load(x), load(y)};
+}
+
+// 1 for pixels of block b of the tile that lie inside the image, else 0.
+FS_INLINE F16 ones_inside(const RasterInput& in, const LaneCentres& centres, int left, int top,
+                          int b) {
+  const int columns = in.width - left - kBlockSize * (b % 4);
+  const int rows = in.height - top - kBlockSize * (b / 4);
+  return zero_unless((centres.x < F16(static_cast<float>(columns))) &
+                         (centres.y < F16(static_cast<float>(rows))),
+                     F16(1.0f));
+}
+
 template <bool kColor, bool kDepth>
 void raster_tile_channels(const RasterInput& in, int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
-  alignas(64) float lane_x[kLanes], lane_y[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    lane_x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
-    lane_y[lane] = static_cast<float>(lane / kBlockSize) + 0.5f;
-  }
-
+  const LaneCentres centres = lane_centres();
   BlockState state[kBlocksPerTile];
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
-    const int columns = in.width - left - kBlockSize * (b % 4);
-    const int rows = in.height - top - kBlockSize * (b / 4);
-    const F16 one = F16(1.0f), zero = F16(0.0f);
-    const Mask16 pixels = (load(lane_x) < F16(static_cast<float>(columns))) &
-                          (load(lane_y) < F16(static_cast<float>(rows)));
-    state[b] = {zero_unless(pixels, one), zero, zero, zero, zero, zero};
-    if (columns > 0 && rows > 0) inside |= 1u << b;
+    const F16 zero = F16(0.0f);
+    state[b] = {ones_inside(in, centres, left, top, b), zero, zero, zero, zero, zero};
+    if (any(state[b].transmittance > zero)) inside |= 1u << b;
   }
 
   StagedTile staged;
   uint32_t live = inside;
   const uint32_t end = in.tile_offsets[tile + 1];
+  uint32_t stages = 0;
   for (uint32_t begin = in.tile_offsets[tile]; begin < end && live; begin += kStageSize) {
+    if (in.transmittance && stages > 0) {
+      float* saved = in.transmittance + (in.later_stages[tile] + stages - 1) * kTileSize * kTileSize;
+      for (int b = 0; b < kBlocksPerTile; ++b) store(saved + kLanes * b, state[b].transmittance);
+    }
+    ++stages;
     const int count = end - begin < kStageSize ? static_cast<int>(end - begin) : kStageSize;
     stage(in, begin, begin + count, static_cast<float>(left), static_cast<float>(top), staged);
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
-      const F16 x = load(lane_x) + F16(static_cast<float>(kBlockSize * (b % 4)));
-      const F16 y = load(lane_y) + F16(static_cast<float>(kBlockSize * (b / 4)));
+      const F16 x = centres.x + F16(static_cast<float>(kBlockSize * (b % 4)));
+      const F16 y = centres.y + F16(static_cast<float>(kBlockSize * (b / 4)));
       const bool open =
           composite<kColor, kDepth>(staged, (count + 63) / 64, b, x, y, state[b]);
       if (!open) live &= ~(1u << b);
     }
   }
+  if (in.stages_done) in.stages_done[tile] = stages;
   for (uint32_t bits = inside; bits; bits &= bits - 1) {
     const int b = __builtin_ctz(bits);
     write_block<kColor, kDepth>(in.image, state[b], in.width, in.height,

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "dispatch.hpp"
 
@@ -21,6 +22,7 @@ Camera make_camera(const CameraParameters& p) {
   // A splat is clipped when its radius, rounded up, does not exceed the limit.
   c.radius_clip = static_cast<float>(std::floor(p.radius_clip));
   c.eps2d = static_cast<float>(p.eps2d);
+  c.antialiased = p.antialiased;
 
   // centre = -R^-1 t by cofactors: R may be a rotation only to single precision.
   double R[3][3], t[3];
@@ -77,45 +79,63 @@ Camera make_camera(const CameraParameters& p) {
 Renderer::Renderer(int threads, const std::string& simd_level)
     : kernels_(flysplat::kernels(simd_level)), pool_(threads) {}
 
-void Renderer::render(const GaussianArrays& gaussians, const Camera& camera, const Image& image) {
+void Renderer::render(const GaussianArrays& gaussians, const Camera& camera, const Image& image,
+                      bool keep) {
+  start_frame(camera);
   project(gaussians.count, [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
     return kernels_.project(gaussians, camera, begin, end, splats, depth_bits);
   });
-  finish(camera, image);
+  finish(image, keep);
 }
 
 void Renderer::render(const BakedArrays& scene, const Camera& camera, const Image& image) {
+  start_frame(camera);
   project(scene.groups * 16, [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
     return kernels_.project_baked(scene, camera, begin, end, splats, depth_bits);
   });
-  finish(camera, image);
+  finish(image, false);
+}
+
+size_t Frame::splat_count() const {
+  return std::accumulate(chunk_counts.begin(), chunk_counts.end(), size_t{0});
 }
 
 void Renderer::for_each_splat(const std::function<void(const Splat&)>& visit) const {
-  for (size_t chunk = 0; chunk < chunk_counts_.size(); ++chunk) {
-    const Splat* first = splats_.data() + chunk * kChunkSize;
-    std::for_each(first, first + chunk_counts_[chunk], visit);
+  if (!frame_) return;
+  for (size_t chunk = 0; chunk < frame_->chunk_counts.size(); ++chunk) {
+    const Splat* first = frame_->splats.data() + chunk * kChunkSize;
+    std::for_each(first, first + frame_->chunk_counts[chunk], visit);
   }
+}
+
+// Takes memory that no backward pass waits for.
+void Renderer::start_frame(const Camera& camera) {
+  frame_.reset();
+  const auto is_free = [](const std::shared_ptr<Frame>& f) { return f.use_count() == 1; };
+  const auto found = std::find_if(frames_.begin(), frames_.end(), is_free);
+  frame_ = found == frames_.end() ? frames_.emplace_back(std::make_shared<Frame>()) : *found;
+  frame_->camera = camera;
 }
 
 template <typename Project>
 void Renderer::project(size_t count, const Project& project) {
+  Frame& frame = *frame_;
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
-  chunk_counts_.resize(chunks);
-  if (splats_.size() < count) {
-    splats_.resize(count);
-    depth_bits_.resize(count);
-  }
+  frame.gaussians = count;
+  frame.chunk_counts.resize(chunks);
+  if (frame.splats.size() < count) frame.splats.resize(count);
+  if (depth_bits_.size() < count) depth_bits_.resize(count);
   pool_.for_each(chunks, [&](size_t chunk) {
     const size_t begin = chunk * kChunkSize;
-    chunk_counts_[chunk] = project(begin, std::min(count, begin + kChunkSize),
-                                   splats_.data() + begin, depth_bits_.data() + begin);
+    frame.chunk_counts[chunk] = project(begin, std::min(count, begin + kChunkSize),
+                                        frame.splats.data() + begin, depth_bits_.data() + begin);
   });
 }
 
 // Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
 // consecutive ranges of the depth order, so the lists do not depend on how many there are.
-void Renderer::bin(int tiles_x, int tiles_y) {
+void Renderer::bin(int tiles_x, int tiles_y, bool keep) {
+  Frame& frame = *frame_;
   const size_t tiles = static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y);
   const size_t tasks = pool_.threads() == 1 ? 1 : 2 * static_cast<size_t>(pool_.threads());
   const size_t visible = order_.size();
@@ -126,52 +146,102 @@ void Renderer::bin(int tiles_x, int tiles_y) {
     task.count = 0;
     const size_t end = visible * (t + 1) / tasks;
     for (size_t i = visible * t / tasks; i < end;) {
-      i = kernels_.bin(splats_.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
+      i = kernels_.bin(frame.splats.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
                        task.pairs.size(), &task.count, task.tile_counts.data());
       if (i < end) task.pairs.resize(2 * task.pairs.size() + tiles + visible);
     }
   });
 
-  tile_offsets_.resize(tiles + 1);
+  frame.tile_offsets.resize(tiles + 1);
   uint32_t sum = 0;
   for (size_t tile = 0; tile < tiles; ++tile) {
-    tile_offsets_[tile] = sum;
+    frame.tile_offsets[tile] = sum;
     for (BinTask& task : bin_tasks_) {
       const uint32_t count = task.tile_counts[tile];
       task.tile_counts[tile] = sum;
       sum += count;
     }
   }
-  tile_offsets_[tiles] = sum;
-  pairs_.resize(sum);
+  frame.tile_offsets[tiles] = sum;
+  frame.pairs.resize(sum);
+  if (keep) {
+    frame.slots.resize(sum);
+    frame.ranges.resize(frame.splats.size());
+    for (const uint32_t splat : order_) frame.ranges[splat] = {0, 0};
+    uint32_t first = 0;
+    for (BinTask& task : bin_tasks_) {
+      task.first_slot = first;
+      first += static_cast<uint32_t>(task.count);
+    }
+  }
   pool_.for_each(tasks, [&](size_t t) {
     BinTask& task = bin_tasks_[t];
     for (size_t i = 0; i < task.count; ++i) {
       const TilePair& p = task.pairs[i];
-      pairs_[task.tile_counts[p.tile]++] = p.pair;
+      const uint32_t slot = task.tile_counts[p.tile]++;
+      frame.pairs[slot] = p.pair;
+      if (!keep) continue;
+      const uint32_t k = task.first_slot + static_cast<uint32_t>(i);
+      frame.slots[k] = slot;
+      PairRange& range = frame.ranges[p.pair.splat];
+      if (range.end == 0) range.begin = k;
+      range.end = k + 1;
     }
   });
 }
 
-void Renderer::finish(const Camera& camera, const Image& image) {
+void Renderer::sort() {
+  const Frame& frame = *frame_;
   items_.clear();
-  for (size_t chunk = 0; chunk < chunk_counts_.size(); ++chunk) {
+  for (size_t chunk = 0; chunk < frame.chunk_counts.size(); ++chunk) {
     const size_t first = chunk * kChunkSize;
-    for (size_t i = first; i < first + chunk_counts_[chunk]; ++i) {
+    for (size_t i = first; i < first + frame.chunk_counts[chunk]; ++i) {
       items_.push_back({depth_bits_[i], static_cast<uint32_t>(i)});
     }
   }
   radix_sort(items_, sort_scratch_);
   order_.resize(items_.size());
   for (size_t i = 0; i < items_.size(); ++i) order_[i] = items_[i].value;
+}
 
-  const int tiles_x = (camera.width + kTileSize - 1) / kTileSize;
-  const int tiles_y = (camera.height + kTileSize - 1) / kTileSize;
-  bin(tiles_x, tiles_y);
-  const RasterInput input{splats_.data(),  pairs_.data(),  tile_offsets_.data(), camera.width,
-                          camera.height,   tiles_x,        image};
-  pool_.for_each(static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y),
-                 [&](size_t tile) { kernels_.raster_tile(input, static_cast<int>(tile)); });
+RasterInput Renderer::raster_input(const Frame& frame) const {
+  RasterInput in{};
+  in.splats = frame.splats.data();
+  in.pairs = frame.pairs.data();
+  in.tile_offsets = frame.tile_offsets.data();
+  in.width = frame.camera.width;
+  in.height = frame.camera.height;
+  in.tiles_x = (in.width + kTileSize - 1) / kTileSize;
+  return in;
+}
+
+void Renderer::finish(const Image& image, bool keep) {
+  Frame& frame = *frame_;
+  frame.kept = keep;
+  sort();
+  const int tiles_x = (frame.camera.width + kTileSize - 1) / kTileSize;
+  const int tiles_y = (frame.camera.height + kTileSize - 1) / kTileSize;
+  bin(tiles_x, tiles_y, keep);
+  const size_t tiles = frame.tile_offsets.size() - 1;
+  RasterInput input = raster_input(frame);
+  input.image = image;
+  if (keep) {
+    frame.later_stages.resize(tiles + 1);
+    frame.stages_done.resize(tiles);
+    uint32_t stages = 0;
+    for (size_t tile = 0; tile < tiles; ++tile) {
+      frame.later_stages[tile] = stages;
+      const uint32_t count = frame.tile_offsets[tile + 1] - frame.tile_offsets[tile];
+      stages += count > kStageSize ? (count - 1) / kStageSize : 0;
+    }
+    frame.later_stages[tiles] = stages;
+    const size_t floats = size_t{stages} * kTileSize * kTileSize;
+    if (frame.transmittance.size() < floats) frame.transmittance.resize(floats);
+    input.later_stages = frame.later_stages.data();
+    input.transmittance = frame.transmittance.data();
+    input.stages_done = frame.stages_done.data();
+  }
+  pool_.for_each(tiles, [&](size_t tile) { kernels_.raster_tile(input, static_cast<int>(tile)); });
 }
 
 }  // namespace flysplat

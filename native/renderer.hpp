@@ -2,6 +2,7 @@
 #pragma once
 
 #include <functional>
+#include <memory>
 #include <mutex>
 #include <string>
 #include <vector>
@@ -18,50 +19,86 @@ struct CameraParameters {
   double X_CW[16];                  // world to camera, row-major
   double near_plane, far_plane;     // [m]
   double radius_clip, eps2d;        // [px], [px^2]
+  bool antialiased;
 };
 
 Camera make_camera(const CameraParameters& parameters);
 
+// What remains of a frame: splats and tile lists, and if it was rendered for a backward pass, what
+// that pass starts from.
+struct Frame {
+  Camera camera;
+  size_t gaussians = 0;  // in the input
+  // Chunk c owns splats[c * kChunkSize ...], of which the first chunk_counts[c] are in use.
+  std::vector<Splat> splats;
+  std::vector<size_t> chunk_counts;
+  std::vector<uint32_t> tile_offsets;
+  std::vector<Pair> pairs;
+
+  // For the backward pass, if `kept`. Splat i is in pairs[slots[k]] for k in ranges[i], by increasing tile.
+  bool kept = false;
+  std::vector<PairRange> ranges;
+  std::vector<uint32_t> slots;
+  std::vector<uint32_t> later_stages, stages_done;
+  std::vector<float> transmittance;
+
+  size_t splat_count() const;
+};
+
 // Holds the scratch memory of a frame and the threads; memory is reused by the next frame and never
-// influences it. After a frame the splats, their order and the tile lists remain readable: that is
-// what a backward pass starts from. Not for use by two threads at a time: hold mutex().
+// influences it. Not for use by two threads at a time: hold mutex().
 class Renderer {
  public:
   Renderer(int threads, const std::string& simd_level);
 
-  void render(const GaussianArrays& gaussians, const Camera& camera, const Image& image);
+  // With `keep`, frame() can be handed to the backward passes, also after later frames.
+  void render(const GaussianArrays& gaussians, const Camera& camera, const Image& image,
+              bool keep = false);
   void render(const BakedArrays& scene, const Camera& camera, const Image& image);
+
+  std::shared_ptr<const Frame> frame() const { return frame_; }
+
+  // From the image to the frame's splats, in the order of the input; `gradients` holds
+  // frame.splat_count(). Returns how many (splat, 4x4 block) were composited.
+  size_t raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients);
+  // From the splats to the Gaussians, which must be those of the frame; `means2d` (n, 2) stands in
+  // for SplatGradient::mean. Adds to `out`.
+  PoseSums project_backward(const Frame& frame, const GaussianArrays& gaussians,
+                            const SplatGradient* gradients, const float* means2d,
+                            const GaussianGradients& out);
 
   const Kernels& kernels() const { return kernels_; }
   std::mutex& mutex() { return mutex_; }
   // Visits the splats of the last frame in the order of the input.
   void for_each_splat(const std::function<void(const Splat&)>& visit) const;
   size_t splat_count() const { return items_.size(); }
-  size_t pair_count() const { return pairs_.size(); }
+  size_t pair_count() const { return frame_ ? frame_->pairs.size() : 0; }
 
  private:
+  void start_frame(const Camera& camera);
   template <typename Project>
   void project(size_t count, const Project& project);
-  void bin(int tiles_x, int tiles_y);
-  void finish(const Camera& camera, const Image& image);
+  void sort();
+  void bin(int tiles_x, int tiles_y, bool keep);
+  void finish(const Image& image, bool keep);
+  RasterInput raster_input(const Frame& frame) const;
 
   const Kernels& kernels_;
   ThreadPool pool_;
   std::mutex mutex_;
-  // Chunk c owns splats_[c * kChunkSize ...], of which the first chunk_counts_[c] are in use.
-  std::vector<Splat> splats_;
+  std::shared_ptr<Frame> frame_;                // the last one
+  std::vector<std::shared_ptr<Frame>> frames_;  // all there are, for their memory
   std::vector<uint32_t> depth_bits_;
-  std::vector<size_t> chunk_counts_;
   std::vector<KeyValue> items_, sort_scratch_;  // visible splats, by depth after sorting
   std::vector<uint32_t> order_;
   struct BinTask {
     std::vector<TilePair> pairs;
     size_t count = 0;
+    uint32_t first_slot = 0;
     std::vector<uint32_t> tile_counts;  // then: where this task's pairs of a tile go
   };
   std::vector<BinTask> bin_tasks_;
-  std::vector<uint32_t> tile_offsets_;
-  std::vector<Pair> pairs_;
+  std::vector<PairGradient> pair_gradients_;
 };
 
 }  // namespace flysplat

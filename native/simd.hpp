@@ -33,6 +33,7 @@ constexpr int kRegisterLanes = kRegisterBytes / 4;
 
 typedef float FloatRegister __attribute__((vector_size(kRegisterBytes)));
 typedef int32_t IntRegister __attribute__((vector_size(kRegisterBytes)));
+typedef uint32_t UnsignedRegister __attribute__((vector_size(kRegisterBytes)));
 
 struct F16 {
   FloatRegister r[kRegisters];
@@ -150,15 +151,22 @@ FS_INLINE F16 float_from_bits(const I16& a) {
   return b;
 }
 
+// Wraps around.
 FS_INLINE I16 operator+(const I16& a, const I16& b) {
   I16 c;
-  FS_EACH_REGISTER(k) c.r[k] = a.r[k] + b.r[k];
+  FS_EACH_REGISTER(k) {
+    c.r[k] = reinterpret_cast<IntRegister>(reinterpret_cast<UnsignedRegister>(a.r[k]) +
+                                           reinterpret_cast<UnsignedRegister>(b.r[k]));
+  }
   return c;
 }
 
 FS_INLINE I16 operator-(const I16& a, int32_t b) {
   I16 c;
-  FS_EACH_REGISTER(k) c.r[k] = a.r[k] - b;
+  FS_EACH_REGISTER(k) {
+    c.r[k] = reinterpret_cast<IntRegister>(reinterpret_cast<UnsignedRegister>(a.r[k]) -
+                                           static_cast<uint32_t>(b));
+  }
   return c;
 }
 

@@ -10,6 +10,7 @@ namespace flysplat {
 constexpr int kTileSize = 16;        // [px]
 constexpr int kBlockSize = 4;        // [px]; one block is 16 pixels, the width of a pack
 constexpr int kBlocksPerTile = 16;   // 4 x 4, one bit each of Pair::blocks
+constexpr int kStageSize = 256;      // splats of a tile held at a time
 constexpr int kChunkSize = 2048;     // Gaussians projected by one task
 constexpr int kPrefetchAhead = 8;    // splats are read in an order that caches cannot guess
 constexpr int kBoundSize = 64;       // baked Gaussians that share one bounding box
@@ -30,6 +31,7 @@ struct Camera {
   float fx, fy, cx, cy;            // [px]
   float near_plane, far_plane;     // [m]
   float radius_clip, eps2d;        // [px], [px^2]
+  bool antialiased;                // opacities fall as the blur spreads small Gaussians
   float R_CW[9];                   // row-major
   // The centre in two parts, so that p_W - centre keeps its digits far from the world's origin.
   float centre_high[3], centre_low[3];
@@ -101,6 +103,58 @@ struct RasterInput {
   const uint32_t* tile_offsets;   // (tiles + 1,)
   int width, height, tiles_x;
   Image image;
+  // What a backward pass starts from, or null: transmittance (16 blocks of 16 pixels) where the
+  // second and later stages of a tile start, from entry later_stages[tile] on; and how many stages
+  // were composited before every pixel was finished.
+  const uint32_t* later_stages;   // (tiles + 1,)
+  float* transmittance;
+  uint32_t* stages_done;          // (tiles,)
+};
+
+// The loss's derivatives by what was rendered; strides as in Image.
+struct ImageGradient {
+  const float* color;
+  const float* depth;
+  int stride;                     // of color and depth
+  const float* alpha;
+  const float* expected_depth;    // the rendered depth, if it was divided by alpha, else null
+  const float* rendered_alpha;
+  float background[3];
+  bool absolute;                  // absolute screen-space gradients are wanted
+};
+
+// Sums over pixels for one (splat, tile), h = alpha dL/dalpha: h, h u, h v, h u^2, h u v, h v^2,
+// dL/dcolor (3), dL/ddepth, |h u|, |h (u uy + v vy)|.
+struct alignas(64) PairGradient {
+  float sums[16];
+};
+
+// dL/d: mean (2) [1/px]; absolute sums of its terms (2); ln of the opacity; h u^2, h u v, h v^2;
+// color (3); depth.
+struct SplatGradient {
+  float mean[2], absolute_mean[2], log_opacity, uu, uv, vv, color[3], depth;
+  float unused[4];
+};
+static_assert(sizeof(SplatGradient) == 64);
+
+// The pairs of a splat: those at slots[begin], ..., slots[end - 1].
+struct PairRange {
+  uint32_t begin, end;
+};
+
+// Where dL/d(inputs) of one camera is added; shapes as in GaussianArrays.
+struct GaussianGradients {
+  float* means;
+  float* quats;
+  float* scales;
+  float* opacities;
+  float* colors;
+};
+
+// dL/dR_CW with the centre held (9, row-major), dL/dp_C (3) and dL/d(p_W - centre) by way of
+// spherical harmonics alone (3), summed over Gaussians.
+struct PoseSums {
+  double values[15];
 };
 
 // A pair before it is sorted by tile.
@@ -108,6 +162,8 @@ struct TilePair {
   uint32_t tile;
   Pair pair;
 };
+
+constexpr size_t kBackwardScratchBytes = 576 * 1024;
 
 struct Kernels {
   const char* name;
@@ -122,9 +178,23 @@ struct Kernels {
   size_t (*bin)(const Splat*, const uint32_t* order, size_t begin, size_t end, int tiles_x,
                 int tiles_y, TilePair*, size_t capacity, size_t* pair_count, uint32_t* tile_counts);
   void (*raster_tile)(const RasterInput&, int tile);
+  // Writes the gradients of a tile's pairs and returns how many (splat, block) it composited;
+  // `scratch` has kBackwardScratchBytes, aligned to 64.
+  size_t (*raster_tile_backward)(const RasterInput&, const ImageGradient&, int tile, void* scratch,
+                               PairGradient*);
+  // Adds up the pairs of `count` splats.
+  void (*gather_gradients)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
+                           const PairGradient*, SplatGradient*);
+  // From `count` splats to the Gaussians they came from; `means2d` (count, 2) replaces mean.
+  void (*project_backward)(const GaussianArrays&, const Camera&, const Splat*, size_t count,
+                           const SplatGradient*, const float* means2d, const GaussianGradients&,
+                           PoseSums*);
   // Index of the first value that is NaN or infinite, or count.
   size_t (*first_nonfinite)(const float*, size_t count);
+  // kFmaChains independent products and sums of packs, `rounds` times: what the machine can do.
+  float (*multiply_add)(size_t rounds);
 };
+constexpr int kFmaChains = 12;
 
 #if defined(__x86_64__)
 const Kernels& kernels_v2();

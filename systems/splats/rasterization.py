@@ -9,9 +9,12 @@ from torch import Tensor
 
 from flysplat import _native
 from flysplat.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
+from flysplat.systems.splats.rasterization_autograd import Composite, Project, Views, to_numpy
 
 TILE_SIZE = 16  # [px]
 CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
+
+RASTERIZE_MODES = ("classic", "antialiased")
 
 _scratch = (
     threading.local()
@@ -36,6 +39,8 @@ def rasterize(
     *,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
     threads: int = 1,
     simd: str = "",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -45,6 +50,11 @@ def rasterize(
     and T is what those in front let through; S is its covariance projected by the Jacobian at its
     centre, plus eps2d on the diagonal. Contributions with a < 1/255 are skipped, and a pixel is
     finished before T would fall to 1e-4. Gaussians of equal depth blend in the order of the input.
+
+    Colour, depth and alpha are differentiable with respect to means, quats, scales, opacities,
+    colors, viewmats (all twelve numbers, taken as free) and backgrounds; a Gaussian that is skipped
+    or held at a = .99 has no part in the derivative there. Equal input gives equal bits, gradients
+    included, whatever the number of threads.
 
     Args:
         means: (N, 3) centres [m].
@@ -65,6 +75,10 @@ def rasterize(
         backgrounds: (C, 3) colours behind everything, black if None; depth has no background.
         render_mode: "RGB"; "D", the accumulated depth sum w z [m]; "ED", the expected depth
             sum w z / sum w; or "RGB+D", "RGB+ED".
+        absgrad: In backward, set ``meta["means2d"].absgrad`` (M, 2): the sums over pixels of the
+            absolute values of what they add to the gradient of means2d.
+        rasterize_mode: "classic", or "antialiased": opacities are multiplied by
+            sqrt(det S / det(S + eps2d)), so that Gaussians narrower than a pixel keep their light.
         threads: CPU threads; the result does not depend on it.
         simd: See `create_renderer`.
 
@@ -72,11 +86,12 @@ def rasterize(
         render_colors (C, H, W, X), X = 3, 1 or 4 by `render_mode`; render_alphas (C, H, W, 1);
         and a dict on the M visible (camera, Gaussian) pairs, in that order, as gsplat's packed one:
         camera_ids, gaussian_ids, depths, opacities (M,), radii, means2d (M, 2), conics (M, 3), and
-        width, height, tile_size, tile_width, tile_height, n_cameras.
+        width, height, tile_size, tile_width, tile_height, n_cameras. After
+        ``meta["means2d"].retain_grad()``, its ``.grad`` holds screen-space gradients [1/px].
 
     Raises:
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it),
-            or a CPU tensor requires a gradient.
+            or Ks requires a gradient.
         ImportError: tensors are on a GPU and gsplat is not installed.
     """
     tensors = {
@@ -92,6 +107,10 @@ def rasterize(
         tensors["backgrounds"] = backgrounds
     if render_mode not in CHANNELS:
         raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+    if rasterize_mode not in RASTERIZE_MODES:
+        raise ValueError(
+            f"rasterize_mode is {rasterize_mode!r}; it must be one of {', '.join(RASTERIZE_MODES)}"
+        )
     _check_shapes(tensors, sh_degree)
     if means.device.type == "cuda":
         return _gsplat().rasterization(
@@ -111,81 +130,67 @@ def rasterize(
             sh_degree=sh_degree,
             backgrounds=backgrounds,
             render_mode=render_mode,
+            absgrad=absgrad,
+            rasterize_mode=rasterize_mode,
         )
     if means.device.type != "cpu":
         raise ValueError(f"tensors are on {means.device}; move them to 'cpu' or 'cuda'")
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()):
-        names = ", ".join(name for name, t in tensors.items() if t.requires_grad)
-        raise ValueError(
-            f"gradients are not available on the CPU, but {names} require them; detach the tensors "
-            "or call under torch.no_grad()"
-        )
+    if torch.is_grad_enabled() and Ks.requires_grad:
+        raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
 
     renderer = _renderer(threads, simd)
-    arrays = {
-        name: np.ascontiguousarray(tensor.detach().numpy()) for name, tensor in tensors.items()
-    }
+    arrays = {name: to_numpy(tensor) for name, tensor in tensors.items()}
     _check_values(arrays, renderer)
     for name, value in (("eps2d", eps2d), ("radius_clip", radius_clip)):
         if not 0 <= value < float("inf"):
             raise ValueError(f"{name} is {value}; it must be a finite number of pixels >= 0")
-    cameras = len(viewmats)
-    intrinsics = [check_camera(K, width, height, near_plane, far_plane) for K in arrays["Ks"]]
-    poses = arrays["viewmats"].astype(np.float64)
-    color_sets = arrays["colors"]
-    per_camera = color_sets.ndim == (3 if sh_degree is None else 4)
-    if sh_degree is None:
-        color_sets = color_sets[..., None, :]
-    black = np.zeros(3, dtype=np.float32)
-
-    render_colors = torch.empty((cameras, height, width, CHANNELS[render_mode]))
-    render_alphas = torch.empty((cameras, height, width, 1))
-    projected = []
-    for c in range(cameras):
-        renderer.render(
-            arrays["means"],
-            arrays["quats"],
-            arrays["scales"],
-            arrays["opacities"],
-            color_sets[c] if per_camera else color_sets,
-            -1 if sh_degree is None else sh_degree,
-            intrinsics[c],
-            poses[c],
-            width,
-            height,
-            near_plane,
-            far_plane,
-            radius_clip,
-            eps2d,
-            "ED" in render_mode,
-            arrays["backgrounds"][c] if backgrounds is not None else black,
-            render_colors[c].numpy(),
-            render_alphas[c].numpy(),
-        )
-        projected.append(renderer.projected())
-    return render_colors, render_alphas, _meta(projected, arrays["opacities"], width, height)
-
-
-def _meta(projected: list[tuple], opacities: np.ndarray, width: int, height: int) -> dict[str, Any]:
-    ids, radii, means2d, depths, conics = (
-        torch.from_numpy(np.concatenate(parts)) for parts in zip(*projected, strict=True)
+    views = Views(
+        renderer=renderer,
+        intrinsics=[check_camera(K, width, height, near_plane, far_plane) for K in arrays["Ks"]],
+        poses=arrays["viewmats"].astype(np.float64),
+        width=width,
+        height=height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        eps2d=eps2d,
+        antialiased=rasterize_mode == "antialiased",
+        sh_degree=sh_degree,
+        per_camera_colors=colors.ndim == (3 if sh_degree is None else 4),
+        backgrounds=arrays.get("backgrounds", np.zeros((len(viewmats), 3), dtype=np.float32)),
+        channels=CHANNELS[render_mode],
+        expected_depth="ED" in render_mode,
+        absgrad=absgrad,
     )
+    scene = (means, quats, scales, opacities, colors, viewmats)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()):
+        means2d = Project.apply(views, *scene)
+        image, alpha = Composite.apply(views, means2d, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
+    else:
+        image, alpha = views.render(arrays, keep=False)
+        means2d = torch.from_numpy(np.concatenate([p[2] for p in views.projected]))
+    return image, alpha, _meta(views, means2d, opacities.detach())
+
+
+def _meta(views: Views, means2d: Tensor, opacities: Tensor) -> dict[str, Any]:
+    ids, radii, _, depths, conics, compensated = (
+        torch.from_numpy(np.concatenate(parts)) for parts in zip(*views.projected, strict=True)
+    )
+    counts = torch.tensor([len(p[0]) for p in views.projected])
     return {
-        "camera_ids": torch.repeat_interleave(
-            torch.arange(len(projected)), torch.tensor([len(p[0]) for p in projected])
-        ),
+        "camera_ids": torch.repeat_interleave(torch.arange(len(counts)), counts),
         "gaussian_ids": ids,
         "radii": radii.int(),
         "means2d": means2d,
         "depths": depths,
         "conics": conics,
-        "opacities": torch.from_numpy(opacities)[ids],
-        "width": width,
-        "height": height,
+        "opacities": compensated if views.antialiased else opacities[ids],
+        "width": views.width,
+        "height": views.height,
         "tile_size": TILE_SIZE,
-        "tile_width": -(-width // TILE_SIZE),
-        "tile_height": -(-height // TILE_SIZE),
-        "n_cameras": len(projected),
+        "tile_width": -(-views.width // TILE_SIZE),
+        "tile_height": -(-views.height // TILE_SIZE),
+        "n_cameras": len(counts),
     }
 
 

@@ -5,7 +5,7 @@ whose generous bounding circle meets its tile, and everything is differentiable.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ class Projection(NamedTuple):
     covariance: Tensor  # (M, 2, 2) [px^2]
     depth: Tensor  # (M,) [m]
     ids: Tensor  # (M,) in the input
+    opacity: Tensor  # (M,) compensated if antialiased
 
 
 class Reference(NamedTuple):
@@ -31,6 +32,43 @@ class Reference(NamedTuple):
     depth: Tensor  # (H, W) accumulated
     alpha: Tensor  # (H, W)
     margin: Tensor  # (H, W) least relative distance of an alpha or a T to the threshold it met
+
+
+def random_scene(count=300, seed=0, sh_degree=None, cameras=1, size=(67, 45)) -> dict[str, Any]:
+    """Needles, discs and blobs in front of, around and behind cameras that look at the origin."""
+    g = torch.Generator().manual_seed(seed)
+    scene = {
+        "means": 1.5 * torch.randn(count, 3, generator=g),
+        "quats": 3 * torch.randn(count, 4, generator=g),
+        "scales": torch.exp(torch.randn(count, 3, generator=g) - 2.5),
+        "opacities": torch.rand(count, generator=g),
+        "colors": torch.rand(count, 3, generator=g),
+    }
+    if sh_degree is not None:
+        K = (sh_degree + 1) ** 2
+        scene["colors"] = 0.4 * torch.randn(count, K, 3, generator=g)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
+    for c in range(cameras):
+        q = torch.randn(1, 4, generator=g, dtype=torch.float64) * 0.1 + torch.tensor([1.0, 0, 0, 0])
+        viewmats[c, :3, :3] = rotation_matrices(q)[0]
+        viewmats[c, 2, 3] = 3.0 + c
+    width, height = size
+    K = torch.tensor([[0.9 * width, 0, 0.48 * width], [0, 1.1 * width, 0.55 * height], [0, 0, 1]])
+    scene["viewmats"] = viewmats.float()
+    scene["Ks"] = K.repeat(cameras, 1, 1)
+    return scene
+
+
+def single_gaussian(opacity=0.5, scale=0.1, depth=2.0, color=(0.2, 0.4, 0.8)) -> dict[str, Any]:
+    return {
+        "means": torch.tensor([[0.0, 0.0, depth]]),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "scales": torch.full((1, 3), scale),
+        "opacities": torch.tensor([opacity]),
+        "colors": torch.tensor([color]),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[100.0, 0, 16.5], [0, 100.0, 16.5], [0, 0, 1]]]),
+    }
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -83,8 +121,13 @@ def project(
     far: float = 1e10,
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
+    antialiased: bool = False,
 ) -> Projection:
-    """EWA projection: J R Sigma R^T J^T + eps2d I (Zwicker et al. 2001; Kerbl et al. 2023)."""
+    """EWA projection: J R Sigma R^T J^T + eps2d I (Zwicker et al. 2001; Kerbl et al. 2023).
+
+    `antialiased` multiplies opacities by the square root of the ratio of the determinants without
+    and with eps2d (Yu et al. 2024).
+    """
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     factor = rotation_matrices(quats) * scales[:, None, :]
@@ -99,7 +142,11 @@ def project(
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1)
     J = J.reshape(-1, 2, 3)
-    covariance = J @ sigma @ J.transpose(1, 2) + eps2d * torch.eye(2, dtype=means.dtype)
+    sharp = J @ sigma @ J.transpose(1, 2)
+    covariance = sharp + eps2d * torch.eye(2, dtype=means.dtype)
+    if antialiased:
+        ratio = torch.linalg.det(sharp) / torch.linalg.det(covariance)
+        opacities = opacities * torch.sqrt(ratio.clamp(min=1e-30))
     mean = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
 
     visible_opacity = opacities >= ALPHA_CUT
@@ -110,13 +157,11 @@ def project(
     large = (torch.ceil(radius) > radius_clip).any(1)
     index = torch.nonzero(inside & visible_opacity & on_image & large)[:, 0]
     index = index[torch.argsort(z[index], stable=True)]
-    return Projection(mean[index], covariance[index], z[index], index)
+    return Projection(mean[index], covariance[index], z[index], index, opacities[index])
 
 
-def composite(
-    projection: Projection, opacities: Tensor, colors: Tensor, width: int, height: int
-) -> Reference:
-    """Front-to-back blending; `opacities` (M,) and `colors` (M, 3) in the projection's order."""
+def composite(projection: Projection, colors: Tensor, width: int, height: int) -> Reference:
+    """Front-to-back blending; `colors` (M, 3) in the projection's order."""
     conic = torch.linalg.inv(projection.covariance)
     reach = 3.5 * torch.sqrt(torch.linalg.eigvalsh(projection.covariance)[:, 1])
     rows = []
@@ -134,7 +179,7 @@ def composite(
             pixels = torch.stack([u, v], -1).reshape(-1, 1, 2).to(conic)
             d = pixels - projection.mean[near]  # (P, G, 2)
             power = -0.5 * torch.einsum("pgi,gij,pgj->pg", d, conic[near], d)
-            raw = opacities[near] * torch.exp(power)
+            raw = projection.opacity[near] * torch.exp(power)
             alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
             after = torch.cumprod(1 - alpha, 1)
             before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
@@ -168,7 +213,7 @@ def render(
     width: int,
     height: int,
     sh_degree: int | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
     dtype: torch.dtype = torch.float64,
     **projection_options,
 ) -> Reference:
@@ -185,6 +230,6 @@ def render(
         basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
         coefficients = colors[p.ids, : (sh_degree + 1) ** 2]
         seen = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)
-    result = composite(p, opacities[p.ids], seen, width, height)
-    behind = (1 - result.alpha)[..., None] * torch.tensor(background, dtype=dtype)
+    result = composite(p, seen, width, height)
+    behind = (1 - result.alpha)[..., None] * torch.as_tensor(background, dtype=dtype)
     return result._replace(color=result.color + behind)

@@ -27,33 +27,9 @@ def _load_reference():
 
 
 reference = _load_reference()
+random_scene, single_gaussian = reference.random_scene, reference.single_gaussian
 
 LEVELS = _native.simd_levels()
-
-
-def random_scene(count=300, seed=0, sh_degree=None, cameras=1, size=(67, 45)) -> dict[str, Any]:
-    """Needles, discs and blobs in front of, around and behind cameras that look at the origin."""
-    g = torch.Generator().manual_seed(seed)
-    scene = {
-        "means": 1.5 * torch.randn(count, 3, generator=g),
-        "quats": 3 * torch.randn(count, 4, generator=g),
-        "scales": torch.exp(torch.randn(count, 3, generator=g) - 2.5),
-        "opacities": torch.rand(count, generator=g),
-        "colors": torch.rand(count, 3, generator=g),
-    }
-    if sh_degree is not None:
-        K = (sh_degree + 1) ** 2
-        scene["colors"] = 0.4 * torch.randn(count, K, 3, generator=g)
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
-    for c in range(cameras):
-        q = torch.randn(1, 4, generator=g, dtype=torch.float64) * 0.1 + torch.tensor([1.0, 0, 0, 0])
-        viewmats[c, :3, :3] = reference.rotation_matrices(q)[0]
-        viewmats[c, 2, 3] = 3.0 + c
-    width, height = size
-    K = torch.tensor([[0.9 * width, 0, 0.48 * width], [0, 1.1 * width, 0.55 * height], [0, 0, 1]])
-    scene["viewmats"] = viewmats.float()
-    scene["Ks"] = K.repeat(cameras, 1, 1)
-    return scene
 
 
 def call_reference(scene, width, height, camera=0, **options):
@@ -73,18 +49,6 @@ def assert_agrees(image, expected, clear, tolerance=2e-4):
     error = (image.double() - expected).abs()
     assert error.median() < 1e-6
     assert error[clear].max() < tolerance
-
-
-def single_gaussian(opacity=0.5, scale=0.1, depth=2.0, color=(0.2, 0.4, 0.8)) -> dict[str, Any]:
-    return {
-        "means": torch.tensor([[0.0, 0.0, depth]]),
-        "quats": torch.tensor([[1.0, 0, 0, 0]]),
-        "scales": torch.full((1, 3), scale),
-        "opacities": torch.tensor([opacity]),
-        "colors": torch.tensor([color]),
-        "viewmats": torch.eye(4)[None],
-        "Ks": torch.tensor([[[100.0, 0, 16.5], [0, 100.0, 16.5], [0, 0, 1]]]),
-    }
 
 
 @pytest.mark.parametrize("simd", LEVELS)
@@ -435,7 +399,8 @@ def _set(index, value):
         (_with("quats", _set(5, 0.0)), r"quats\[5\] is \[0.0, 0.0, 0.0, 0.0\]"),
         (_with("Ks", _set((0, 0, 0), 0.0)), r"focal lengths K\[0, 0\] = 0"),
         (_with("viewmats", lambda t: 2 * t), r"viewmats\[0\] is not a rigid transform"),
-        (_with("means", lambda t: t.clone().requires_grad_()), r"gradients.*means require"),
+        (_with("Ks", lambda t: t.clone().requires_grad_()), r"Ks requires a gradient.*detach"),
+        (lambda s: s | {"rasterize_mode": "smooth"}, r"rasterize_mode is 'smooth'; .* antialiased"),
         (lambda s: s | {"width": 0}, r"image size is 0 x 45"),
         (lambda s: s | {"height": -3}, r"image size is 67 x -3"),
         (lambda s: s | {"near_plane": 0.0}, r"0 < near < far"),

@@ -1,0 +1,65 @@
+// What the files of the Python module share.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <algorithm>
+#include <stdexcept>
+
+#include "renderer.hpp"
+
+namespace flysplat {
+
+namespace nb = nanobind;
+template <typename... Shape>
+using Floats = nb::ndarray<const float, Shape..., nb::c_contig, nb::device::cpu>;
+template <typename... Shape>
+using Doubles = nb::ndarray<const double, Shape..., nb::c_contig, nb::device::cpu>;
+using Output = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+
+using Means = Floats<nb::shape<-1, 3>>;
+using Quats = Floats<nb::shape<-1, 4>>;
+using Opacities = Floats<nb::ndim<1>>;
+using Colors = Floats<nb::shape<-1, -1, 3>>;
+
+inline void require(bool condition, const char* message) {
+  if (!condition) throw std::invalid_argument(message);
+}
+
+inline GaussianArrays gaussian_arrays(const Means& means, const Quats& quats, const Means& scales,
+                                      const Opacities& opacities, const Colors& colors, int sh_degree) {
+  const size_t n = means.shape(0);
+  require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n &&
+              colors.shape(0) == n,
+          "arrays of Gaussians differ in length");
+  require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
+  const int coefficients = static_cast<int>(colors.shape(1));
+  require(sh_degree <= 3 && coefficients >= (sh_degree + 1) * (sh_degree + 1),
+          "too few spherical-harmonic coefficients for the degree");
+  return {n, means.data(), quats.data(), scales.data(), opacities.data(), colors.data(), sh_degree,
+          coefficients};
+}
+
+inline Camera camera_from(const Doubles<nb::shape<3, 3>>& K, const Doubles<nb::shape<4, 4>>& X_CW,
+                          int width, int height, double near_plane, double far_plane, double radius_clip,
+                          double eps2d, bool antialiased = false) {
+  require(width > 0 && height > 0, "the image must have pixels");
+  require(width <= 32768 && height <= 32768, "the image is larger than 32768 pixels");
+  CameraParameters p{width, height, {}, {}, near_plane, far_plane, radius_clip, eps2d,
+                     antialiased};
+  std::copy_n(K.data(), 9, p.K);
+  std::copy_n(X_CW.data(), 16, p.X_CW);
+  return make_camera(p);
+}
+
+inline void check_size(const Output& out, int width, int height, size_t channels) {
+  require(out.shape(0) == static_cast<size_t>(height) &&
+              out.shape(1) == static_cast<size_t>(width) && out.shape(2) == channels,
+          "an output array has the wrong shape");
+}
+
+// Adds what the backward pass needs to the module.
+void bind_gradients(nb::module_& m);
+
+}  // namespace flysplat
