@@ -18,6 +18,9 @@ namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace flysplat {
+
+void bind_surfels(nb::module_& m);  // surfel_module.cpp
+
 namespace {
 
 template <typename... Shape>
@@ -197,6 +200,8 @@ NB_MODULE(_native, m) {
           },
           "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a)
       .def("render", &render_baked);
+
+  bind_surfels(m);
 }
 
 }  // namespace flysplat

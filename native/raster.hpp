@@ -27,6 +27,24 @@ struct alignas(64) StagedTile {
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
 };
 
+// From the blocks that each of `count` splats touches to the splats that touch each block: bits are
+// transposed 16 splats at a time, since a bit shifted into the sign shows in the lane bits. `blocks`
+// has room for a multiple of 64.
+FS_INLINE void transpose_blocks(int32_t* blocks, int count,
+                                uint64_t touching[kBlocksPerTile][kStageWords]) {
+  for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;
+  for (int word = 0; word < (count + 63) / 64; ++word) {
+    for (int b = 0; b < kBlocksPerTile; ++b) touching[b][word] = 0;
+    for (int part = 0; part < 4; ++part) {
+      const I16 pack = load(blocks + 64 * word + kLanes * part);
+      for (int b = 0; b < kBlocksPerTile; ++b) {
+        const uint64_t bits = sign_bits(shift_left(pack, 31 - b));
+        touching[b][word] |= bits << (kLanes * part);
+      }
+    }
+  }
+}
+
 FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float left, float top,
                      StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
@@ -40,18 +58,7 @@ FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float 
                         s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
     blocks[i] = static_cast<int32_t>(pair->blocks);
   }
-  // Transposes the bits, 16 splats at a time: a bit shifted into the sign shows in the lane bits.
-  for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;
-  for (int word = 0; word < (count + 63) / 64; ++word) {
-    for (int b = 0; b < kBlocksPerTile; ++b) staged.touching[b][word] = 0;
-    for (int part = 0; part < 4; ++part) {
-      const I16 pack = load(blocks + 64 * word + kLanes * part);
-      for (int b = 0; b < kBlocksPerTile; ++b) {
-        const uint64_t bits = sign_bits(shift_left(pack, 31 - b));
-        staged.touching[b][word] |= bits << (kLanes * part);
-      }
-    }
-  }
+  transpose_blocks(blocks, count, staged.touching);
 }
 
 // Composites the staged splats of one block; returns whether any pixel is still open.

@@ -98,8 +98,8 @@ void Renderer::for_each_splat(const std::function<void(const Splat&)>& visit) co
   }
 }
 
-template <typename Project>
-void Renderer::project(size_t count, const Project& project) {
+void Renderer::project(
+    size_t count, const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project) {
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
   chunk_counts_.resize(chunks);
   if (splats_.size() < count) {
@@ -115,7 +115,7 @@ void Renderer::project(size_t count, const Project& project) {
 
 // Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
 // consecutive ranges of the depth order, so the lists do not depend on how many there are.
-void Renderer::bin(int tiles_x, int tiles_y) {
+void Renderer::bin(BinKernel kernel, int tiles_x, int tiles_y) {
   const size_t tiles = static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y);
   const size_t tasks = pool_.threads() == 1 ? 1 : 2 * static_cast<size_t>(pool_.threads());
   const size_t visible = order_.size();
@@ -126,7 +126,7 @@ void Renderer::bin(int tiles_x, int tiles_y) {
     task.count = 0;
     const size_t end = visible * (t + 1) / tasks;
     for (size_t i = visible * t / tasks; i < end;) {
-      i = kernels_.bin(splats_.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
+      i = kernel(splats_.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
                        task.pairs.size(), &task.count, task.tile_counts.data());
       if (i < end) task.pairs.resize(2 * task.pairs.size() + tiles + visible);
     }
@@ -153,7 +153,7 @@ void Renderer::bin(int tiles_x, int tiles_y) {
   });
 }
 
-void Renderer::finish(const Camera& camera, const Image& image) {
+void Renderer::sort() {
   items_.clear();
   for (size_t chunk = 0; chunk < chunk_counts_.size(); ++chunk) {
     const size_t first = chunk * kChunkSize;
@@ -164,10 +164,13 @@ void Renderer::finish(const Camera& camera, const Image& image) {
   radix_sort(items_, sort_scratch_);
   order_.resize(items_.size());
   for (size_t i = 0; i < items_.size(); ++i) order_[i] = items_[i].value;
+}
 
+void Renderer::finish(const Camera& camera, const Image& image) {
+  sort();
   const int tiles_x = (camera.width + kTileSize - 1) / kTileSize;
   const int tiles_y = (camera.height + kTileSize - 1) / kTileSize;
-  bin(tiles_x, tiles_y);
+  bin(kernels_.bin, tiles_x, tiles_y);
   const RasterInput input{splats_.data(),  pairs_.data(),  tile_offsets_.data(), camera.width,
                           camera.height,   tiles_x,        image};
   pool_.for_each(static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y),

@@ -39,10 +39,12 @@ class Renderer {
   size_t splat_count() const { return items_.size(); }
   size_t pair_count() const { return pairs_.size(); }
 
- private:
-  template <typename Project>
-  void project(size_t count, const Project& project);
-  void bin(int tiles_x, int tiles_y);
+ protected:
+  // Splats of Gaussians [0, count), chunk by chunk: project(begin, end, splats, depth bits) returns
+  // how many.
+  void project(size_t count, const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project);
+  void sort();
+  void bin(BinKernel kernel, int tiles_x, int tiles_y);
   void finish(const Camera& camera, const Image& image);
 
   const Kernels& kernels_;
