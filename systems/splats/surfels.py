@@ -1,6 +1,6 @@
 """2D Gaussian splatting (surfels; Huang et al. 2024) on the CPU, with gradients."""
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -157,7 +157,7 @@ class _View(NamedTuple):
 class _Frames:
     """One native renderer per camera, lent for as long as its frame may be needed."""
 
-    idle: dict[tuple[int, str], list[_native.SurfelRenderer]] = {}
+    idle: ClassVar[dict[tuple[int, str], list[_native.SurfelRenderer]]] = {}
 
     def __init__(self, view: _View):
         self._idle = self.idle.setdefault((view.threads, view.simd), [])

@@ -45,10 +45,11 @@ def render(
     far: float = 1e10,
     sh_degree: int | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    dtype: torch.dtype = torch.float64,
 ) -> Reference:
-    """One camera; tensors are cast to float64."""
+    """One camera; tensors are cast to `dtype`."""
     means, quats, scales, opacities, colors, viewmat, K = (
-        a.double() for a in (means, quats, scales, opacities, colors, viewmat, K)
+        a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
     )
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     p_C = means @ R.T + t
@@ -74,7 +75,7 @@ def render(
         seen = torch.clamp(0.5 + torch.einsum("mk,mkc->mc", basis, coefficients), min=0)
 
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    x, y = x.reshape(-1, 1).double(), y.reshape(-1, 1).double()  # (P, 1)
+    x, y = x.reshape(-1, 1).to(dtype), y.reshape(-1, 1).to(dtype)  # (P, 1)
     # The planes of the pixel's column and row, in the surfel's coordinates; a ray lies in both.
     h_u = x[..., None] * H[:, 2] - H[:, 0]  # (P, M, 3)
     h_v = y[..., None] * H[:, 2] - H[:, 1]
@@ -116,7 +117,7 @@ def render(
     ).amin(0)
     margin = torch.cat([margin, torch.inf * ones], 1).amin(1)
     total = weight.sum(1)
-    color = weight @ seen + (1 - total)[:, None] * torch.tensor(background).double()
+    color = weight @ seen + (1 - total)[:, None] * torch.tensor(background, dtype=dtype)
     shape = (height, width)
     return Reference(
         color.reshape(*shape, 3),
