@@ -46,19 +46,26 @@ struct PlaneGradient {
 FS_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& s,
                                        const F16 scale[2], const F16 g[16]) {
   const F16 zero = F16(0.0f);
-  const F16 inverse_fx = F16(1.0f / camera.fx), inverse_fy = F16(1.0f / camera.fy);
   const F16 inverse_s0 = F16(1.0f) / scale[0], inverse_s1 = F16(1.0f) / scale[1];
-  const F16 u_x = g[0] * inverse_fx, u_y = g[1] * inverse_fy;
-  const F16 v_x = g[2] * inverse_fx, v_y = g[3] * inverse_fy;
-  const F16 w_x = g[4] * inverse_fx, w_y = g[5] * inverse_fy;
-  const F16 by_log_u = u_x * s.u.x + u_y * s.u.y, by_log_v = v_x * s.v.x + v_y * s.v.y;
-  const F16 by_log_w = w_x * s.w.x + w_y * s.w.y;
+  const F16 inverse_z = F16(1.0f) / s.p.z;
+  // d = A (u . d, v . d), with A the image of the scaled tangents; by focal lengths both ways.
+  Vector16 A[2];
+  for (int k = 0; k < 2; ++k) {
+    A[k] = {scale[k] * (s.t[k].x - s.p.x * inverse_z * s.t[k].z),
+            scale[k] * (s.t[k].y - s.p.y * inverse_z * s.t[k].z), zero};
+  }
+  const Vector16 by_u0 = sum(scaled(A[0], g[0]), scaled(A[1], g[1]));
+  const Vector16 by_v0 = sum(scaled(A[0], g[2]), scaled(A[1], g[3]));
+  const Vector16 by_w = sum(scaled(A[0], g[4]), scaled(A[1], g[5]));
+  // Derivatives with respect to the logarithms of common factors; w . A[k] is -scale t.z / p.z.
+  const F16 by_log_u = g[0], by_log_v = g[3];
+  const F16 by_log_w =
+      -((g[4] * scale[0] * s.t[0].z + g[5] * scale[1] * s.t[1].z) * inverse_z);
   const F16 u_factor = s.inverse_facing * inverse_s0, v_factor = s.inverse_facing * inverse_s1;
-  const Vector16 by_u = {u_x * u_factor, u_y * u_factor, zero};  // of t1 x p
-  const Vector16 by_v = {v_x * v_factor, v_y * v_factor, zero};  // of p x t0
+  const Vector16 by_u = scaled(by_u0, u_factor);  // of t1 x p
+  const Vector16 by_v = scaled(by_v0, v_factor);  // of p x t0
   const F16 by_facing = -((by_log_u + by_log_v + by_log_w) * s.inverse_facing);
-  const Vector16 by_n = sum({w_x * s.inverse_facing, w_y * s.inverse_facing, zero},
-                            scaled(s.p, by_facing));
+  const Vector16 by_n = sum(scaled(by_w, s.inverse_facing), scaled(s.p, by_facing));
 
   PlaneGradient out;
   out.p = sum(scaled(s.t[2], by_facing), sum(cross(by_u, s.t[1]), cross(s.t[0], by_v)));
@@ -74,7 +81,6 @@ FS_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& 
     out.scale[k] = zero_unless(met, out.scale[k]);
   }
 
-  const F16 inverse_z = F16(1.0f) / s.p.z;
   const F16 by_x = g[6] * F16(camera.fx) * inverse_z, by_y = g[7] * F16(camera.fy) * inverse_z;
   out.p = sum(out.p, {by_x, by_y, g[8] - (by_x * s.p.x + by_y * s.p.y) * inverse_z});
   return out;

@@ -46,6 +46,7 @@ FS_INLINE BlockLanes block_lanes(int b) {
 // How a surfel appears in 16 pixels.
 struct SurfelSample {
   F16 dx, dy;
+  F16 U, V;      // u . d and v . d of the surfel
   F16 u, v;      // where the ray meets the plane, in standard deviations
   F16 z;         // at which depth
   Mask16 hit;    // whether that counts, or else the blob
@@ -61,8 +62,10 @@ FS_INLINE SurfelSample sample_surfel(const Surfel& s, const BlockLanes& pixel,
   a.dx = pixel.x - F16(s.mean[0]);
   a.dy = pixel.y - F16(s.mean[1]);
   a.z = F16(1.0f) / (F16(s.w[0]) * a.dx + (F16(s.w[1]) * a.dy + F16(s.inverse_depth)));
-  a.u = (F16(s.u[0]) * a.dx + F16(s.u[1]) * a.dy) * a.z;
-  a.v = (F16(s.v[0]) * a.dx + F16(s.v[1]) * a.dy) * a.z;
+  a.U = F16(s.u[0]) * a.dx + F16(s.u[1]) * a.dy;
+  a.V = F16(s.v[0]) * a.dx + F16(s.v[1]) * a.dy;
+  a.u = a.U * a.z;
+  a.v = a.V * a.z;
   const F16 on_plane = a.u * a.u + a.v * a.v;
   const F16 of_blob = F16(1.0f / kBlobVariance) * (a.dx * a.dx + a.dy * a.dy);
   a.hit = (a.z >= near_plane) & (on_plane <= of_blob);

@@ -87,15 +87,17 @@ FS_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, 
   const F16 by_q =
       -(zero_unless(a.hit, a.z * (a.z * by_depth + (a.u * by_u + a.v * by_v))));
   const F16 by_U = zero_unless(a.hit, a.z * by_u), by_V = zero_unless(a.hit, a.z * by_v);
+  // Masked, since a product of zero and an infinity is none.
+  const F16 U = zero_unless(a.hit, a.U), V = zero_unless(a.hit, a.V);
   const F16 by_blob = by_exponent - zero_unless(a.hit, by_exponent);
   const F16 of_blob = F16(1.0f / kBlobVariance) * by_blob;
   const F16 q = F16(surfel.inverse_depth);
-  sums[0] += by_U * a.dx;
-  sums[1] += by_U * a.dy;
-  sums[2] += by_V * a.dx;
-  sums[3] += by_V * a.dy;
-  sums[4] += by_q * a.dx;
-  sums[5] += by_q * a.dy;
+  sums[0] += by_U * U;
+  sums[1] += by_U * V;
+  sums[2] += by_V * U;
+  sums[3] += by_V * V;
+  sums[4] += by_q * U;
+  sums[5] += by_q * V;
   sums[6] += of_blob * a.dx -
              (by_U * F16(surfel.u[0]) + (by_V * F16(surfel.v[0]) + by_q * F16(surfel.w[0])));
   sums[7] += of_blob * a.dy -

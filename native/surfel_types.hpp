@@ -65,7 +65,8 @@ struct SurfelRasterInput {
 };
 
 // Derivatives of the loss, summed over the pixels of a tile, with respect to fields of a Surfel
-// and, in `exponent`, to log alpha.
+// and, in `exponent`, to log alpha. Those with respect to u, v and w, which are vectors d times a
+// number, are told by that number's products with (u . d, v . d): needles keep their digits.
 struct alignas(64) SurfelGradient {
   float u[2], v[2], w[2], mean[2], depth, exponent, color[3], normal[3];
 };

