@@ -30,14 +30,20 @@ def depth_to_normals(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
             raise ValueError(
                 f"{name} has shape {tuple(tensor.shape)}; it must be ({C}, {size}, {size})"
             )
-    x = (torch.arange(W, dtype=depths.dtype) + 0.5 - Ks[:, None, 0, 2]) / Ks[:, None, 0, 0]
-    y = (torch.arange(H, dtype=depths.dtype) + 0.5 - Ks[:, None, 1, 2]) / Ks[:, None, 1, 1]
-    rays = torch.stack(
-        [x[:, None, :].expand(C, H, W), y[:, :, None].expand(C, H, W), torch.ones(C, H, W)], -1
+    # Component by component: images of vectors take torch several times as long.
+    x = ((torch.arange(W) + 0.5 - Ks[:, None, 0, 2]) / Ks[:, None, 0, 0])[:, None, :]
+    y = ((torch.arange(H) + 0.5 - Ks[:, None, 1, 2]) / Ks[:, None, 1, 1])[:, :, None]
+    z = depths[..., 0]  # (C, H, W)
+    point = (x * z, y * z, z)  # in the camera frame
+    a0, a1, a2 = (c[:, 2:, 1:-1] - c[:, :-2, 1:-1] for c in point)
+    b0, b1, b2 = (c[:, 1:-1, 2:] - c[:, 1:-1, :-2] for c in point)
+    n = (a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0)
+    squared = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
+    # Without a plane there is neither a normal nor a gradient, which division would make huge.
+    inverse = torch.where(squared > 1e-24, torch.rsqrt(squared.clamp(min=1e-24)), 0.0)
+    R = viewmats[:, :3, :3, None, None]
+    normals = torch.stack(
+        [(R[:, 0, i] * n[0] + R[:, 1, i] * n[1] + R[:, 2, i] * n[2]) * inverse for i in range(3)],
+        -1,
     )
-    points = depths * rays.to(depths.dtype)  # (C, H, W, 3) in the camera frame
-    down = points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
-    right = points[:, 1:-1, 2:] - points[:, 1:-1, :-2]
-    normals = torch.nn.functional.normalize(torch.linalg.cross(down, right), dim=-1)
-    padded = torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))
-    return torch.einsum("cji,chwj->chwi", viewmats[:, :3, :3], padded)
+    return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))

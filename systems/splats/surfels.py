@@ -121,16 +121,14 @@ def rasterize_surfels(
         means, quats, scales, opacities, colors, viewmats, view, frames
     )
 
-    expected = depth / alpha.clamp(min=1e-10)
-    parts = []
+    parts, surface = [], None
     if "RGB" in render_mode:
         if backgrounds is not None:
             color = color + (1 - alpha) * backgrounds[:, None, None, :]
         parts.append(color)
     if "D" in render_mode:
+        expected = depth / alpha.clamp(min=1e-10)
         parts.append(expected if "ED" in render_mode else depth)
-    surface = None
-    if "D" in render_mode:
         surface = depth_to_normals(expected if depth_mode == "expected" else median, viewmats, Ks)
     images = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
     meta = _meta(frames.projected, arrays["opacities"], width, height)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from flysplat import _native
 from flysplat.systems.splats import rasterize
+from flysplat.systems.splats.depth_normals import depth_to_normals
 from flysplat.systems.splats.surfels import rasterize_surfels
 
 
@@ -234,6 +235,23 @@ def test_surface_normals_are_in_the_world_and_differentiable():
         assert (inner - R @ normal).abs().max() < 2e-3, name
     images["surface"][..., 0].sum().backward()
     assert turned["means"].grad is not None and turned["means"].grad.abs().max() > 0
+
+
+def test_depth_without_a_plane_has_no_normal():
+    """Beside pixels that see nothing normals are zero where no plane is, and gradients bounded."""
+    depths = torch.zeros(1, 7, 7, 1)
+    depths[0, 3, 3] = 2.0
+    depths[0, 1, 1:5] = 2.0
+    depths.requires_grad_()
+    Ks = torch.tensor([[[100.0, 0, 3.5], [0, 100.0, 3.5], [0, 0, 1]]])
+    normals = depth_to_normals(depths, torch.eye(4)[None], Ks)
+    assert not normals[0, 5, 5].any() and torch.isfinite(normals).all()
+    (
+        normals * torch.rand(normals.shape, generator=torch.Generator().manual_seed(0))
+    ).sum().backward()
+    assert depths.grad is not None and depths.grad.abs().max() < 1e3
+    with pytest.raises(ValueError, match=r"depths has shape \(7, 7\)"):
+        depth_to_normals(depths[0, ..., 0], torch.eye(4)[None], Ks)
 
 
 def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
