@@ -27,9 +27,9 @@ struct alignas(64) StagedTile {
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
 };
 
-// From the blocks that each of `count` splats touches to the splats that touch each block: bits are
-// transposed 16 splats at a time, since a bit shifted into the sign shows in the lane bits. `blocks`
-// has room for a multiple of 64.
+// From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
+// transposed 16 splats at a time: one shifted into the sign shows in the lane bits. `blocks` has
+// room for a multiple of 64.
 FS_INLINE void transpose_blocks(int32_t* blocks, int count,
                                 uint64_t touching[kBlocksPerTile][kStageWords]) {
   for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;

@@ -42,7 +42,8 @@ class Renderer {
  protected:
   // Splats of Gaussians [0, count), chunk by chunk: project(begin, end, splats, depth bits) returns
   // how many.
-  void project(size_t count, const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project);
+  void project(size_t count,
+               const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project);
   void sort();
   void bin(BinKernel kernel, int tiles_x, int tiles_y);
   void finish(const Camera& camera, const Image& image);

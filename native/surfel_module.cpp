@@ -150,7 +150,7 @@ nb::tuple projected(SurfelRenderer& renderer) {
 }  // namespace
 
 void bind_surfels(nb::module_& m) {
-  nb::class_<SurfelRenderer, Renderer>(m, "SurfelRenderer", "Threads, scratch memory and the last frame.")
+  nb::class_<SurfelRenderer, Renderer>(m, "SurfelRenderer", "A Renderer of surfels.")
       .def(
           "__init__",
           [](SurfelRenderer* self, int threads, const std::string& simd) {

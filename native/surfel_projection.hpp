@@ -198,10 +198,10 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
     gather_colors(g, indices, bits, d_W, color);
 
     const F16 inverse_z = F16(1.0f) / s.p.z;
-    const F16 one = F16(1.0f), inverse_fx = F16(1.0f / camera.fx), inverse_fy = F16(1.0f / camera.fy);
+    const F16 inverse_fx = F16(1.0f / camera.fx), inverse_fy = F16(1.0f / camera.fy);
     disc[0] = F16(camera.fx) * (s.p.x * inverse_z) + F16(camera.cx);
     disc[1] = F16(camera.fy) * (s.p.y * inverse_z) + F16(camera.cy);
-    const F16 zero = F16(0.0f);
+    const F16 zero = F16(0.0f), one = F16(1.0f);
     const F16 towards = select(s.facing > zero, -one, one);
     const F16 fields[kSurfelFields] = {
         disc[0],

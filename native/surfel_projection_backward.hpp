@@ -95,8 +95,8 @@ FS_INLINE double masked_sum(const F16& a, uint32_t bits) {
   return total;
 }
 
-// Adds the gradients of colours, or of their coefficients, to rows of `out`; returns the gradient of
-// the direction from the camera, which is zero without spherical harmonics.
+// Adds the gradients of colours, or of their coefficients, to rows of `out`; returns that of the
+// direction from the camera, which is zero without spherical harmonics.
 FS_INLINE Vector16 color_gradient(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
                                   const Vector16& d_W, const F16 by_color[3], float* out) {
   const F16 zero = F16(0.0f);

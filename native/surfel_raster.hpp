@@ -123,8 +123,7 @@ FS_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b, 
   return open;
 }
 
-// Moves 16 pixels of a block between lanes and rows of an image with `channels` values a pixel;
-// pixels outside the image are left out. `store_lane` is called with the lane and the offset.
+// Calls move(lane, pixel) for the pixels of a block that are on the image.
 template <typename Move>
 FS_INLINE void for_each_pixel(int width, int height, int left, int top, const Move& move) {
   const int columns = width - left < kBlockSize ? width - left : kBlockSize;

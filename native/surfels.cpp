@@ -11,8 +11,8 @@ namespace {
 
 const SurfelKernels& surfel_kernels(const Kernels& level) {
 #if defined(__x86_64__)
-  for (const SurfelKernels* k : {&surfel_kernels_v2(), &surfel_kernels_v3(), &surfel_kernels_v4()}) {
-    if (std::strcmp(k->name, level.name) == 0) return *k;
+  for (const auto table : {surfel_kernels_v2, surfel_kernels_v3, surfel_kernels_v4}) {
+    if (std::strcmp(table().name, level.name) == 0) return table();
   }
   throw std::logic_error("no surfel kernels for this SIMD level");
 #else
