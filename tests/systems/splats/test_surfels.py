@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flysplat import _native
-from flysplat.systems.splats import rasterize
+from flysplat.systems.splats import rasterize, surfels
 from flysplat.systems.splats.depth_normals import depth_to_normals
 from flysplat.systems.splats.surfels import rasterize_surfels
 
@@ -383,6 +383,23 @@ def test_backward_twice_gives_the_same():
     render(random_scene(seed=5))
     (second,) = torch.autograd.grad(loss, scene["means"])
     assert torch.equal(first, second)
+
+
+def test_renderers_are_lent_again():
+    """A call returns its renderers when its graph is gone: their number does not grow."""
+
+    def idle() -> int:
+        return sum(map(len, surfels._Frames.idle.values()))
+
+    scene = random_scene(seed=4, cameras=2)
+    scene["means"].requires_grad_()
+    render(scene)["color"].sum().backward()
+    before = idle()
+    images = render(scene)
+    assert idle() == before - 2
+    images["color"].sum().backward()
+    del images
+    assert idle() == before
 
 
 def test_modes_and_meta():
