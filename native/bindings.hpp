@@ -61,5 +61,7 @@ inline void check_size(const Output& out, int width, int height, size_t channels
 
 // Adds what the backward pass needs to the module.
 void bind_gradients(nb::module_& m);
+// Adds the renderer of surfels.
+void bind_surfels(nb::module_& m);
 
 }  // namespace flysplat

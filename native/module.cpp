@@ -11,6 +11,7 @@
 #include "losses_module.hpp"
 
 namespace flysplat {
+
 namespace {
 
 using namespace nb::literals;
@@ -153,6 +154,7 @@ NB_MODULE(_native, m) {
 
   bind_losses(m);
   bind_gradients(m);
+  bind_surfels(m);
 }
 
 }  // namespace flysplat

@@ -32,6 +32,24 @@ FS_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
           s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
 }
 
+// From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
+// transposed 16 splats at a time: one shifted into the sign shows in the lane bits. `blocks` has
+// room for a multiple of 64.
+FS_INLINE void transpose_blocks(int32_t* blocks, int count,
+                                uint64_t touching[kBlocksPerTile][kStageWords]) {
+  for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;
+  for (int word = 0; word < (count + 63) / 64; ++word) {
+    for (int b = 0; b < kBlocksPerTile; ++b) touching[b][word] = 0;
+    for (int part = 0; part < 4; ++part) {
+      const I16 pack = load(blocks + 64 * word + kLanes * part);
+      for (int b = 0; b < kBlocksPerTile; ++b) {
+        const uint64_t bits = sign_bits(shift_left(pack, 31 - b));
+        touching[b][word] |= bits << (kLanes * part);
+      }
+    }
+  }
+}
+
 FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float left, float top,
                      StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
@@ -42,18 +60,7 @@ FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float 
     staged.splats[i] = in_tile(in.splats[pair->splat], left, top);
     blocks[i] = static_cast<int32_t>(pair->blocks);
   }
-  // Transposes the bits, 16 splats at a time: a bit shifted into the sign shows in the lane bits.
-  for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;
-  for (int word = 0; word < (count + 63) / 64; ++word) {
-    for (int b = 0; b < kBlocksPerTile; ++b) staged.touching[b][word] = 0;
-    for (int part = 0; part < 4; ++part) {
-      const I16 pack = load(blocks + 64 * word + kLanes * part);
-      for (int b = 0; b < kBlocksPerTile; ++b) {
-        const uint64_t bits = sign_bits(shift_left(pack, 31 - b));
-        staged.touching[b][word] |= bits << (kLanes * part);
-      }
-    }
-  }
+  transpose_blocks(blocks, count, staged.touching);
 }
 
 FS_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {

@@ -115,10 +115,11 @@ void Renderer::start_frame(const Camera& camera) {
   const auto found = std::find_if(frames_.begin(), frames_.end(), is_free);
   frame_ = found == frames_.end() ? frames_.emplace_back(std::make_shared<Frame>()) : *found;
   frame_->camera = camera;
+  frame_->kept = false;
 }
 
-template <typename Project>
-void Renderer::project(size_t count, const Project& project) {
+void Renderer::project(
+    size_t count, const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project) {
   Frame& frame = *frame_;
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
   frame.gaussians = count;
@@ -134,7 +135,7 @@ void Renderer::project(size_t count, const Project& project) {
 
 // Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
 // consecutive ranges of the depth order, so the lists do not depend on how many there are.
-void Renderer::bin(int tiles_x, int tiles_y, bool keep) {
+void Renderer::bin(BinKernel kernel, int tiles_x, int tiles_y, bool keep) {
   Frame& frame = *frame_;
   const size_t tiles = static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y);
   const size_t tasks = pool_.threads() == 1 ? 1 : 2 * static_cast<size_t>(pool_.threads());
@@ -146,8 +147,8 @@ void Renderer::bin(int tiles_x, int tiles_y, bool keep) {
     task.count = 0;
     const size_t end = visible * (t + 1) / tasks;
     for (size_t i = visible * t / tasks; i < end;) {
-      i = kernels_.bin(frame.splats.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
-                       task.pairs.size(), &task.count, task.tile_counts.data());
+      i = kernel(frame.splats.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
+                 task.pairs.size(), &task.count, task.tile_counts.data());
       if (i < end) task.pairs.resize(2 * task.pairs.size() + tiles + visible);
     }
   });
@@ -221,7 +222,7 @@ void Renderer::finish(const Image& image, bool keep) {
   sort();
   const int tiles_x = (frame.camera.width + kTileSize - 1) / kTileSize;
   const int tiles_y = (frame.camera.height + kTileSize - 1) / kTileSize;
-  bin(tiles_x, tiles_y, keep);
+  bin(kernels_.bin, tiles_x, tiles_y, keep);
   const size_t tiles = frame.tile_offsets.size() - 1;
   RasterInput input = raster_input(frame);
   input.image = image;

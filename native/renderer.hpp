@@ -74,19 +74,24 @@ class Renderer {
   size_t splat_count() const { return items_.size(); }
   size_t pair_count() const { return frame_ ? frame_->pairs.size() : 0; }
 
- private:
+ protected:
   void start_frame(const Camera& camera);
-  template <typename Project>
-  void project(size_t count, const Project& project);
+  // Splats of Gaussians [0, count), chunk by chunk: project(begin, end, splats, depth bits) returns
+  // how many.
+  void project(size_t count,
+               const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project);
   void sort();
-  void bin(int tiles_x, int tiles_y, bool keep);
+  void bin(BinKernel kernel, int tiles_x, int tiles_y, bool keep);
+
+  ThreadPool pool_;
+  std::shared_ptr<Frame> frame_;  // the last one
+
+ private:
   void finish(const Image& image, bool keep);
   RasterInput raster_input(const Frame& frame) const;
 
   const Kernels& kernels_;
-  ThreadPool pool_;
   std::mutex mutex_;
-  std::shared_ptr<Frame> frame_;                // the last one
   std::vector<std::shared_ptr<Frame>> frames_;  // all there are, for their memory
   std::vector<uint32_t> depth_bits_;
   std::vector<KeyValue> items_, sort_scratch_;  // visible splats, by depth after sorting

@@ -165,6 +165,12 @@ struct TilePair {
 
 constexpr size_t kBackwardScratchBytes = 576 * 1024;
 
+// Appends the tile pairs of splats order[begin..end) and counts them per tile; returns where it
+// stopped because fewer than one splat's pairs might have fitted, or end.
+using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, size_t end,
+                             int tiles_x, int tiles_y, TilePair*, size_t capacity,
+                             size_t* pair_count, uint32_t* tile_counts);
+
 struct Kernels {
   const char* name;
   // Projects Gaussians [begin, end); writes visible ones and the bits of their depths in input
@@ -173,10 +179,7 @@ struct Kernels {
                     uint32_t* depth_bits);
   size_t (*project_baked)(const BakedArrays&, const Camera&, size_t begin, size_t end, Splat*,
                           uint32_t* depth_bits);
-  // Appends the tile pairs of splats order[begin..end) and counts them per tile; returns where it
-  // stopped because fewer than one splat's pairs might have fitted, or end.
-  size_t (*bin)(const Splat*, const uint32_t* order, size_t begin, size_t end, int tiles_x,
-                int tiles_y, TilePair*, size_t capacity, size_t* pair_count, uint32_t* tile_counts);
+  BinKernel bin;
   void (*raster_tile)(const RasterInput&, int tile);
   // Writes the gradients of a tile's pairs and returns how many (splat, block) it composited;
   // `scratch` has kBackwardScratchBytes, aligned to 64.

@@ -1,14 +1,16 @@
 """Gaussian scenes and their rendering.
 
-`rasterize` (torch tensors, gsplat's interface) loads torch on first use; nothing else here does.
+`rasterize` and `rasterize_surfels` (torch tensors, gsplat's interfaces) load torch on first use;
+nothing else here does.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flysplat.systems.splats.rasterization import rasterize
+    from flysplat.systems.splats.surfels import rasterize_surfels
 
-__all__ = ["rasterize"]
+__all__ = ["rasterize", "rasterize_surfels"]
 
 
 def __getattr__(name: str) -> Any:
@@ -16,4 +18,8 @@ def __getattr__(name: str) -> Any:
         from flysplat.systems.splats.rasterization import rasterize
 
         return rasterize
+    if name == "rasterize_surfels":
+        from flysplat.systems.splats.surfels import rasterize_surfels
+
+        return rasterize_surfels
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

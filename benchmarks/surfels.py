@@ -1,0 +1,68 @@
+"""Times the surfel renderer, forward and backward, beside the forward pass of 3D Gaussians.
+
+    python benchmarks/surfels.py
+
+The scene is that of benchmarks/rasterize.py, each point a disc that faces in a random direction.
+The loss is a sum over colour, depth, normals and, where it is named, distortion. Times are of the
+wall clock, in milliseconds, of whole calls on torch tensors; on a busy machine the minimum is what
+to read.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from rasterize import cameras_of, hospital, machine, milliseconds, synthetic_room, tensors_of
+
+from flysplat import _native
+from flysplat.systems.splats import rasterize
+from flysplat.systems.splats.surfels import rasterize_surfels
+
+
+def show(call: Callable[[], object]) -> str:
+    least, median = milliseconds(call)
+    return f"{least:.2f} ({median:.2f})"
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    data = os.environ.get("FLYSPLAT_DATA")
+    scene, X_WC = hospital(Path(data) / "tartanair/hospital") if data else synthetic_room()
+    surfels = tensors_of(scene)
+    surfels["quats"] = torch.randn(len(scene), 4, generator=torch.Generator().manual_seed(0))
+    print(f"{machine()}\n{len(scene):,} surfels, one thread; milliseconds, minimum (median)\n")
+    print("| size | SIMD | 3D forward | forward | forward + backward | with distortion |")
+    print("|---|---|---|---|---|---|", flush=True)
+    for width, height in ((160, 120), (320, 240), (640, 480)):
+        viewmats, Ks = cameras_of(X_WC, width, height)
+        view = {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
+        for level in _native.simd_levels():
+            learned = {k: v.clone().requires_grad_() for k, v in surfels.items()}
+
+            def forward_3d(level: str = level, view: dict = view) -> object:
+                return rasterize(**surfels, **view, simd=level, render_mode="RGB+D")
+
+            def forward(level: str = level, view: dict = view, mode: str = "RGB") -> object:
+                return rasterize_surfels(**surfels, **view, simd=level, render_mode=mode)
+
+            def both(
+                distort: bool = False,
+                level: str = level,
+                view: dict = view,
+                learned: dict[str, torch.Tensor] = learned,
+            ) -> None:
+                image, _, normal, _, distortion, _, _ = rasterize_surfels(
+                    **learned, **view, simd=level, render_mode="RGB+D", distloss=distort
+                )
+                loss = image.sum() + normal.sum()
+                (loss + distortion.sum() if distort else loss).backward()
+                for tensor in learned.values():
+                    tensor.grad = None
+
+            cells = [show(call) for call in (forward_3d, forward, both, lambda f=both: f(True))]
+            print("| " + " | ".join([f"{width}x{height}", level, *cells]) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,238 @@
+// Surfels in the world to rays through their planes, 16 at a time (Huang et al. 2024, section 4.2,
+// with the homography between plane and image inverted in closed form).
+#pragma once
+
+#include "project_arrays.hpp"
+#include "surfel_lanes.hpp"
+#include "surfel_types.hpp"
+
+namespace flysplat::FLYSPLAT_LEVEL {
+
+FS_INLINE Vector16 cross(const Vector16& a, const Vector16& b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+FS_INLINE Vector16 scaled(const Vector16& a, const F16& s) { return {a.x * s, a.y * s, a.z * s}; }
+FS_INLINE Vector16 sum(const Vector16& a, const Vector16& b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+
+// The unit tangents and the normal t[2] = t[0] x t[1] of surfels, in the world.
+FS_INLINE void surfel_axes(const F16 q[4], Vector16 t[3]) {
+  const F16 ones[3] = {F16(1.0f), F16(1.0f), F16(1.0f)};
+  covariance_factor(q, ones, t);
+}
+
+// A surfel in the camera frame, and the coefficients of Surfel::u, v and w before the division by
+// focal lengths: u = (t1 x p) / (s0 n . p), v = (p x t0) / (s1 n . p), w = n / (n . p), of which
+// the x and y components count.
+struct SurfelPlane {
+  Vector16 p, t[3];
+  F16 facing;         // n . p
+  F16 inverse_facing;
+  Vector16 u, v, w;
+  Mask16 edge_on;
+};
+
+FS_INLINE SurfelPlane surfel_plane(const Camera& camera, const Vector16& p_C,
+                                   const Vector16 t_W[3], const F16 scale[2]) {
+  SurfelPlane s;
+  s.p = p_C;
+  for (int k = 0; k < 2; ++k) s.t[k] = to_camera(camera, t_W[k]);
+  s.t[2] = cross(s.t[0], s.t[1]);
+  s.facing = dot(s.t[2], p_C);
+  s.edge_on = s.facing * s.facing <= F16(kEdgeOn * kEdgeOn) * dot(p_C, p_C);
+  s.inverse_facing = F16(1.0f) / select(s.edge_on, F16(1.0f), s.facing);
+  s.u = scaled(cross(s.t[1], p_C), s.inverse_facing / scale[0]);
+  s.v = scaled(cross(p_C, s.t[0]), s.inverse_facing / scale[1]);
+  s.w = scaled(s.t[2], s.inverse_facing);
+  return s;
+}
+
+// Where alpha can reach the cut: the image of the disc of radius r standard deviations about the
+// centre, an ellipse while the disc is beyond the near plane, and the blob. Returns the lanes of
+// which some of it is on the image.
+FS_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const F16 scale[2],
+                               const F16& log2_opacity, SplatPack& out, F16& disc_radius) {
+  const F16 zero = F16(0.0f), one = F16(1.0f);
+  const F16 budget = log2_opacity - F16(kLog2AlphaCut);
+  const F16 r = sqrt(max(budget, zero) * F16(1.0f / kHalfLog2e));
+  const F16 inverse_z = one / s.p.z;
+  const F16 slope_x = s.p.x * inverse_z, slope_y = s.p.y * inverse_z;
+  const F16 mean_x = F16(camera.fx) * slope_x + F16(camera.cx);
+  const F16 mean_y = F16(camera.fy) * slope_y + F16(camera.cy);
+
+  // A point (a, b) of the plane is seen at mean + (A (a, b)) / (z + c . (a, b)).
+  F16 A_x[2], A_y[2], c[2];
+  for (int k = 0; k < 2; ++k) {
+    A_x[k] = scale[k] * F16(camera.fx) * (s.t[k].x - slope_x * s.t[k].z);
+    A_y[k] = scale[k] * F16(camera.fy) * (s.t[k].y - slope_y * s.t[k].z);
+    c[k] = scale[k] * s.t[k].z;
+  }
+  const F16 reach = r * sqrt(c[0] * c[0] + c[1] * c[1]);
+  const Mask16 beyond = s.p.z - reach >= F16(camera.near_plane);
+  // Dual of the conic, about the mean: an ellipse centred at -r^2 A c / d with the covariance
+  // (outer product of that) + r^2 A A^T / d, d = z^2 - r^2 |c|^2.
+  const F16 inverse_d = one / select(beyond, (s.p.z - reach) * (s.p.z + reach), one);
+  const F16 offset_scale = -(r * r * inverse_d);
+  const F16 offset_x = offset_scale * (A_x[0] * c[0] + A_x[1] * c[1]);
+  const F16 offset_y = offset_scale * (A_y[0] * c[0] + A_y[1] * c[1]);
+  const F16 size = r * sqrt(inverse_d);
+  const F16 x0 = size * A_x[0], x1 = size * A_x[1], y0 = size * A_y[0], y1 = size * A_y[1];
+  // A hundredth of a pixel keeps ellipses that have no width invertible.
+  const F16 margin = F16(1e-4f);
+  const F16 raw_xx = offset_x * offset_x + (x0 * x0 + x1 * x1);
+  const F16 raw_yy = offset_y * offset_y + (y0 * y0 + y1 * y1);
+  const F16 xx = raw_xx + margin, yy = raw_yy + margin;
+  const F16 xy = offset_x * offset_y + (x0 * y0 + x1 * y1);
+  const F16 d0 = offset_x * y0 - offset_y * x0, d1 = offset_x * y1 - offset_y * x1;
+  const F16 d2 = x0 * y1 - x1 * y0;
+  const F16 det = (d0 * d0 + d1 * d1 + d2 * d2) + margin * (raw_xx + raw_yy + margin);
+
+  // Scaled so that u^2 + v^2 = log2(255 o) on the ellipse, as touched_blocks() has it. A disc that
+  // is cut by the near plane is bounded by a rectangle, in which u = v = 0.
+  const F16 root = sqrt(max(budget, zero));
+  const F16 ellipse_ux = root * sqrt(yy / det), inverse_yy = one / yy;
+  const Mask16 regular = beyond & (ellipse_ux < F16(1e30f)) & (xx + yy < F16(1e15f));
+  const F16 cut_x = r * sqrt(A_x[0] * A_x[0] + A_x[1] * A_x[1]) / F16(camera.near_plane);
+  const F16 cut_y = r * sqrt(A_y[0] * A_y[0] + A_y[1] * A_y[1]) / F16(camera.near_plane);
+  const F16 most = F16(1e30f);
+  out.mean_x = mean_x + zero_unless(regular, offset_x);
+  out.mean_y = mean_y + zero_unless(regular, offset_y);
+  // min() returns its second operand for a NaN.
+  out.extent_x = min(select(regular, sqrt(xx), cut_x), most);
+  out.extent_y = min(select(regular, sqrt(yy), cut_y), most);
+  out.slope_x = zero_unless(regular, xy * inverse_yy);
+  out.slope_y = zero_unless(regular, xy / xx);
+  out.ux = zero_unless(regular, ellipse_ux);
+  out.uy = -(out.ux * out.slope_x);
+  out.vy = zero_unless(regular, root * sqrt(inverse_yy));
+  out.log2_opacity = log2_opacity;
+  out.depth = s.p.z;
+  disc_radius = r * F16(__builtin_sqrtf(kBlobVariance));
+
+  const F16 low_x = min(out.mean_x - out.extent_x, mean_x - disc_radius);
+  const F16 high_x = max(out.mean_x + out.extent_x, mean_x + disc_radius);
+  const F16 low_y = min(out.mean_y - out.extent_y, mean_y - disc_radius);
+  const F16 high_y = max(out.mean_y + out.extent_y, mean_y + disc_radius);
+  return in_depth_range(camera, s.p.z) & (budget >= zero) &
+         (max(disc_radius, max(out.extent_x, out.extent_y)) > F16(camera.radius_clip)) &
+         (high_x > zero) & (low_x < F16(static_cast<float>(camera.width))) & (high_y > zero) &
+         (low_y < F16(static_cast<float>(camera.height)));
+}
+
+// The lanes that may be visible by position and larger scale alone: a disc of radius R reaches the
+// half-space n . p > 0 if n . p + |n| R > 0. The sides have room for the blob.
+inline size_t cull_surfels(const GaussianArrays& g, const Camera& camera, size_t begin, size_t end,
+                           uint32_t* candidates) {
+  float reach[4];
+  for (int side = 0; side < 4; ++side) {
+    const float* n = camera.side_normal[side];
+    reach[side] = 1.001f * kMaxExtent * __builtin_sqrtf(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+  }
+  size_t count = 0;
+  for (size_t first = begin; first < end; first += kLanes) {
+    const size_t lanes = end - first < kLanes ? end - first : kLanes;
+    alignas(64) float soa[5][kLanes] = {};
+    for (size_t lane = 0; lane < lanes; ++lane) {
+      for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * (first + lane) + axis];
+      for (int k = 0; k < 2; ++k) soa[3 + k][lane] = g.scales[3 * (first + lane) + k];
+    }
+    const Vector16 p_C =
+        to_camera(camera, from_centre(camera, load(soa[0]), load(soa[1]), load(soa[2])));
+    const F16 largest_scale = max(load(soa[3]), load(soa[4]));
+    Mask16 visible = in_depth_range(camera, p_C.z);
+    for (int side = 0; side < 4; ++side) {
+      visible = visible & (dot(camera.side_normal[side], p_C) + F16(reach[side]) * largest_scale >
+                           F16(0.0f));
+    }
+    for (uint32_t bits = lane_bits(visible) & ((1u << lanes) - 1); bits; bits &= bits - 1) {
+      candidates[count++] = static_cast<uint32_t>(first) + __builtin_ctz(bits);
+    }
+  }
+  return count;
+}
+
+// Sixteen Gaussians of the input, gathered.
+struct SurfelInput {
+  Vector16 p_W;
+  F16 q[4], scale[2], opacity;
+};
+
+FS_INLINE SurfelInput gather_surfels(const GaussianArrays& g, const uint32_t* indices) {
+  alignas(64) float soa[10][kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const size_t i = indices[lane];
+    for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * i + axis];
+    for (int k = 0; k < 4; ++k) soa[3 + k][lane] = g.quats[4 * i + k];
+    for (int k = 0; k < 2; ++k) soa[7 + k][lane] = g.scales[3 * i + k];
+    soa[9][lane] = g.opacities[i];
+  }
+  return {{load(soa[0]), load(soa[1]), load(soa[2])},
+          {load(soa[3]), load(soa[4]), load(soa[5]), load(soa[6])},
+          {load(soa[7]), load(soa[8])},
+          load(soa[9])};
+}
+
+inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, size_t begin,
+                              size_t end, Splat* bounds, Surfel* surfels, uint32_t* depth_bits) {
+  uint32_t candidates[kChunkSize + kLanes];
+  const size_t candidate_count = cull_surfels(g, camera, begin, end, candidates);
+  for (int i = 0; i < kLanes; ++i) candidates[candidate_count + i] = static_cast<uint32_t>(begin);
+
+  size_t count = 0;
+  for (size_t first = 0; first < candidate_count; first += kLanes) {
+    const uint32_t* indices = candidates + first;
+    const SurfelInput in = gather_surfels(g, indices);
+    const Vector16 d_W = from_centre(camera, in.p_W.x, in.p_W.y, in.p_W.z);
+    Vector16 t_W[3];
+    surfel_axes(in.q, t_W);
+    const SurfelPlane s = surfel_plane(camera, to_camera(camera, d_W), t_W, in.scale);
+    const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
+    SplatPack pack;
+    F16 disc[3], color[3];
+    uint32_t bits =
+        lane_bits(surfel_bounds(camera, s, in.scale, log2_opacity, pack, disc[2]));
+    if (candidate_count - first < kLanes) bits &= (1u << (candidate_count - first)) - 1;
+    if (!bits) continue;
+    gather_colors(g, indices, bits, d_W, color);
+
+    const F16 inverse_z = F16(1.0f) / s.p.z;
+    const F16 inverse_fx = F16(1.0f / camera.fx), inverse_fy = F16(1.0f / camera.fy);
+    disc[0] = F16(camera.fx) * (s.p.x * inverse_z) + F16(camera.cx);
+    disc[1] = F16(camera.fy) * (s.p.y * inverse_z) + F16(camera.cy);
+    const F16 zero = F16(0.0f), one = F16(1.0f);
+    const F16 towards = select(s.facing > zero, -one, one);
+    const F16 fields[kSurfelFields] = {
+        disc[0],
+        disc[1],
+        select(s.edge_on, zero, s.u.x * inverse_fx),
+        select(s.edge_on, zero, s.u.y * inverse_fy),
+        select(s.edge_on, zero, s.v.x * inverse_fx),
+        select(s.edge_on, zero, s.v.y * inverse_fy),
+        select(s.edge_on, zero, s.w.x * inverse_fx),
+        select(s.edge_on, zero, s.w.y * inverse_fy),
+        select(s.edge_on, -one, inverse_z),
+        s.p.z,
+        log2_opacity,
+        color[0],
+        color[1],
+        color[2],
+        towards * t_W[2].x,
+        towards * t_W[2].y,
+        towards * t_W[2].z};
+    alignas(64) float soa[kSurfelFields][kLanes];
+    for (int f = 0; f < kSurfelFields; ++f) store(soa[f], fields[f]);
+    size_t next = count;
+    for (uint32_t b = bits; b; b &= b - 1, ++next) {
+      const int lane = __builtin_ctz(b);
+      float row[kSurfelFields];
+      for (int f = 0; f < kSurfelFields; ++f) row[f] = soa[f][lane];
+      std::memcpy(surfels + next, row, sizeof(Surfel));
+    }
+    count += append_splats(pack, disc, bits, indices, bounds + count, depth_bits + count);
+  }
+  return count;
+}
+
+}  // namespace flysplat::FLYSPLAT_LEVEL

@@ -1,0 +1,285 @@
+"""2D Gaussian splatting (surfels; Huang et al. 2024) on the CPU, with gradients."""
+
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flysplat import _native
+from flysplat.systems.splats.baked_scene import check_camera, create_renderer
+from flysplat.systems.splats.depth_normals import depth_to_normals
+from flysplat.systems.splats.rasterization import (
+    CHANNELS,
+    TILE_SIZE,
+    _check_shapes,
+    _check_values,
+)
+
+DEPTH_MODES = ("expected", "median")
+
+
+def rasterize_surfels(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    sh_degree: int | None = None,
+    *,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    distloss: bool = False,
+    depth_mode: str = "expected",
+    threads: int = 1,
+    simd: str = "",
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, dict[str, Any]]:
+    """Renders N surfels into C pinhole cameras, with the interface of gsplat.rasterization_2dgs.
+
+    A surfel is a Gaussian on the plane through its mean spanned by the first two columns of its
+    rotation. The ray through a pixel meets that plane at (u, v) standard deviations and depth z;
+    then ``a = min(.99, o exp(-r2 / 2))``, with r2 the lesser of u^2 + v^2 and 2 |d|^2, d the
+    pixels to the projected mean: a blob of sqrt(1/2) px stands in for surfels smaller than a pixel
+    or seen edge-on, at the depth of the mean. Blending is that of `rasterize`, in the order of the
+    means' depths.
+
+    Depths are those at which rays meet the surfels, as in the paper, so that a plane of surfels
+    has the plane's depth; gsplat blends the depths of the means. Rays that meet a surfel nearer
+    than `near_plane` miss it.
+
+    Differentiable with respect to means, quats, scales (the first two), opacities, colors,
+    viewmats and backgrounds. Which surfels a pixel sees, and which gives its median, is constant.
+
+    Args:
+        means, quats, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane,
+            radius_clip, sh_degree, backgrounds, render_mode, threads, simd: as for `rasterize`.
+        scales: (N, 3) standard deviations [m], positive; the third does not matter.
+        distloss: Whether to render the distortion; needs a `render_mode` with depth, as gsplat.
+        depth_mode: Of which depth surface normals are: "expected" or "median".
+
+    Returns:
+        render_colors: (C, H, W, X), X = 3, 1 or 4 by `render_mode`.
+        render_alphas: (C, H, W, 1).
+        render_normals: (C, H, W, 3) sum of weight and normal, in the world, towards the camera.
+        surf_normals: (C, H, W, 3) from depth, see `depth_to_normals`; None for "RGB".
+        render_distort: (C, H, W, 1) sum over pairs of surfels i, j of ``w_i w_j (z_i - z_j)``, i
+            behind j in the order of blending, times 2 [m]; zero without `distloss`.
+        render_median: (C, H, W, 1) depth of the last surfel in front of which more than half of
+            the light passes [m]; 0 where there is none.
+        meta: dict on the M visible (camera, surfel) pairs: camera_ids, gaussian_ids, depths,
+            opacities (M,), radii, means2d (M, 2), normals (M, 3) in the world, and width, height,
+            tile_size, tile_width, tile_height, n_cameras, render_distort.
+
+    Raises:
+        ValueError: a tensor has the wrong shape, dtype, device or values (the message names it).
+    """
+    tensors = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+    }
+    if backgrounds is not None:
+        tensors["backgrounds"] = backgrounds
+    _check_options(render_mode, depth_mode, distloss, radius_clip)
+    _check_shapes(tensors, sh_degree)
+    if means.device.type != "cpu":
+        raise ValueError(f"tensors are on {means.device}; surfels render on 'cpu': use .cpu()")
+    if Ks.requires_grad:
+        raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
+    view = _View(
+        intrinsics=[
+            check_camera(K, width, height, near_plane, far_plane) for K in Ks.detach().numpy()
+        ],
+        width=width,
+        height=height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        sh_degree=-1 if sh_degree is None else sh_degree,
+        distort=distloss,
+        record=torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()),
+        threads=threads,
+        simd=simd,
+    )
+    frames = _Frames(view)
+    arrays = {k: np.ascontiguousarray(t.detach().numpy()) for k, t in tensors.items()}
+    # The third scale is not read; whatever it is, it is no error.
+    arrays["scales"] = np.ascontiguousarray(arrays["scales"][:, :2])
+    _check_values(arrays, frames.renderers[0])
+    color, normal, depth, alpha, median, distort = _Rasterize.apply(
+        means, quats, scales, opacities, colors, viewmats, view, frames
+    )
+
+    parts, surface = [], None
+    if "RGB" in render_mode:
+        if backgrounds is not None:
+            color = color + (1 - alpha) * backgrounds[:, None, None, :]
+        parts.append(color)
+    if "D" in render_mode:
+        expected = depth / alpha.clamp(min=1e-10)
+        parts.append(expected if "ED" in render_mode else depth)
+        surface = depth_to_normals(expected if depth_mode == "expected" else median, viewmats, Ks)
+    images = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+    meta = _meta(frames.projected, arrays["opacities"], width, height)
+    meta["render_distort"] = distort
+    return images, alpha, normal, surface, distort, median, meta
+
+
+class _View(NamedTuple):
+    """What a call renders, beside the tensors."""
+
+    intrinsics: list[np.ndarray]  # (3, 3) float64 of each camera
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    sh_degree: int  # -1: colours are given
+    distort: bool
+    record: bool  # whether gradients may be asked for
+    threads: int
+    simd: str
+
+
+class _Frames:
+    """One native renderer per camera, lent for as long as its frame may be needed."""
+
+    idle: ClassVar[dict[tuple[int, str], list[_native.SurfelRenderer]]] = {}
+
+    def __init__(self, view: _View):
+        self._idle = self.idle.setdefault((view.threads, view.simd), [])
+        count = len(view.intrinsics) if view.record else 1
+        self.renderers = [self._take(view) for _ in range(count)]
+        self.projected: list[tuple] = []
+
+    def _take(self, view: _View) -> _native.SurfelRenderer:
+        try:
+            return self._idle.pop()
+        except IndexError:
+            level = create_renderer(view.threads, view.simd).simd
+            return _native.SurfelRenderer(view.threads, level)
+
+    def __del__(self):
+        self._idle.extend(getattr(self, "renderers", ()))
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quats, scales, opacities, colors, viewmats, view, frames):
+        tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities)]
+        colors = colors.detach().contiguous()
+        C, H, W = len(viewmats), view.height, view.width
+        images = [torch.empty((C, H, W, channels)) for channels in (3, 3, 1, 1, 1)]
+        distort = torch.empty((C, H, W, 1)) if view.distort else torch.zeros((C, H, W, 1))
+        poses = viewmats.detach().double().numpy()
+        for c in range(C):
+            renderer = frames.renderers[c if view.record else 0]
+            renderer.render(
+                *(t.numpy() for t in tensors),
+                _of_camera(colors, c, view).numpy(),
+                view.sh_degree,
+                view.intrinsics[c],
+                poses[c],
+                W,
+                H,
+                view.near_plane,
+                view.far_plane,
+                view.radius_clip,
+                *(image[c].numpy() for image in images),
+                distort[c].numpy() if view.distort else None,
+                view.record,
+            )
+            frames.projected.append(renderer.projected())
+        ctx.view, ctx.frames = view, frames
+        ctx.save_for_backward(*tensors, colors, viewmats)
+        ctx.set_materialize_grads(False)
+        if not view.distort:
+            ctx.mark_non_differentiable(distort)
+        return (*images, distort)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *gradients):  # pyright: ignore[reportIncompatibleMethodOverride]
+        *tensors, colors, viewmats = ctx.saved_tensors
+        view, frames = ctx.view, ctx.frames
+        outputs = [torch.zeros_like(t) for t in tensors]
+        by_colors = torch.zeros_like(colors)
+        by_viewmats = torch.zeros_like(viewmats)
+        images = [g if g is None else g.contiguous() for g in gradients]
+        if not view.distort:
+            images[5] = None
+        for c, X_CW in enumerate(viewmats.detach().double().numpy()):
+            by_camera = frames.renderers[c].backward(
+                *(t.numpy() for t in tensors),
+                _of_camera(colors, c, view).numpy(),
+                view.sh_degree,
+                *(None if g is None else g[c].numpy() for g in images),
+                *(t.numpy() for t in outputs),
+                _of_camera(by_colors, c, view).numpy(),
+            )
+            by_viewmats[c] = torch.from_numpy(_viewmat_gradient(by_camera, X_CW))
+        return *outputs, by_colors, by_viewmats, None, None
+
+
+def _of_camera(colors: Tensor, camera: int, view: _View) -> Tensor:
+    """Coefficients (N, K, 3) of one camera, as a view."""
+    if view.sh_degree < 0:
+        colors = colors.unsqueeze(-2)
+    return colors[camera] if colors.ndim == 4 else colors
+
+
+def _viewmat_gradient(by_camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:
+    """Adds to the gradient of R and t that of the camera centre, -R^-1 t."""
+    gradient = np.zeros((4, 4))
+    R_inverse = np.linalg.inv(X_CW[:3, :3])
+    through_centre = -R_inverse.T @ by_camera[4]
+    gradient[:3, :3] = by_camera[:3] + np.outer(through_centre, -R_inverse @ X_CW[:3, 3])
+    gradient[:3, 3] = by_camera[3] + through_centre
+    return gradient
+
+
+def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_clip: float) -> None:
+    if render_mode not in CHANNELS:
+        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+    if depth_mode not in DEPTH_MODES:
+        raise ValueError(f"depth_mode is {depth_mode!r}; it must be one of {DEPTH_MODES}")
+    if distloss and "D" not in render_mode:
+        raise ValueError(
+            f"distloss needs depth, but render_mode is {render_mode!r}; use 'RGB+D' or 'RGB+ED'"
+        )
+    if not 0 <= radius_clip < float("inf"):
+        raise ValueError(f"radius_clip is {radius_clip}; it must be a finite number of pixels >= 0")
+
+
+def _meta(projected: list[tuple], opacities: np.ndarray, width: int, height: int) -> dict[str, Any]:
+    ids, radii, means2d, depths, normals = (
+        torch.from_numpy(np.concatenate(parts)) for parts in zip(*projected, strict=True)
+    )
+    return {
+        "camera_ids": torch.repeat_interleave(
+            torch.arange(len(projected)), torch.tensor([len(p[0]) for p in projected])
+        ),
+        "gaussian_ids": ids,
+        "radii": radii.clamp(max=2**30).int(),
+        "means2d": means2d,
+        "depths": depths,
+        "normals": normals,
+        "opacities": torch.from_numpy(opacities)[ids],
+        "width": width,
+        "height": height,
+        "tile_size": TILE_SIZE,
+        "tile_width": -(-width // TILE_SIZE),
+        "tile_height": -(-height // TILE_SIZE),
+        "n_cameras": len(projected),
+    }

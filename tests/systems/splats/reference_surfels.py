@@ -1,0 +1,130 @@
+"""2D Gaussian splatting in float64 torch, straight from the paper's equations, to test against.
+
+Huang et al. 2024, equations 4 to 11: the homography H from a surfel's plane to the image, the ray
+as the intersection of two planes carried back by H^T, and the larger of the two Gaussians. Every
+pixel sees every surfel and everything is differentiable.
+"""
+
+from typing import NamedTuple
+
+import torch
+from reference_rasterizer import (
+    ALPHA_CUT,
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    rotation_matrices,
+    sh_basis,
+)
+from torch import Tensor
+
+BLOB_SIGMA = 0.5**0.5  # [px]
+EDGE_ON = 1e-5
+
+
+class Reference(NamedTuple):
+    color: Tensor  # (H, W, 3)
+    alpha: Tensor  # (H, W)
+    normal: Tensor  # (H, W, 3) in the world
+    depth: Tensor  # (H, W) accumulated
+    median: Tensor  # (H, W)
+    distort: Tensor  # (H, W)
+    margin: Tensor  # (H, W) least relative distance of a quantity to the threshold it met
+
+
+def render(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    far: float = 1e10,
+    sh_degree: int | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    dtype: torch.dtype = torch.float64,
+) -> Reference:
+    """One camera; tensors are cast to `dtype`."""
+    means, quats, scales, opacities, colors, viewmat, K = (
+        a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
+    )
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    p_C = means @ R.T + t
+    index = torch.nonzero((p_C[:, 2] >= near) & (p_C[:, 2] <= far))[:, 0]
+    index = index[torch.argsort(p_C[index, 2], stable=True)]
+    p_C, axes_W, opacity = p_C[index], rotation_matrices(quats[index]), opacities[index]
+    tangents_C = R @ axes_W[:, :, :2]  # (M, 3, 2)
+
+    # Columns of H: what u, v and 1 contribute to (x z, y z, z) of a point of the surfel.
+    H = K @ torch.cat([tangents_C * scales[index, None, :2], p_C[:, :, None]], 2)  # (M, 3, 3)
+    normal_C = torch.linalg.cross(tangents_C[:, :, 0], tangents_C[:, :, 1])
+    facing = (normal_C * p_C).sum(1)
+    normal_W = axes_W[:, :, 2] * -torch.sign(facing)[:, None]
+    edge_on = facing.abs() <= EDGE_ON * p_C.norm(dim=1)
+    centre = (p_C @ K.T)[:, :2] / p_C[:, 2:]
+
+    if sh_degree is None:
+        seen = colors[index]
+    else:
+        direction = means[index] + torch.linalg.inv(R) @ t
+        basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
+        coefficients = colors[index, : (sh_degree + 1) ** 2]
+        seen = torch.clamp(0.5 + torch.einsum("mk,mkc->mc", basis, coefficients), min=0)
+
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    x, y = x.reshape(-1, 1).to(dtype), y.reshape(-1, 1).to(dtype)  # (P, 1)
+    # The planes of the pixel's column and row, in the surfel's coordinates; a ray lies in both.
+    h_u = x[..., None] * H[:, 2] - H[:, 0]  # (P, M, 3)
+    h_v = y[..., None] * H[:, 2] - H[:, 1]
+    point = torch.linalg.cross(h_u, h_v)
+    parallel = point[..., 2] == 0
+    uv = point[..., :2] / torch.where(parallel, 1.0, point[..., 2])[..., None]
+    z = (uv * H[:, 2, :2]).sum(-1) + H[:, 2, 2]
+    on_plane = (uv * uv).sum(-1)
+    of_blob = ((x - centre[:, 0]) ** 2 + (y - centre[:, 1]) ** 2) / BLOB_SIGMA**2
+    hit = ~parallel & ~edge_on & (z >= near) & (on_plane <= of_blob)
+    r2 = torch.where(hit, on_plane, of_blob)
+    depth = torch.where(hit, z, p_C[:, 2])
+
+    raw = opacity * torch.exp(-r2 / 2)
+    alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
+    ones = torch.ones_like(x)
+    after = torch.cat([ones, torch.cumprod(1 - alpha, 1)], 1)
+    before, after = after[:, :-1], after[:, 1:]
+    weight = torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
+    front_weight = weight.cumsum(1) - weight
+    front_depth = (weight * depth).cumsum(1) - weight * depth
+    distort = 2 * (weight * (depth * front_weight - front_depth)).sum(1)
+    places = torch.arange(1, len(index) + 1)
+    is_median = (weight > 0) & (before > 0.5)
+    last = (is_median * places).amax(1, keepdim=True) if len(index) else torch.zeros_like(x).long()
+    median = torch.where((places == last) & is_median, depth, 0.0).sum(1)
+
+    drawn = (before > MIN_TRANSMITTANCE) & (raw >= 0.9 * ALPHA_CUT)
+    thresholds = [
+        (raw / ALPHA_CUT - 1, before > MIN_TRANSMITTANCE),
+        (raw / MAX_ALPHA - 1, drawn),
+        (after / MIN_TRANSMITTANCE - 1, before > MIN_TRANSMITTANCE),
+        (before / 0.5 - 1, drawn),
+        (on_plane / of_blob - 1, drawn & ~edge_on),
+        (z / near - 1, drawn & (on_plane <= of_blob)),
+    ]
+    margin = torch.stack(
+        [torch.where(met, d.detach().abs(), torch.inf) for d, met in thresholds]
+    ).amin(0)
+    margin = torch.cat([margin, torch.inf * ones], 1).amin(1)
+    total = weight.sum(1)
+    color = weight @ seen + (1 - total)[:, None] * torch.tensor(background, dtype=dtype)
+    shape = (height, width)
+    return Reference(
+        color.reshape(*shape, 3),
+        total.reshape(shape),
+        (weight @ normal_W).reshape(*shape, 3),
+        (weight * depth).sum(1).reshape(shape),
+        median.reshape(shape),
+        distort.reshape(shape),
+        margin.reshape(shape),
+    )

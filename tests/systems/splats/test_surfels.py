@@ -1,0 +1,507 @@
+"""Tests of the surfel renderer against an independent reference and analytic oracles."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flysplat import _native
+from flysplat.systems.splats import rasterize, surfels
+from flysplat.systems.splats.depth_normals import depth_to_normals
+from flysplat.systems.splats.surfels import rasterize_surfels
+
+
+def _load(name):
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+rotation_matrices = _load("reference_rasterizer").rotation_matrices
+reference = _load("reference_surfels")
+
+LEVELS = _native.simd_levels()
+WIDTH, HEIGHT = 67, 45
+LEARNED = ("means", "quats", "scales", "opacities", "colors", "viewmats")
+OUTPUTS = ("color", "alpha", "normal", "depth", "median", "distort")
+
+
+def random_scene(
+    count=300, seed=0, sh_degree=None, cameras=1, size=(WIDTH, HEIGHT)
+) -> dict[str, Any]:
+    """Surfels of many sizes in front of, around and behind cameras that look at the origin."""
+    g = torch.Generator().manual_seed(seed)
+    scene = {
+        "means": 1.5 * torch.randn(count, 3, generator=g),
+        "quats": 3 * torch.randn(count, 4, generator=g),
+        "scales": torch.exp(0.7 * torch.randn(count, 3, generator=g) - 2.3),
+        "opacities": torch.rand(count, generator=g),
+        "colors": torch.rand(count, 3, generator=g),
+    }
+    if sh_degree is not None:
+        K = (sh_degree + 1) ** 2
+        scene["colors"] = 0.4 * torch.randn(count, K, 3, generator=g)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
+    for c in range(cameras):
+        q = torch.randn(1, 4, generator=g, dtype=torch.float64) * 0.1 + torch.tensor([1.0, 0, 0, 0])
+        viewmats[c, :3, :3] = rotation_matrices(q)[0]
+        viewmats[c, 2, 3] = 3.0 + c
+    width, height = size
+    K = torch.tensor([[0.9 * width, 0, 0.48 * width], [0, 1.1 * width, 0.55 * height], [0, 0, 1]])
+    scene["viewmats"] = viewmats.float()
+    scene["Ks"] = K.repeat(cameras, 1, 1)
+    return scene
+
+
+def single_surfel(opacity=0.5, scale=0.1, depth=2.0, quat=(1.0, 0, 0, 0)) -> dict[str, Any]:
+    return {
+        "means": torch.tensor([[0.0, 0.0, depth]]),
+        "quats": torch.tensor([quat]),
+        "scales": torch.full((1, 3), scale),
+        "opacities": torch.tensor([opacity]),
+        "colors": torch.tensor([[0.2, 0.4, 0.8]]),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[100.0, 0, 16.5], [0, 100.0, 16.5], [0, 0, 1]]]),
+    }
+
+
+def render(scene, width=WIDTH, height=HEIGHT, **options) -> dict[str, torch.Tensor]:
+    """The images of the first camera, by name."""
+    options = {"render_mode": "RGB+D", "distloss": True} | options
+    image, alpha, normal, surface, distort, median, _ = rasterize_surfels(
+        **scene, width=width, height=height, **options
+    )
+    named = {"alpha": alpha, "distort": distort, "median": median}
+    images = {name: a[0, ..., 0] for name, a in named.items()}
+    images |= {"color": image[0, ..., :3], "depth": image[0, ..., -1], "normal": normal[0]}
+    return images if surface is None else images | {"surface": surface[0]}
+
+
+def total(images: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack([(image * image).sum() for image in images.values()]).sum()
+
+
+def call_reference(scene, width=WIDTH, height=HEIGHT, **options):
+    s = {name: a for name, a in scene.items() if name not in ("viewmats", "Ks")}
+    return reference.render(
+        **s, viewmat=scene["viewmats"][0], K=scene["Ks"][0], width=width, height=height, **options
+    )
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_images_agree_with_reference(simd, seed):
+    """Every image equals the float64 reference, at every SIMD level, threshold flips apart."""
+    scene = random_scene(seed=seed)
+    expected = call_reference(scene, background=(0.1, 0.7, 0.3))
+    clear = expected.margin > 1e-4
+    assert clear.float().mean() > 0.99
+    images = render(scene, backgrounds=torch.tensor([[0.1, 0.7, 0.3]]), simd=simd)
+    for name in OUTPUTS:
+        wanted = getattr(expected, name)
+        error = (images[name].double() - wanted).abs()
+        assert error.median() < 5e-7, name
+        assert (error / wanted.abs().clamp(min=1))[clear].max() < 1e-4, name
+
+
+@pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
+@pytest.mark.parametrize("simd", LEVELS[:2])
+def test_gradients_agree_with_reference(sh_degree, simd):
+    """Gradients of all images with respect to all inputs equal autograd's through the reference.
+
+    All but 3 % are within gsplat's tolerance (1e-5 relative, 1e-3 absolute) of float64, and
+    the largest error is of the size of that which torch makes in float32.
+    """
+    scene = random_scene(seed=3, sh_degree=sh_degree)
+    clear = call_reference(scene, sh_degree=sh_degree).margin > 1e-4
+
+    def gradients(call, dtype):
+        leaves = {
+            k: v.detach().clone().to(dtype).requires_grad_(k in LEARNED) for k, v in scene.items()
+        }
+        images = call(leaves)
+        g = torch.Generator().manual_seed(5)
+        loss = torch.zeros(())
+        for name in OUTPUTS:
+            weight = torch.randn(images[name].shape, generator=g)
+            loss = loss + (images[name] * weight.to(dtype))[clear].sum()
+        loss.backward()
+        return {name: leaves[name].grad.double() for name in LEARNED}
+
+    def reference_in(dtype):
+        call = lambda s: call_reference(s, sh_degree=sh_degree, dtype=dtype)._asdict()  # noqa: E731
+        return gradients(call, dtype)
+
+    exact, single = reference_in(torch.float64), reference_in(torch.float32)
+    ours = gradients(lambda s: render(s, sh_degree=sh_degree, simd=simd), torch.float32)
+    for name in LEARNED:
+        error = (ours[name] - exact[name]).abs()
+        allowed = 1e-3 + 1e-5 * exact[name].abs()
+        if name != "viewmats":  # each entry sums over the whole scene
+            assert (error <= allowed).double().mean() > 0.97, name
+        assert error.max() <= 5 * (single[name] - exact[name]).abs().max() + allowed.max(), name
+        assert exact[name].abs().max() > 1
+
+
+def test_third_scale_does_not_matter():
+    """A surfel is flat: its third scale changes nothing, not even where it is NaN."""
+    scene = random_scene(seed=2)
+    other = scene | {"scales": scene["scales"].clone()}
+    other["scales"][:, 2] = torch.tensor([0.0, math.nan, 1e9]).repeat(100)
+    before, after = render(scene), render(other)
+    assert all(torch.equal(before[name], after[name]) for name in OUTPUTS)
+
+
+def test_surfel_facing_the_camera_is_a_gaussian_disc():
+    """Face on, alpha is a Gaussian of the projected size, at the surfel's depth and normal."""
+    images = render(single_surfel(opacity=0.8), width=33, height=33)
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    expected = 0.8 * torch.exp(-(x**2 + y**2) / (2 * 5.0**2))  # 100 px * 0.1 m / 2 m
+    expected[expected < 1 / 255] = 0
+    torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(images["depth"], 2 * expected, rtol=1e-5, atol=1e-6)
+    towards = torch.tensor([0.0, 0.0, -1.0])
+    torch.testing.assert_close(images["normal"], expected[..., None] * towards)
+    assert (images["median"] - 2 * (expected > 0)).abs().max() < 1e-6
+    assert not images["distort"].abs().max() > 1e-6
+
+
+def test_small_surfel_is_the_blob():
+    """A surfel far smaller than a pixel covers what a deviation of sqrt(1/2) px does."""
+    images = render(single_surfel(scale=1e-6), width=33, height=33)
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    expected = 0.5 * torch.exp(-(x**2 + y**2))
+    expected[expected < 1 / 255] = 0
+    torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
+
+
+def tilted_plane(tilt=1.1) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor]:
+    """Surfels on the plane through (0, 0, 2) with a normal turned about x; its normal and depth."""
+    g = torch.Generator().manual_seed(0)
+    normal = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)])
+    in_plane = torch.tensor([[1.0, 0, 0], [0.0, math.cos(tilt), math.sin(tilt)]])
+    count = 3000
+    scene = single_surfel(opacity=0.5, scale=0.15)
+    scene["means"] = torch.tensor([0.0, 0, 2]) + (torch.rand(count, 2, generator=g) - 0.5) @ (
+        in_plane * torch.tensor([[2.0], [3.0]])
+    )
+    quat = (math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0)  # z axis to minus the normal
+    for name in ("scales", "opacities", "colors"):
+        scene[name] = scene[name].expand(count, *scene[name].shape[1:])
+    scene["quats"] = torch.tensor([quat]).expand(count, 4)
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    rays = torch.stack([x / 100, y / 100, torch.ones_like(x)], -1)
+    return scene, normal, (2 * normal[2]) / (rays @ normal)
+
+
+def test_tilted_plane_has_exact_depth_and_normals():
+    """Surfels on one plane give its depth and normal at every pixel, where Gaussians do not."""
+    scene, normal, depth = tilted_plane()
+    axis = rotation_matrices(scene["quats"][:1])[0, :, 2]
+    assert (axis.cross(normal, dim=0)).norm() < 1e-6
+    images = render(scene, width=33, height=33, render_mode="RGB+ED")
+    assert images["alpha"].min() > 0.99
+    assert (images["depth"] / depth - 1).abs().max() < 1e-5
+    assert (images["median"] / depth - 1).abs().max() < 1e-5
+    assert images["distort"].abs().max() < 1e-4
+    torch.testing.assert_close(images["normal"], images["alpha"][..., None] * normal)
+    inner = images["surface"][1:-1, 1:-1]
+    assert (inner - normal).abs().max() < 1e-3 and not images["surface"][0].any()
+
+    gaussians, _, _ = rasterize(**scene, width=33, height=33, render_mode="RGB+ED")
+    assert (gaussians[0, ..., 3] / depth - 1).abs().max() > 0.01
+
+
+def test_surface_normals_are_in_the_world_and_differentiable():
+    """A turned camera sees the same normals, and their gradient moves the surfels."""
+    scene, normal, _ = tilted_plane()
+    R = rotation_matrices(torch.tensor([[1.0, 0.1, -0.2, 0.3]]))[0]
+    turned = scene | {"means": scene["means"] @ R.T, "viewmats": scene["viewmats"].clone()}
+    turned["viewmats"][0, :3, :3] = R.T
+    turned["quats"] = quaternion_product(torch.tensor([1.0, 0.1, -0.2, 0.3]), scene["quats"])
+    turned["means"] = turned["means"].requires_grad_()
+    images = render(turned, width=33, height=33, depth_mode="median")
+    for name in ("normal", "surface"):
+        inner = torch.nn.functional.normalize(images[name][1:-1, 1:-1], dim=-1)
+        assert (inner - R @ normal).abs().max() < 2e-3, name
+    images["surface"][..., 0].sum().backward()
+    assert turned["means"].grad is not None and turned["means"].grad.abs().max() > 0
+
+
+def test_depth_without_a_plane_has_no_normal():
+    """Beside pixels that see nothing normals are zero where no plane is, and gradients bounded."""
+    depths = torch.zeros(1, 7, 7, 1)
+    depths[0, 3, 3] = 2.0
+    depths[0, 1, 1:5] = 2.0
+    depths.requires_grad_()
+    Ks = torch.tensor([[[100.0, 0, 3.5], [0, 100.0, 3.5], [0, 0, 1]]])
+    normals = depth_to_normals(depths, torch.eye(4)[None], Ks)
+    assert not normals[0, 5, 5].any() and torch.isfinite(normals).all()
+    (
+        normals * torch.rand(normals.shape, generator=torch.Generator().manual_seed(0))
+    ).sum().backward()
+    assert depths.grad is not None and depths.grad.abs().max() < 1e3
+    with pytest.raises(ValueError, match=r"depths has shape \(7, 7\)"):
+        depth_to_normals(depths[0, ..., 0], torch.eye(4)[None], Ks)
+
+
+def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    real = a[0] * b[:, :1] - (b[:, 1:] @ a[1:])[:, None]
+    cross = torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
+    return torch.cat([real, a[0] * b[:, 1:] + b[:, :1] * a[1:] + cross], 1)
+
+
+def test_distortion_is_the_weighted_spread():
+    """Two surfels give twice the product of their weights and the distance between them."""
+    scene = single_surfel(opacity=0.5)
+    scene = {
+        k: v if k in ("viewmats", "Ks") else v.repeat(2, *[1] * (v.ndim - 1))
+        for k, v in scene.items()
+    }
+    scene["means"][1, 2] = 2.6
+    images = render(scene, width=33, height=33)
+    assert images["distort"][16, 16] == pytest.approx(2 * 0.5 * 0.25 * 0.6, abs=1e-6)
+    # Half of the light does not pass the first: the second is no median.
+    assert images["median"][16, 16] == pytest.approx(2.0)
+    off = render(scene, width=33, height=33, distloss=False)
+    assert not off["distort"].any() and torch.equal(off["color"], images["color"])
+
+
+@pytest.mark.parametrize("quat", [(1.0, 1.0, 0, 0), (1.0, 1.0 + 1e-6, 0, 0), (1.0, 1.001, 0, 0)])
+def test_edge_on_surfel_is_its_blob(quat):
+    """Seen from the side a surfel is drawn where its centre is, and gradients are finite."""
+    scene = single_surfel(quat=quat)
+    for name in LEARNED:
+        scene[name] = scene[name].requires_grad_()
+    images = render(scene, width=33, height=33)
+    assert images["alpha"][16, 16].item() == pytest.approx(0.5, abs=1e-5)
+    assert images["depth"][16, 16].item() == pytest.approx(1.0, abs=1e-4)
+    total(images).backward()
+    assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
+
+
+@pytest.mark.parametrize(
+    ("depth", "visible"), [(-2.0, False), (0.0, False), (0.0099, False), (0.01, True), (5.0, True)]
+)
+def test_near_plane_is_the_limit(depth, visible):
+    """A surfel is drawn if its centre is at or beyond the near plane, never if behind it."""
+    images = render(single_surfel(depth=depth, scale=0.001), width=33, height=33)
+    assert bool(images["alpha"].any()) == visible
+
+
+def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
+    """A floor that passes below and behind the camera ends at the horizon."""
+    quat = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # normal along -y
+    scene = single_surfel(opacity=0.9, scale=3.0, depth=1.0, quat=quat)
+    scene["means"][0, 1] = 0.5
+    expected = call_reference(scene, 33, 33, near=0.2)
+    images = render(scene, width=33, height=33, near_plane=0.2)
+    assert not images["alpha"][:16].any() and images["alpha"][24:].min() > 0.01
+    assert (images["alpha"].double() - expected.alpha).abs().max() < 1e-5
+    assert (images["depth"].double() - expected.depth).abs().max() < 1e-4
+
+
+def test_empty_scene_is_background():
+    """No surfels give the background and zeros, with gradients that are empty."""
+    scene = random_scene(count=0)
+    for name in LEARNED:
+        scene[name] = scene[name].requires_grad_()
+    background = torch.tensor([[0.1, 0.2, 0.3]])
+    images = render(scene, width=20, height=10, backgrounds=background, render_mode="RGB+ED")
+    assert torch.equal(images["color"], background.expand(10, 20, 3))
+    assert not any(images[name].any() for name in ("alpha", "depth", "normal", "median"))
+    images["color"].sum().backward()
+    assert not scene["viewmats"].grad.any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (16, 16), (17, 33), (97, 1)])
+def test_odd_sizes_agree_with_reference(size):
+    """Images that end inside tiles and blocks are complete and equal the reference."""
+    width, height = size
+    scene = random_scene(seed=8, size=size)
+    expected = call_reference(scene, width, height)
+    images = render(scene, width=width, height=height)
+    clear = expected.margin > 1e-4
+    assert (images["color"].double() - expected.color).abs()[clear].max() < 1e-4
+
+
+def all_bits(scene, **options):
+    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
+    images = render(leaves, **options)
+    total(images).backward()
+    return [images[name] for name in OUTPUTS] + [leaves[name].grad for name in LEARNED]
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_same_bits_for_any_number_of_threads(simd):
+    """Images and gradients do not depend on threads, nor on what was rendered before."""
+    scene = random_scene(count=6000, seed=6, size=(150, 110), sh_degree=1)
+    options = {"width": 150, "height": 110, "sh_degree": 1, "simd": simd}
+    single = all_bits(scene, **options)
+    render(random_scene(seed=7), simd=simd)
+    for threads in (1, 2, 4):
+        bits = all_bits(scene, threads=threads, **options)
+        assert all(torch.equal(a, b) for a, b in zip(single, bits, strict=True)), threads
+
+
+def test_batch_of_cameras_equals_single_calls():
+    """C cameras give the images of C calls and the sum of their gradients, in any order."""
+    scene = random_scene(seed=3, cameras=3)
+    scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
+    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
+    options: dict[str, Any] = {"width": 40, "height": 30}
+    images, _, _, _, _, _, meta = rasterize_surfels(**leaves, **options)
+    (images**2).sum().backward()
+    losses = []
+    again = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
+    for c in range(3):
+        one = again | {k: again[k][c : c + 1] for k in ("viewmats", "Ks", "colors")}
+        image, _, _, _, _, _, single = rasterize_surfels(**one, **options)
+        assert torch.equal(image[0], images[c])
+        assert torch.equal(meta["means2d"][meta["camera_ids"] == c], single["means2d"])
+        losses.append((image**2).sum())
+    torch.stack(losses[::-1]).sum().backward()
+    for name in LEARNED:
+        torch.testing.assert_close(leaves[name].grad, again[name].grad, rtol=1e-4, atol=1e-4)
+
+
+def test_backward_twice_gives_the_same():
+    """A graph that is retained can be walked again, whatever was rendered in between."""
+    scene = random_scene(seed=4)
+    scene["means"].requires_grad_()
+    loss = render(scene)["color"].sum()
+    (first,) = torch.autograd.grad(loss, scene["means"], retain_graph=True)
+    render(random_scene(seed=5))
+    (second,) = torch.autograd.grad(loss, scene["means"])
+    assert torch.equal(first, second)
+
+
+def test_renderers_are_lent_again():
+    """A call returns its renderers when its graph is gone: their number does not grow."""
+
+    def idle() -> int:
+        return sum(map(len, surfels._Frames.idle.values()))
+
+    scene = random_scene(seed=4, cameras=2)
+    scene["means"].requires_grad_()
+    render(scene)["color"].sum().backward()
+    before = idle()
+    images = render(scene)
+    assert idle() == before - 2
+    images["color"].sum().backward()
+    del images
+    assert idle() == before
+
+
+def test_modes_and_meta():
+    """Each render mode has its channels, and meta lists the visible surfels."""
+    scene = random_scene(seed=4)
+    depth = render(scene)
+    expected = depth["depth"] / depth["alpha"].clamp(min=1e-10)
+    meta = {}
+    for mode, channels in {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}.items():
+        image, _, _, surface, _, _, meta = rasterize_surfels(
+            **scene, width=WIDTH, height=HEIGHT, render_mode=mode
+        )
+        assert image.shape == (1, HEIGHT, WIDTH, channels)
+        assert (surface is None) == (mode == "RGB")
+        if "ED" in mode:
+            assert torch.equal(image[0, ..., -1], expected)
+    ids = meta["gaussian_ids"]
+    X_CW, K = scene["viewmats"][0].double(), scene["Ks"][0].double()
+    p_C = scene["means"][ids].double() @ X_CW[:3, :3].T + X_CW[:3, 3]
+    torch.testing.assert_close(meta["depths"].double(), p_C[:, 2], rtol=1e-5, atol=1e-6)
+    pixels = (p_C @ K.T)[:, :2] / p_C[:, 2:]
+    torch.testing.assert_close(meta["means2d"].double(), pixels, rtol=1e-4, atol=1e-3)
+    assert (meta["normals"].double() @ X_CW[:3, :3].T * p_C).sum(1).max() <= 1e-6
+    assert (meta["radii"] >= 1).all() and 0 < len(ids) < 300
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 60),
+    width=st.integers(1, 40),
+    height=st.integers(1, 40),
+    spread=st.floats(-3, 3),
+    log_scale=st.floats(-30, 15),
+    simd=st.sampled_from(LEVELS),
+    threads=st.integers(1, 2),
+)
+def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, simd, threads):
+    """Any valid scene gives finite images and gradients, and alpha in [0, 1]."""
+    g = torch.Generator().manual_seed(seed)
+    scene = random_scene(count=count, seed=seed, size=(width, height))
+    scene["means"] *= 10.0**spread
+    scene["scales"] = 10.0 ** (log_scale + torch.randn(count, 3, generator=g))
+    for name in LEARNED:
+        scene[name] = scene[name].requires_grad_()
+    images = render(scene, width=width, height=height, simd=simd, threads=threads)
+    assert all(torch.isfinite(image).all() for image in images.values())
+    assert (images["alpha"] >= 0).all() and (images["alpha"] <= 1 + 1e-6).all()
+    assert (images["color"] >= 0).all() and (images["color"] <= 1 + 1e-5).all()
+    total({name: images[name] for name in OUTPUTS}).backward()
+    assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31), spread=st.floats(-1, 1), log_scale=st.floats(-3, 1))
+def test_fuzz_agrees_with_reference(seed, spread, log_scale):
+    """Random scenes agree with the reference wherever no decision is within rounding."""
+    scene = random_scene(count=80, seed=seed, size=(29, 23))
+    scene["means"] *= 10.0**spread
+    scene["scales"] = scene["scales"] * 10.0**log_scale
+    expected = call_reference(scene, 29, 23)
+    images = render(scene, width=29, height=23)
+    clear = expected.margin > 1e-2
+    error = (images["alpha"].double() - expected.alpha).abs()
+    assert not clear.any() or error[clear].max() < 2e-3
+
+
+def _set(name, index, value):
+    def change(scene):
+        tensor = scene[name].clone()
+        tensor[index] = value
+        return scene | {name: tensor}
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s | {"quats": s["quats"][:-1]}, r"quats has shape \(299, 4\)"),
+        (lambda s: s | {"scales": s["scales"][:, :2]}, r"scales has shape \(300, 2\)"),
+        (lambda s: s | {"means": s["means"].double()}, r"means is torch.float64"),
+        (_set("means", (7, 1), math.nan), r"means\[7, 1\] is nan; it must be finite"),
+        (_set("scales", (3, 1), 0.0), r"scales\[3, 1\] is 0; it must be positive"),
+        (_set("opacities", 4, 1.5), r"opacities\[4\] is 1.5; it must lie in \[0, 1\]"),
+        (_set("quats", 5, 0.0), r"quats\[5\] is \[0.0, 0.0, 0.0, 0.0\]"),
+        (_set("viewmats", 0, 2 * torch.eye(4)), r"viewmats\[0\] is not a rigid transform"),
+        (_set("Ks", (0, 0, 0), 0.0), r"focal lengths K\[0, 0\] = 0"),
+        (lambda s: s | {"render_mode": "RGBD"}, r"render_mode is 'RGBD'"),
+        (lambda s: s | {"depth_mode": "mean"}, r"depth_mode is 'mean'"),
+        (lambda s: s | {"distloss": True}, r"distloss needs depth, but render_mode is 'RGB'"),
+        (lambda s: s | {"radius_clip": -1.0}, r"radius_clip is -1"),
+        (lambda s: s | {"width": 0}, r"image size is 0 x 45"),
+        (lambda s: s | {"near_plane": 0.0}, r"0 < near < far"),
+        (lambda s: s | {"threads": 0}, r"threads is 0"),
+        (lambda s: s | {"sh_degree": 1}, r"colors has shape \(300, 3\).*sh_degree=1"),
+        (lambda s: s | {"Ks": s["Ks"].requires_grad_()}, r"Ks requires a gradient"),
+        (lambda s: {k: v.to("meta") if torch.is_tensor(v) else v for k, v in s.items()}, r"meta"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    """Each mistake raises ValueError that names the tensor, the place, the value and the limit."""
+    scene = change(random_scene() | {"width": WIDTH, "height": HEIGHT})
+    with pytest.raises(ValueError, match=message):
+        rasterize_surfels(**scene)
