@@ -61,5 +61,7 @@ inline void check_size(const Output& out, int width, int height, size_t channels
 
 // Adds what the backward pass needs to the module.
 void bind_gradients(nb::module_& m);
+// Adds the rendering of projected Gaussians.
+void bind_projected(nb::module_& m);
 
 }  // namespace flysplat

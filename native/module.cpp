@@ -151,6 +151,7 @@ NB_MODULE(_native, m) {
       .def("render", &render_baked);
 
   bind_gradients(m);
+  bind_projected(m);
 }
 
 }  // namespace flysplat
