@@ -115,18 +115,19 @@ def _project(
     R_CW, t_CW = X_CW[:3, :3], X_CW[:3, 3]
     with torch.no_grad():
         p_C = means.double() @ R_CW.T + t_CW
-        pixels, visible = project(p_C)
+        in_range = (p_C[:, 2] >= views.near_plane) & (p_C[:, 2] <= views.far_plane)
+        (ids,) = torch.nonzero(in_range, as_tuple=True)
+        pixels, visible = project(p_C[ids])
         size = torch.tensor([views.width, views.height])
         in_window = ((pixels + MARGIN * size >= 0) & (pixels <= (1 + MARGIN) * size)).all(-1)
-        in_range = (p_C[:, 2] >= views.near_plane) & (p_C[:, 2] <= views.far_plane)
-        (ids,) = torch.nonzero(visible & in_window & in_range, as_tuple=True)
-        factors = R_CW @ _covariance_factors(quats[ids].double(), scales[ids].double())
-        ids = ids[unscented_projection(p_C[ids], factors, project).valid]
+        ids = ids[visible & in_window]
 
     p_W = means[ids].double()
     p_C = p_W @ R_CW.T + t_CW
     factors = R_CW @ _covariance_factors(quats[ids].double(), scales[ids].double())
-    means2d, sharp, _ = unscented_projection(p_C, factors, project)
+    means2d, sharp, valid = unscented_projection(p_C, factors, project)
+    if not valid.all():
+        ids, p_W, p_C, means2d, sharp = (t[valid] for t in (ids, p_W, p_C, means2d, sharp))
     covariances = sharp + views.eps2d * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
     opacity = opacities[ids]
     if views.antialiased:
@@ -136,7 +137,8 @@ def _project(
     color = (colors[camera] if views.per_camera_colors else colors)[ids]
     if views.sh_degree is not None:
         direction = torch.nn.functional.normalize(p_W + torch.linalg.solve(R_CW, t_CW), dim=-1)
-        basis = torch.stack(sh_basis_functions(*direction.unbind(-1), views.sh_degree), -1).float()
+        x, y, z = direction.unbind(-1)
+        basis = torch.stack(sh_basis_functions(x, y, z, views.sh_degree), -1).float()
         color = torch.einsum("nk,nkc->nc", basis, color[:, : basis.shape[1]])
         color = (color + 0.5).clamp(min=0)
     return ids, (means2d, covariances, p_C[:, 2].float(), opacity, color)

@@ -48,55 +48,70 @@ def blobs(count: int, scale: float, seed: int = 0, spread: float = 0.6) -> dict[
 
 
 def test_zero_distortion_is_the_pinhole():
-    """Means differ from the pinhole's by (s/z)^2 f and images by less than 2e-3 at s/z = 1/400."""
+    """In every mode, for s/z = 1/400, images equal the pinhole's by 5e-5 (depths of up to 4 m: by
+    3e-4 m) in the mean, and but for a few contributions of 1/255 that cross the cut."""
+    scene = blobs(4000, 1 / 400)
+    for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+        for rasterize_mode in ("classic", "antialiased"):
+            options: dict[str, Any] = {"render_mode": mode, "rasterize_mode": rasterize_mode}
+            options["backgrounds"] = torch.tensor([[0.2, 0.5, 0.9]])
+            image, alpha, meta = rasterize(**scene, width=160, height=120, **options)
+            got, got_alpha, got_meta = rasterize(
+                **scene, width=160, height=120, **options, **lens("zero")
+            )
+            assert torch.equal(got_meta["gaussian_ids"], meta["gaussian_ids"])
+            assert (got_alpha - alpha).abs().max() < 5e-3
+            covered = (alpha > 0.1) & (got_alpha > 0.1)
+            error = (got - image).abs() * covered
+            assert covered.float().mean() > 0.1
+            assert error.mean() < (5e-5 if mode == "RGB" else 3e-4)
+            assert error.max() < (5e-3 if mode == "RGB" else 0.05)
+
+
+def test_means_shift_with_curvature():
+    """Without distortion means differ from the pinhole's by at most f (s/z)^2, quadratically."""
     shifts = []
     for scale in (1 / 100, 1 / 400):
         scene = blobs(400, scale)
-        modes = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-        for mode in modes if scale == 1 / 400 else ("RGB",):
-            for rasterize_mode in ("classic", "antialiased"):
-                options: dict[str, Any] = {"render_mode": mode, "rasterize_mode": rasterize_mode}
-                options["backgrounds"] = torch.tensor([[0.2, 0.5, 0.9]])
-                expected = rasterize(**scene, width=160, height=120, **options)
-                got = rasterize(**scene, width=160, height=120, **options, **lens("zero"))
-                assert torch.equal(got[2]["gaussian_ids"], expected[2]["gaussian_ids"])
-                covered = (expected[1] > 0.1) & (got[1] > 0.1)
-                tolerance = 2e-3 if mode == "RGB" else 8e-3  # depths reach 4 m
-                if scale == 1 / 400:
-                    error = (got[0] - expected[0]).abs() * covered
-                    assert error.max() < tolerance and covered.float().mean() > 0.05
-                    assert (got[1] - expected[1]).abs().max() < 5e-3  # an alpha of 1/255 may flip
-        shift = (got[2]["means2d"] - expected[2]["means2d"]).norm(dim=1)
-        shifts.append(float(shift.max()))
+        means = [
+            rasterize(**scene, width=160, height=120, **options)[2]["means2d"]
+            for options in ({}, lens("zero"))
+        ]
+        shifts.append(float((means[1] - means[0]).norm(dim=1).max()))
         assert shifts[-1] < 110 * (1.5 * scale) ** 2
-    assert 10 < shifts[0] / shifts[1] < 25  # quadratic: 16
+    assert 10 < shifts[0] / shifts[1] < 25  # 16
 
 
 @pytest.mark.parametrize("model", ["opencv", "fisheye"])
 def test_undistorted_render_is_the_pinhole_render(model):
-    """OpenCV's undistortion of a distorted render is the pinhole's render, to interpolation."""
+    """OpenCV's undistortion of a distorted render is the pinhole's render.
+
+    What remains is interpolation and, proportional to the size of the Gaussians, what a projected
+    Gaussian lacks to be one; a shift by half a pixel would be three times as much.
+    """
+    width, height = 2 * SIZE[0], 2 * SIZE[1]
     scene = blobs(1500, 0.012, spread=0.8)
-    options: dict[str, Any] = {"width": SIZE[0], "height": SIZE[1], "eps2d": 0.0}
+    K_cv = K.numpy() * [[2], [2], [1]]
+    scene["Ks"] = torch.from_numpy(K_cv).float()[None]
+    options: dict[str, Any] = {"width": width, "height": height, "eps2d": 0.0}
     distorted = rasterize(**scene, **options, **lens(model))[0][0].numpy()
     pinhole = rasterize(**scene, **options)[0][0].numpy()
-    K_cv = K.numpy().copy()
     K_cv[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
+    shape = (np.eye(3), K_cv, (width, height), cv2.CV_32FC1)
     if model == "fisheye":
-        maps = cv2.fisheye.initUndistortRectifyMap(
-            K_cv, FISHEYE.numpy(), np.eye(3), K_cv, SIZE, cv2.CV_32FC1
-        )
+        maps = cv2.fisheye.initUndistortRectifyMap(K_cv, FISHEYE.numpy(), *shape)
     else:
         order = [0, 1, 6, 7, 2, 3, 4, 5]
         coefficients = torch.cat([RADIAL, TANGENTIAL])[order].numpy()
-        maps = cv2.initUndistortRectifyMap(K_cv, coefficients, np.eye(3), K_cv, SIZE, cv2.CV_32FC1)
-    undistorted = cv2.remap(distorted, *maps, cv2.INTER_CUBIC)
-    inside = (maps[0] > 2) & (maps[0] < SIZE[0] - 3) & (maps[1] > 2) & (maps[1] < SIZE[1] - 3)
+        maps = cv2.initUndistortRectifyMap(K_cv, coefficients, *shape)
+    undistorted = cv2.remap(distorted, *maps, cv2.INTER_LANCZOS4)
+    x, y = maps
+    inside = (x > 4) & (x < width - 5) & (y > 4) & (y < height - 5)
     error = np.abs(undistorted - pinhole)[inside]
     untouched = np.abs(distorted - pinhole)[inside]
-    print(model, "mean", error.mean(), "p99", np.quantile(error, 0.99), "control", untouched.mean())
     assert inside.mean() > 0.7
-    assert error.mean() < 0.004 and np.quantile(error, 0.99) < 0.03
-    assert untouched.mean() > 10 * error.mean()
+    assert error.mean() < 0.002 and np.quantile(error, 0.99) < 0.012
+    assert untouched.mean() > 0.1
 
 
 @pytest.mark.parametrize("model", ["opencv", "fisheye"])
@@ -143,7 +158,6 @@ def test_rendered_gradients(model, rasterize_mode):
         expected = float(ends[0] - ends[1]) / (2 * h)
         got = float((gradient.double() * direction).sum())
         scale = float((gradient.double() * direction).abs().sum())
-        print(model, rasterize_mode, name, abs(got - expected) / scale)
         assert abs(got - expected) < 2e-3 * scale, name
 
 
@@ -168,7 +182,7 @@ def test_fold_backs_are_culled():
         image.sum().backward()
         for name, leaf in leaves.items():
             assert leaf.grad is not None and leaf.grad.isfinite().all(), name
-        assert (leaves["means"].grad[1:] == 0).all()
+        assert not leaves["means"].grad[1:].any()  # pyright: ignore[reportOptionalSubscript]
 
 
 def test_depth_range_and_field_of_view():
