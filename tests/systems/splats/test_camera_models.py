@@ -83,7 +83,8 @@ def test_limits():
     assert opencv_limit(torch.tensor([0.1, 0.1, 0, 0, 0, 0])) == math.inf
     assert fisheye_limit(torch.tensor([-1 / 3, 0, 0, 0])) == pytest.approx(1, rel=1e-6)
     assert fisheye_limit(torch.zeros(4)) == math.inf
-    for radial in (RADIAL, quadratic, saturates):
+    turns_twice = torch.tensor([-0.4, 0.06, 0, 0, 0, 0])
+    for radial in (RADIAL, quadratic, saturates, turns_twice):
         r = torch.linspace(0, 3, 3001, dtype=torch.float64)
         p_C = torch.stack([r, 0 * r, 1 + 0 * r], -1)
         pixels, valid = project_opencv(p_C, K, radial.double(), torch.zeros(2).double())
@@ -129,3 +130,28 @@ def test_projection_gradients():
         return [t for r in results for t in (r.means2d, r.covariances)]
 
     assert torch.autograd.gradcheck(projected, (p_C, factors, *inputs), atol=1e-5)
+
+
+def test_tangential_fold():
+    """y' = y + 3 p1 y^2 turns back at y = -1 / (6 p1); what lies beyond is not valid."""
+    y = torch.linspace(-1, 1, 201, dtype=torch.float64)
+    p_C = torch.stack([0 * y, y, 1 + 0 * y], -1)
+    tangential = torch.tensor([0.5, 0.0], dtype=torch.float64)
+    _, valid = project_opencv(p_C, K, torch.zeros(6).double(), tangential)
+    assert torch.equal(valid, y > -1 / 3)
+
+
+def test_moments_of_a_quadratic():
+    """Through (x + x^2, y) a Gaussian's mean moves by s^2, its variance grows by 2 s^4 (1 %)."""
+
+    def project(p):
+        x, y, _ = p.unbind(-1)
+        return torch.stack([x + x * x, y], -1), torch.ones_like(x, dtype=torch.bool)
+
+    s = 0.3
+    factor = s * torch.eye(3, dtype=torch.float64)[None]
+    result = unscented_projection(torch.zeros(1, 3, dtype=torch.float64), factor, project)
+    assert result.means2d[0].tolist() == pytest.approx([s**2, 0], abs=1e-12)
+    xx, xy, yy = result.covariances[0].tolist()
+    assert (xx - s**2) / (2 * s**4) == pytest.approx(1, abs=0.011)
+    assert (xy, yy) == pytest.approx((0, s**2), abs=1e-12)

@@ -68,6 +68,31 @@ def test_zero_distortion_is_the_pinhole():
             assert error.max() < (5e-3 if mode == "RGB" else 0.05)
 
 
+def test_spherical_harmonics_see_the_pose():
+    """Colours from spherical harmonics are the pinhole's for a camera that is moved and turned."""
+    scene = blobs(2000, 1 / 400)
+    scene["colors"] = torch.randn(2000, 16, 3, generator=torch.Generator().manual_seed(1))
+    cos, sin = math.cos(0.2), math.sin(0.2)
+    scene["viewmats"] = torch.tensor(
+        [[[cos, 0, sin, -0.5], [0, 1, 0, 0.3], [-sin, 0, cos, 0.2], [0, 0, 0, 1]]]
+    )
+    images = [
+        rasterize(**scene, width=160, height=120, sh_degree=3, **options)[0]
+        for options in ({}, lens("zero"))
+    ]
+    assert images[0].mean() > 0.02
+    assert (images[1] - images[0]).abs().mean() < 1e-4
+
+
+def test_margin():
+    """Near the camera plane, where images are stretched without bound, Gaussians are left out."""
+    scene = blobs(2, 0.01)
+    scene["means"] = torch.tensor([[1.0, 0, 0.05], [0.9, 0, 1]])
+    scene["scales"] = torch.tensor([[0.1, 0.1, 0.01]]).repeat(2, 1)
+    _, _, meta = rasterize(**scene, width=160, height=120, **lens("zero"))
+    assert meta["gaussian_ids"].tolist() == [1]
+
+
 def test_means_shift_with_curvature():
     """Without distortion means differ from the pinhole's by at most f (s/z)^2, quadratically."""
     shifts = []
@@ -257,6 +282,22 @@ def test_batches_of_cameras():
         assert torch.equal(alone[0], image[c])
         assert torch.equal(own_meta["means2d"], meta["means2d"][meta["camera_ids"] == c])
     assert not torch.equal(image[0], image[1])
+
+    def gradient(views, **options) -> Tensor:
+        means = scene["means"].clone().requires_grad_()
+        inputs: dict[str, Any] = views | {"means": means}
+        rasterize(**inputs, width=160, height=120, **options)[0].square().sum().backward()
+        assert means.grad is not None
+        return means.grad
+
+    single = [
+        gradient(
+            scene | {n: scene[n][c : c + 1] for n in ("viewmats", "Ks")},
+            **{n: t[c : c + 1] for n, t in coefficients.items() if n != "camera_model"},
+        )
+        for c in (0, 1)
+    ]
+    assert torch.allclose(gradient(scene, **coefficients), single[0] + single[1], atol=1e-4)
 
 
 def test_errors():
