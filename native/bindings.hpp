@@ -63,5 +63,7 @@ inline void check_size(const Output& out, int width, int height, size_t channels
 void bind_gradients(nb::module_& m);
 // Adds the renderer of surfels.
 void bind_surfels(nb::module_& m);
+// Adds the rendering of projected Gaussians.
+void bind_projected(nb::module_& m);
 
 }  // namespace flysplat

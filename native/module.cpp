@@ -155,6 +155,7 @@ NB_MODULE(_native, m) {
   bind_losses(m);
   bind_gradients(m);
   bind_surfels(m);
+  bind_projected(m);
 }
 
 }  // namespace flysplat

@@ -96,6 +96,15 @@ void Renderer::render(const BakedArrays& scene, const Camera& camera, const Imag
   finish(image, false);
 }
 
+void Renderer::render(const ProjectedArrays& projected, const Camera& camera, const Image& image,
+                      bool keep) {
+  start_frame(camera);
+  project(projected.count, [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
+    return place_splats(projected, camera, begin, end, splats, depth_bits);
+  });
+  finish(image, keep);
+}
+
 size_t Frame::splat_count() const {
   return std::accumulate(chunk_counts.begin(), chunk_counts.end(), size_t{0});
 }

@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "projected.hpp"
 #include "radix_sort.hpp"
 #include "thread_pool.hpp"
 #include "types.hpp"
@@ -55,6 +56,7 @@ class Renderer {
   void render(const GaussianArrays& gaussians, const Camera& camera, const Image& image,
               bool keep = false);
   void render(const BakedArrays& scene, const Camera& camera, const Image& image);
+  void render(const ProjectedArrays& projected, const Camera& camera, const Image& image, bool keep);
 
   std::shared_ptr<const Frame> frame() const { return frame_; }
 

@@ -1,5 +1,6 @@
 """Gaussian splatting with gsplat's interface: native kernels on the CPU, gsplat on CUDA."""
 
+import math
 import threading
 from typing import Any
 
@@ -10,6 +11,12 @@ from torch import Tensor
 from flysplat import _native
 from flysplat.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
 from flysplat.systems.splats.rasterization_autograd import Composite, Project, Views, to_numpy
+from flysplat.systems.splats.rasterization_unscented import (
+    RADIAL_COUNTS,
+    camera_projections,
+    check_camera_model,
+    render_unscented,
+)
 
 TILE_SIZE = 16  # [px]
 CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
@@ -41,10 +48,14 @@ def rasterize(
     render_mode: str = "RGB",
     absgrad: bool = False,
     rasterize_mode: str = "classic",
+    camera_model: str = "pinhole",
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    max_angle: float = math.pi / 2,
     threads: int = 1,
     simd: str = "",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Renders N Gaussians into C pinhole cameras (Kerbl et al. 2023, with gsplat's conventions).
+    """Renders N Gaussians into C cameras (Kerbl et al. 2023, with gsplat's conventions).
 
     A Gaussian of colour c adds ``T a c`` to a pixel, where ``a = min(.99, o exp(-d^T S^-1 d / 2))``
     and T is what those in front let through; S is its covariance projected by the Jacobian at its
@@ -55,6 +66,11 @@ def rasterize(
     colors, viewmats (all twelve numbers, taken as free) and backgrounds; a Gaussian that is skipped
     or held at a = .99 has no part in the derivative there. Equal input gives equal bits, gradients
     included, whatever the number of threads.
+
+    With distortion coefficients, or for a fisheye, S and the centre on the image are those of the
+    unscented projection (see `camera_models`), and Ks and the coefficients are differentiable too.
+    Gaussians that reach where the camera model is not valid are left out, and so are those whose
+    centre lies more than half an image outside the image.
 
     Args:
         means: (N, 3) centres [m].
@@ -79,6 +95,11 @@ def rasterize(
             absolute values of what they add to the gradient of means2d.
         rasterize_mode: "classic", or "antialiased": opacities are multiplied by
             sqrt(det S / det(S + eps2d)), so that Gaussians narrower than a pixel keep their light.
+        camera_model: "pinhole", with OpenCV's distortion if coefficients are given, or "fisheye".
+        radial_coeffs: (C, 2), (C, 3) or (C, 6) k1 k2 [k3 [k4 k5 k6]] of a pinhole; (C, 4) k1 to k4
+            of a fisheye, zero if None.
+        tangential_coeffs: (C, 2) p1 p2 of a pinhole.
+        max_angle: Fisheye: Gaussians farther from the optical axis are left out, <= pi/2 [rad].
         threads: CPU threads; the result does not depend on it.
         simd: See `create_renderer`.
 
@@ -91,7 +112,8 @@ def rasterize(
 
     Raises:
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it),
-            or Ks requires a gradient.
+            or Ks of an undistorted pinhole requires a gradient.
+        NotImplementedError: tensors are on a GPU and the cameras are distorted.
         ImportError: tensors are on a GPU and gsplat is not installed.
     """
     tensors = {
@@ -105,14 +127,24 @@ def rasterize(
     }
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
+    if radial_coeffs is not None:
+        tensors["radial_coeffs"] = radial_coeffs
+    if tangential_coeffs is not None:
+        tensors["tangential_coeffs"] = tangential_coeffs
+    check_camera_model(camera_model, tangential_coeffs, max_angle)
+    unscented = camera_model != "pinhole" or not (radial_coeffs is tangential_coeffs is None)
     if render_mode not in CHANNELS:
         raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(
             f"rasterize_mode is {rasterize_mode!r}; it must be one of {', '.join(RASTERIZE_MODES)}"
         )
-    _check_shapes(tensors, sh_degree)
+    _check_shapes(tensors, sh_degree, RADIAL_COUNTS[camera_model])
     if means.device.type == "cuda":
+        if unscented:
+            raise NotImplementedError(
+                "distorted cameras are rendered on the CPU alone; move the tensors with .cpu()"
+            )
         return _gsplat().rasterization(
             means,
             quats,
@@ -135,7 +167,7 @@ def rasterize(
         )
     if means.device.type != "cpu":
         raise ValueError(f"tensors are on {means.device}; move them to 'cpu' or 'cuda'")
-    if torch.is_grad_enabled() and Ks.requires_grad:
+    if torch.is_grad_enabled() and Ks.requires_grad and not unscented:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
 
     renderer = _renderer(threads, simd)
@@ -163,7 +195,13 @@ def rasterize(
         absgrad=absgrad,
     )
     scene = (means, quats, scales, opacities, colors, viewmats)
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()):
+    wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
+    if unscented:
+        cameras = camera_projections(camera_model, Ks, radial_coeffs, tangential_coeffs, max_angle)
+        image, alpha, means2d = render_unscented(
+            views, scene, backgrounds, cameras, wants_gradients
+        )
+    elif wants_gradients:
         means2d = Project.apply(views, *scene)
         image, alpha = Composite.apply(views, means2d, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
     else:
@@ -212,7 +250,9 @@ def _gsplat():
     return gsplat
 
 
-def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None) -> None:
+def _check_shapes(
+    tensors: dict[str, Tensor], sh_degree: int | None, radial_counts: tuple[int, ...] = ()
+) -> None:
     N = tensors["means"].shape[0] if tensors["means"].ndim else 0
     C = tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
     allowed: dict[str, tuple[tuple[int | str, ...], ...]] = {
@@ -224,6 +264,8 @@ def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None) -> None:
         "viewmats": ((C, 4, 4),),
         "Ks": ((C, 3, 3),),
         "backgrounds": ((C, 3),),
+        "radial_coeffs": tuple((C, count) for count in radial_counts),
+        "tangential_coeffs": ((C, 2),),
     }
     if sh_degree is not None:
         if sh_degree not in (0, 1, 2, 3):

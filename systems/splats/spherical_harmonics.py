@@ -6,6 +6,9 @@ Evaluation", JCGT 2013), listed by degree and then by order from -l to l. A colo
 ``max(0, 0.5 + sum_k basis_k(direction) sh_k)``, with the direction from the camera to the Gaussian.
 """
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,32 +30,37 @@ def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
         raise ValueError(f"spherical harmonics of degree {degree}: the degree must be 0, 1, 2 or 3")
     directions = np.asarray(directions, dtype=np.float64)
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    return np.stack(sh_basis_functions(x, y, z, degree), axis=-1)
+
+
+def sh_basis_functions(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
+    """The (degree + 1)^2 basis functions of unit vectors (x, y, z): NumPy arrays or tensors."""
     xx, yy, zz = x * x, y * y, z * z
-    basis = [np.full_like(x, C0)]
+    basis = [C0 + 0 * x]
     if degree >= 1:
-        c = np.sqrt(3 / (4 * np.pi))
+        c = math.sqrt(3 / (4 * math.pi))
         basis += [-c * y, c * z, -c * x]
     if degree >= 2:
-        c = np.sqrt(15 / (4 * np.pi))
+        c = math.sqrt(15 / (4 * math.pi))
         basis += [
             c * x * y,
             -c * y * z,
-            np.sqrt(5 / (16 * np.pi)) * (2 * zz - xx - yy),
+            math.sqrt(5 / (16 * math.pi)) * (2 * zz - xx - yy),
             -c * x * z,
             c / 2 * (xx - yy),
         ]
     if degree >= 3:
-        c3, c2, c1 = np.sqrt(np.array([35 / 32, 105 / 4, 21 / 32]) / np.pi)
+        c3, c2, c1 = (math.sqrt(a / math.pi) for a in (35 / 32, 105 / 4, 21 / 32))
         basis += [
             -c3 * y * (3 * xx - yy),
             c2 * x * y * z,
             -c1 * y * (4 * zz - xx - yy),
-            np.sqrt(7 / (16 * np.pi)) * z * (2 * zz - 3 * xx - 3 * yy),
+            math.sqrt(7 / (16 * math.pi)) * z * (2 * zz - 3 * xx - 3 * yy),
             -c1 * x * (4 * zz - xx - yy),
             c2 / 2 * z * (xx - yy),
             -c3 * x * (xx - 3 * yy),
         ]
-    return np.stack(basis, axis=-1)
+    return basis
 
 
 def evaluate_sh(sh: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:

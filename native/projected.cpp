@@ -1,0 +1,117 @@
+// From projected Gaussians to splats, and the Python binding. Scalar: whoever projects in Python
+// spends far more there.
+#include "projected.hpp"
+
+#include <cmath>
+#include <cstring>
+
+#include "bindings.hpp"
+
+namespace flysplat {
+namespace {
+
+bool place(const ProjectedArrays& in, const Camera& camera, size_t i, Splat& s) {
+  const double xx = in.covariances[3 * i], xy = in.covariances[3 * i + 1],
+               yy = in.covariances[3 * i + 2];
+  const double det = xx * yy - xy * xy;
+  if (!(xx > 0.0 && yy > 0.0 && det > 0.0)) return false;
+  const double x = in.means2d[2 * i], y = in.means2d[2 * i + 1];
+  const double scale = kExponentScale;
+  s.mean_x = static_cast<float>(x);
+  s.mean_y = static_cast<float>(y);
+  s.ux = static_cast<float>(scale * std::sqrt(yy / det));
+  s.uy = static_cast<float>(-scale * std::sqrt(yy / det) * (xy / yy));
+  s.vy = static_cast<float>(scale / std::sqrt(yy));
+  s.slope_x = static_cast<float>(xy / yy);
+  s.slope_y = static_cast<float>(xy / xx);
+  s.depth = in.depths[i];
+  s.index = static_cast<uint32_t>(i);
+  s.unused = 0;
+  std::copy_n(in.colors + 3 * i, 3, s.color);
+  s.log2_opacity = std::log2(std::max(in.opacities[i], 1e-30f));
+
+  // alpha >= 1/255 where u^2 + v^2 <= log2(255 o).
+  const double budget = static_cast<double>(s.log2_opacity) - kLog2AlphaCut;
+  if (!(budget >= 0.0)) return false;
+  const double extent_x = std::sqrt(budget * xx) / scale, extent_y = std::sqrt(budget * yy) / scale;
+  s.extent_x = static_cast<float>(extent_x);
+  s.extent_y = static_cast<float>(extent_y);
+  return std::max(extent_x, extent_y) > static_cast<double>(camera.radius_clip) &&
+         x + extent_x > 0.0 && x - extent_x < camera.width && y + extent_y > 0.0 &&
+         y - extent_y < camera.height && std::isfinite(s.ux + s.uy + s.vy) &&
+         std::isfinite(s.mean_x + s.mean_y) && s.depth > 0.0f && std::isfinite(s.depth);
+}
+
+using namespace nb::literals;
+using Rows = Doubles<nb::shape<-1, 3>>;
+
+// Returns (ux, uy, vy) of every visible splat, which the derivative by the covariance needs.
+nb::ndarray<nb::numpy, float, nb::ndim<2>> render_projected(
+    Renderer& renderer, Doubles<nb::shape<-1, 2>> means2d, Rows covariances, Opacities depths,
+    Opacities opacities, Means colors, int width, int height, double radius_clip,
+    bool expected_depth, Floats<nb::shape<3>> background, Output image, Output alpha, bool keep) {
+  const size_t n = means2d.shape(0);
+  require(covariances.shape(0) == n && depths.shape(0) == n && opacities.shape(0) == n &&
+              colors.shape(0) == n,
+          "arrays of Gaussians differ in length");
+  require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
+  require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
+          "the image must have pixels, and at most 32768 a side");
+  const size_t channels = image.shape(2);
+  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
+  check_size(image, width, height, channels);
+  check_size(alpha, width, height, 1);
+  const ProjectedArrays projected{n, means2d.data(), covariances.data(), depths.data(),
+                                  opacities.data(), colors.data()};
+  Camera camera{};
+  camera.width = width;
+  camera.height = height;
+  camera.radius_clip = static_cast<float>(std::floor(radius_clip));
+  Image out{};
+  if (channels >= 3) out.color = image.data();
+  if (channels != 3) out.depth = image.data() + channels - 1;
+  out.color_stride = out.depth_stride = static_cast<int>(channels);
+  out.expected_depth = expected_depth;
+  out.alpha = alpha.data();
+  std::copy_n(background.data(), 3, out.background);
+
+  float* factors = nullptr;
+  size_t visible = 0;
+  {
+    const nb::gil_scoped_release release;
+    const std::scoped_lock lock(renderer.mutex());
+    renderer.render(projected, camera, out, keep);
+    visible = renderer.splat_count();
+    factors = new float[3 * visible];
+    size_t i = 0;
+    renderer.for_each_splat([&](const Splat& s) {
+      factors[i++] = s.ux;
+      factors[i++] = s.uy;
+      factors[i++] = s.vy;
+    });
+  }
+  nb::capsule owner(factors, [](void* p) noexcept { delete[] static_cast<float*>(p); });
+  return nb::ndarray<nb::numpy, float, nb::ndim<2>>(factors, {visible, 3}, owner);
+}
+
+}  // namespace
+
+size_t place_splats(const ProjectedArrays& projected, const Camera& camera, size_t begin,
+                    size_t end, Splat* splats, uint32_t* depth_bits) {
+  size_t count = 0;
+  for (size_t i = begin; i < end; ++i) {
+    Splat splat;
+    if (!place(projected, camera, i, splat)) continue;
+    splats[count] = splat;
+    std::memcpy(depth_bits + count, &splat.depth, sizeof(uint32_t));
+    ++count;
+  }
+  return count;
+}
+
+void bind_projected(nb::module_& m) {
+  m.def("render_projected", &render_projected,
+        "Renders projected Gaussians; returns the factors (ux, uy, vy) of the visible ones.");
+}
+
+}  // namespace flysplat
