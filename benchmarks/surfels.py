@@ -8,16 +8,16 @@ wall clock, in milliseconds, of whole calls on torch tensors; on a busy machine 
 to read.
 """
 
-import os
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
-from rasterize import cameras_of, hospital, machine, milliseconds, synthetic_room, tensors_of
+from rasterize import cameras_of, load_scene, machine, milliseconds, tensors_of
 
 from flysplat import _native
 from flysplat.systems.splats import rasterize
 from flysplat.systems.splats.surfels import rasterize_surfels
+
+COUNT = 100_000  # surfels
 
 
 def show(call: Callable[[], object]) -> str:
@@ -27,8 +27,7 @@ def show(call: Callable[[], object]) -> str:
 
 def main() -> None:
     torch.set_num_threads(1)
-    data = os.environ.get("FLYSPLAT_DATA")
-    scene, X_WC = hospital(Path(data) / "tartanair/hospital") if data else synthetic_room()
+    scene, X_WC = load_scene(COUNT)
     surfels = tensors_of(scene)
     surfels["quats"] = torch.randn(len(scene), 4, generator=torch.Generator().manual_seed(0))
     print(f"{machine()}\n{len(scene):,} surfels, one thread; milliseconds, minimum (median)\n")

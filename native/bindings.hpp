@@ -35,7 +35,7 @@ inline GaussianArrays gaussian_arrays(const Means& means, const Quats& quats, co
           "arrays of Gaussians differ in length");
   require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
   const int coefficients = static_cast<int>(colors.shape(1));
-  require(sh_degree <= 3 && coefficients >= (sh_degree + 1) * (sh_degree + 1),
+  require(sh_degree <= 3 && coefficients >= std::max(1, (sh_degree + 1) * (sh_degree + 1)),
           "too few spherical-harmonic coefficients for the degree");
   return {n, means.data(), quats.data(), scales.data(), opacities.data(), colors.data(), sh_degree,
           coefficients};
