@@ -11,6 +11,7 @@ from torch import Tensor
 from flysplat import _native
 from flysplat.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
 from flysplat.systems.splats.rasterization_autograd import Composite, Project, Views, to_numpy
+from flysplat.systems.splats.rasterization_checks import check_shapes, check_values
 from flysplat.systems.splats.rasterization_unscented import (
     RADIAL_COUNTS,
     camera_projections,
@@ -23,9 +24,7 @@ CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
 
 RASTERIZE_MODES = ("classic", "antialiased")
 
-_scratch = (
-    threading.local()
-)  # one native renderer per thread and configuration, for its memory only
+_scratch = threading.local()  # one native renderer per thread and setting, for its memory only
 
 
 def rasterize(
@@ -139,7 +138,7 @@ def rasterize(
         raise ValueError(
             f"rasterize_mode is {rasterize_mode!r}; it must be one of {', '.join(RASTERIZE_MODES)}"
         )
-    _check_shapes(tensors, sh_degree, RADIAL_COUNTS[camera_model])
+    check_shapes(tensors, sh_degree, RADIAL_COUNTS[camera_model])
     if means.device.type == "cuda":
         if unscented:
             raise NotImplementedError(
@@ -172,7 +171,7 @@ def rasterize(
 
     renderer = _renderer(threads, simd)
     arrays = {name: to_numpy(tensor) for name, tensor in tensors.items()}
-    _check_values(arrays, renderer)
+    check_values(arrays, renderer)
     for name, value in (("eps2d", eps2d), ("radius_clip", radius_clip)):
         if not 0 <= value < float("inf"):
             raise ValueError(f"{name} is {value}; it must be a finite number of pixels >= 0")
@@ -248,85 +247,3 @@ def _gsplat():
             "pip install 'flysplat[cuda]', or move the tensors to the CPU"
         ) from error
     return gsplat
-
-
-def _check_shapes(
-    tensors: dict[str, Tensor], sh_degree: int | None, radial_counts: tuple[int, ...] = ()
-) -> None:
-    N = tensors["means"].shape[0] if tensors["means"].ndim else 0
-    C = tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
-    allowed: dict[str, tuple[tuple[int | str, ...], ...]] = {
-        "means": ((N, 3),),
-        "quats": ((N, 4),),
-        "scales": ((N, 3),),
-        "opacities": ((N,),),
-        "colors": ((N, 3), (C, N, 3)),
-        "viewmats": ((C, 4, 4),),
-        "Ks": ((C, 3, 3),),
-        "backgrounds": ((C, 3),),
-        "radial_coeffs": tuple((C, count) for count in radial_counts),
-        "tangential_coeffs": ((C, 2),),
-    }
-    if sh_degree is not None:
-        if sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"sh_degree is {sh_degree}; it must be 0, 1, 2, 3 or None")
-        allowed["colors"] = ((N, "K", 3), (C, N, "K", 3))
-    for name, tensor in tensors.items():
-        if not any(
-            len(shape) == tensor.ndim
-            and all(want in (have, "K") for want, have in zip(shape, tensor.shape, strict=True))
-            for shape in allowed[name]
-        ):
-            wanted = " or ".join("(" + ", ".join(map(str, s)) + ")" for s in allowed[name])
-            hint = "" if name != "colors" else f" with sh_degree={sh_degree}"
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it must be {wanted}{hint}")
-        if tensor.dtype != torch.float32:
-            raise ValueError(f"{name} is {tensor.dtype}; it must be torch.float32: use .float()")
-        if tensor.device != tensors["means"].device:
-            raise ValueError(
-                f"{name} is on {tensor.device} and means on {tensors['means'].device}; move them "
-                "to one device"
-            )
-    if C == 0:
-        raise ValueError("viewmats has shape (0, 4, 4); at least one camera is needed")
-    if sh_degree is not None and tensors["colors"].shape[-2] < (sh_degree + 1) ** 2:
-        raise ValueError(
-            f"colors has {tensors['colors'].shape[-2]} coefficients; sh_degree={sh_degree} needs "
-            f"{(sh_degree + 1) ** 2}"
-        )
-
-
-def _check_values(arrays: dict[str, np.ndarray], renderer: _native.Renderer) -> None:
-    for name, array in arrays.items():
-        first = _native.first_nonfinite(array.reshape(-1), renderer)
-        if first >= 0:
-            raise _bad_value(name, array, first, "be finite")
-    limits = {
-        "scales": (lambda a: a <= 0, "be positive"),
-        "opacities": (lambda a: (a < 0) | (a > 1), "lie in [0, 1]"),
-    }
-    for name, (is_bad, requirement) in limits.items():
-        bad = is_bad(arrays[name])
-        if bad.any():
-            raise _bad_value(name, arrays[name], int(bad.argmax()), requirement)
-    quats = arrays["quats"]
-    first = _native.first_zero_quaternion(quats)
-    if first >= 0:
-        raise ValueError(
-            f"quats[{first}] is {quats[first].tolist()}, which cannot be normalised; use "
-            "(1, 0, 0, 0) for no rotation"
-        )
-    for c, X_CW in enumerate(arrays["viewmats"].astype(np.float64)):
-        R = X_CW[:3, :3]
-        error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(X_CW[3] - (0, 0, 0, 1)).max())
-        if error > 1e-3:
-            raise ValueError(
-                f"viewmats[{c}] is not a rigid transform: R R^T or the last row is off by "
-                f"{error:.3g}, more than 0.001"
-            )
-
-
-def _bad_value(name: str, array: np.ndarray, flat_index: int, requirement: str) -> ValueError:
-    index = np.unravel_index(flat_index, array.shape)
-    where = ", ".join(str(int(i)) for i in index)
-    return ValueError(f"{name}[{where}] is {array[index]:g}; it must {requirement}")

@@ -9,12 +9,8 @@ from torch import Tensor
 from flysplat import _native
 from flysplat.systems.splats.baked_scene import check_camera, create_renderer
 from flysplat.systems.splats.depth_normals import depth_to_normals
-from flysplat.systems.splats.rasterization import (
-    CHANNELS,
-    TILE_SIZE,
-    _check_shapes,
-    _check_values,
-)
+from flysplat.systems.splats.rasterization import CHANNELS, TILE_SIZE
+from flysplat.systems.splats.rasterization_checks import check_shapes, check_values
 
 DEPTH_MODES = ("expected", "median")
 
@@ -92,7 +88,7 @@ def rasterize_surfels(
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
     _check_options(render_mode, depth_mode, distloss, radius_clip)
-    _check_shapes(tensors, sh_degree)
+    check_shapes(tensors, sh_degree)
     if means.device.type != "cpu":
         raise ValueError(f"tensors are on {means.device}; surfels render on 'cpu': use .cpu()")
     if Ks.requires_grad:
@@ -116,7 +112,7 @@ def rasterize_surfels(
     arrays = {k: np.ascontiguousarray(t.detach().numpy()) for k, t in tensors.items()}
     # The third scale is not read; whatever it is, it is no error.
     arrays["scales"] = np.ascontiguousarray(arrays["scales"][:, :2])
-    _check_values(arrays, frames.renderers[0])
+    check_values(arrays, frames.renderers[0])
     color, normal, depth, alpha, median, distort = _Rasterize.apply(
         means, quats, scales, opacities, colors, viewmats, view, frames
     )
