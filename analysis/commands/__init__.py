@@ -1,0 +1,10 @@
+"""The verbs of the command line, one module each.
+
+A module has `add_to(verbs)`, which adds the verb's parser and sets its default `verb` to the
+function that runs it. That function imports what it needs when it runs: torch and pydrake take
+seconds to load.
+"""
+
+from flysplat.analysis.commands import fly, reconstruct
+
+COMMANDS = (fly, reconstruct)

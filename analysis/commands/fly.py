@@ -1,0 +1,42 @@
+"""`flysplat fly`."""
+
+import argparse
+import logging
+from pathlib import Path
+
+from flysplat.analysis.commands.overrides import add_overrides
+
+
+def add_to(verbs: argparse._SubParsersAction) -> None:
+    fly = verbs.add_parser("fly", help="fly to a goal and leave a page, a video and a trajectory")
+    fly.set_defaults(verb=_fly)
+    fly.add_argument("--scenario", type=Path, metavar="FILE.yaml", help="the scenario to fly")
+    fly.add_argument(
+        "--scene",
+        type=Path,
+        metavar="DIR_OR_PLY",
+        help="fly in this scene folder, or PLY in metres, z up",
+    )
+    fly.add_argument("--seed", type=int, help="seed of the world and the start")
+    fly.add_argument(
+        "--out", type=Path, default=Path("out/fly"), help="output folder (%(default)s)"
+    )
+    fly.add_argument("--live", action="store_true", help="serve Meshcat while flying, in real time")
+    fly.add_argument("--graphviz", type=Path, metavar="FILE", help="write the diagram as Graphviz")
+    add_overrides(fly, "policy.lattice.speed=3")
+
+
+def _fly(options: argparse.Namespace) -> None:
+    from flysplat.diagrams import fly
+    from flysplat.diagrams.configuration import load_config
+    from flysplat.diagrams.scenario import Scenario
+    from flysplat.diagrams.worlds.make_world import SceneConfig
+
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    scenario = load_config(Scenario(), options.scenario)
+    if options.scene is not None:
+        scenario.world = SceneConfig(path=str(options.scene.absolute()))
+    if options.seed is not None:
+        scenario.seed = options.seed
+    scenario = load_config(scenario, overrides=options.overrides)
+    fly.run(scenario=scenario, out=options.out, live=options.live, graphviz=options.graphviz)
