@@ -19,12 +19,13 @@ from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.distance_field import FieldState
 from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.collision.esdf_build import esdf_from_gaussians
-from flysplat.systems.files import require_writable_folder
+from flysplat.systems.files import require_writable_folder, written_atomically
 from flysplat.systems.splats.gaussian_ply import read_ply, write_ply
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 FORMAT_VERSION = 1
 WORLD_FRAME = "z up"
+REPRESENTATIONS = ("3dgs", "2dgs")
 
 _MAX_VOXELS = 2e7
 _COARSEST = 0.25  # [m], voxels at which a vehicle of 0.354 m radius still finds its way
@@ -59,6 +60,19 @@ class SceneMetadata:
     """[m], default start."""
     p_WG: list[float] = field(default_factory=list)
     """[m], default goal."""
+    representation: str = "3dgs"
+    """"3dgs": Gaussians; "2dgs": surfels, kept as Gaussians that are as flat as allowed."""
+    capture: str = ""
+    """Folder of the capture that the scene was made from; empty if unknown."""
+    held_out: list[int] = field(default_factory=list)
+    """Frames of the capture that had no part in making the scene."""
+    image_width: int = 0
+    """[px], to which images were scaled down for the making; 0 if they were not."""
+    perturbation_bound: float | None = None
+    """[m], how far from the poses of the capture images of the scene can be trusted, as
+    `flysplat fidelity` measured it; None before."""
+    pose_perturbation_bounds: list[float] = field(default_factory=list)
+    """[m], the same for each pose of the capture, in frame order; empty before."""
 
 
 def read_scene(path: str | Path) -> World:
@@ -139,7 +153,34 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
         )
     if not all(0 <= value <= 1 for value in metadata.background):
         raise ValueError(f"{file}: background is {metadata.background}, 0 to 1 is needed")
+    if metadata.representation not in REPRESENTATIONS:
+        raise ValueError(
+            f"{file}: representation is {metadata.representation!r}, it must be one of "
+            f"{REPRESENTATIONS}"
+        )
+    if metadata.image_width < 0 or any(frame < 0 for frame in metadata.held_out):
+        raise ValueError(
+            f"{file}: image_width is {metadata.image_width} and held_out {metadata.held_out}; "
+            "neither may be negative"
+        )
+    bounds = np.array([metadata.perturbation_bound or 0.0, *metadata.pose_perturbation_bounds])
+    if not (np.isfinite(bounds) & (bounds >= 0)).all():
+        raise ValueError(
+            f"{file}: perturbation_bound is {metadata.perturbation_bound} and "
+            f"pose_perturbation_bounds {metadata.pose_perturbation_bounds}; finite lengths [m] of "
+            "at least 0 are needed, run `flysplat fidelity` again"
+        )
     return metadata
+
+
+def write_scene_metadata(path: str | Path, metadata: SceneMetadata) -> None:
+    """Replaces `scene.yaml` of the scene folder `path`, whole or not at all.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    with written_atomically(Path(path) / "scene.yaml") as partial:
+        yaml_dump_typed(metadata, filename=str(partial))
 
 
 def check_scene_target(path: str | Path) -> None:
@@ -168,8 +209,14 @@ def write_scene_folder(
     provenance: str,
     gains: Sequence[float] = (),
     vignetting: float = 0.0,
+    metric: bool = True,
+    representation: str = "3dgs",
+    capture: str = "",
+    held_out: Sequence[int] = (),
+    image_width: int = 0,
 ) -> SceneMetadata:
-    """Writes `world` as a scene folder and returns what its `scene.yaml` says.
+    """Writes `world` as a scene folder and returns what its `scene.yaml` says; see `SceneMetadata`
+    for what is said about it.
 
     The folder appears whole: it is written beside its place and renamed. A scene that stands there
     is replaced. Only the grid of the distance field is kept.
@@ -183,6 +230,7 @@ def write_scene_folder(
     metadata = SceneMetadata(
         name=world.name,
         provenance=provenance,
+        metric=metric,
         lower_W=[float(x) for x in esdf.lower_W],
         upper_W=[float(x) for x in esdf.upper_W],
         observed_free_volume=esdf.volume(FieldState.FREE),
@@ -191,6 +239,10 @@ def write_scene_folder(
         background=[float(x) for x in world.background],
         p_WS=[float(x) for x in world.p_WS],
         p_WG=[float(x) for x in world.p_WG],
+        representation=representation,
+        capture=capture,
+        held_out=[int(frame) for frame in held_out],
+        image_width=image_width,
     )
     new = path.with_name(f".{path.name}.{os.getpid()}.new")
     old = path.with_name(f".{path.name}.{os.getpid()}.old")

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from flysplat.diagrams.worlds.scene_folder import (
     read_scene_folder,
     read_scene_metadata,
     write_scene_folder,
+    write_scene_metadata,
 )
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.esdf_build import esdf_from_occupancy
@@ -77,6 +79,42 @@ def test_round_trip(tmp_path, world):
     np.testing.assert_allclose(metadata.lower_W, [1, 2, 3])
     np.testing.assert_allclose(metadata.upper_W, [5, 4, 5])
     assert metadata.observed_free_volume == pytest.approx(14 * 10 * 10 * 0.2**3)
+
+
+def test_how_it_was_made_is_kept(tmp_path, world):
+    """What is said of a scene's making reads back, and so do bounds that are measured later."""
+    folder = tmp_path / "scene"
+    written = write_scene_folder(
+        folder,
+        world,
+        provenance="",
+        representation="2dgs",
+        capture="/captures/hall",
+        held_out=[0, 8],
+        image_width=320,
+    )
+    assert (written.representation, written.capture) == ("2dgs", "/captures/hall")
+    assert (written.held_out, written.image_width) == ([0, 8], 320)
+    assert (written.perturbation_bound, written.pose_perturbation_bounds) == (None, [])
+    assert read_scene_metadata(folder) == written
+    measured = replace(written, perturbation_bound=0.4, pose_perturbation_bounds=[0.3, 0.5])
+    write_scene_metadata(folder, measured)
+    assert read_scene_metadata(folder) == measured
+    assert read_scene(folder).name == world.name
+
+
+def test_scene_from_before_these_fields(tmp_path, world):
+    """A scene.yaml that lacks the fields of later versions has their defaults."""
+    folder = tmp_path / "scene"
+    write_scene_folder(folder, world, provenance="")
+    later = ("representation", "capture", "held_out", "image_width", "perturb", "pose_perturb")
+    lines = (folder / "scene.yaml").read_text().splitlines(keepends=True)
+    kept = [line for line in lines if not line.startswith(later)]
+    assert len(kept) < len(lines) - 3
+    (folder / "scene.yaml").write_text("".join(kept))
+    metadata = read_scene_metadata(folder)
+    assert (metadata.representation, metadata.capture, metadata.held_out) == ("3dgs", "", [])
+    assert (metadata.image_width, metadata.perturbation_bound) == (0, None)
 
 
 def test_a_scene_is_replaced_whole(tmp_path, world):
@@ -180,6 +218,9 @@ def test_missing_scene(tmp_path):
         ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS is \[\]"),
         ("vignetting: 0.0", "vignetting: dark", "dark"),
         ("metric: true", "metric: [", "scene.yaml"),
+        ("representation: 3dgs", "representation: nerf", "representation is 'nerf', it must be"),
+        ("held_out: []", "held_out: [-1]", r"held_out \[-1\]; neither may be negative"),
+        ("image_width: 0", "perturbation_bound: -0.5", r"perturbation_bound is -0\.5"),
     ],
 )
 def test_bad_metadata(tmp_path, world, old, new, message):
