@@ -160,7 +160,7 @@ def _distance_field(capture: Capture, config: ReconstructConfig) -> Esdf:
     """Fuses the depth images; space that no image saw is marked unknown."""
 
     def depths() -> Iterator[NDArray[np.float32]]:
-        return (capture.load_depth(i) for i in range(len(capture)))
+        return (capture.registered_depth(i) for i in range(len(capture)))
 
     lower_W, upper_W = bounds_of_depth_images(depths(), capture.K, capture.X_WCs, config.max_range)
     return esdf_from_depth_images(

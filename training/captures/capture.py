@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from flysplat.training.captures.registered_depth import registered_depth
+
 
 @dataclass(frozen=True, eq=False)
 class CaptureFrame:
@@ -28,29 +30,84 @@ class CaptureFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
-    """A sequence of posed images with metric depth, loaded frame by frame when asked for.
+class DepthCamera:
+    """A camera that measures depth, beside the one that takes colour."""
 
-    World W has z up and is metric.
+    K: NDArray[np.float64]  # (3, 3) [px]
+    width: int  # [px]
+    height: int  # [px]
+    X_CD: RigidTransform  # pose of the depth camera D in the colour camera C
+
+
+@dataclass(frozen=True, eq=False)
+class SfmPoints:
+    """Coloured points of the place, from structure from motion or a scan."""
+
+    p_WQ: NDArray[np.float64]  # (N, 3) [m]
+    colors: NDArray[np.float64]  # (N, 3) red, green, blue, 0 to 1
+
+
+def no_depth(i: int) -> None:
+    """The `Capture.load_depth` of a capture without depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A sequence of posed images, with depth if there is any, loaded frame by frame when asked for.
+
+    Cameras are pinholes: loaders undistort. World W has z up and, unless `metric` is false, is in
+    metres.
     """
 
     name: str
     source: str
     """Where it was read from, for the record."""
-    K: NDArray[np.float64]  # (3, 3) [px]
+    K: NDArray[np.float64]  # (3, 3) [px], of the colour camera
     width: int  # [px]
     height: int  # [px]
     X_WCs: Sequence[RigidTransform]
     load_image: Callable[[int], NDArray[np.uint8]]
     """Returns the image of frame i, (height, width, 3), or raises an error that names the file."""
-    load_depth: Callable[[int], NDArray[np.float32]]
-    """Returns the depth of frame i, (height, width) [m], or raises an error that names the file."""
+    load_depth: Callable[[int], NDArray[np.float32] | None] = no_depth
+    """Returns the depth of frame i [m] in the pixels of the camera that measured it, None if that
+    frame has none, or raises an error that names the file. 0 is unknown, inf is beyond range."""
+    depth_camera: DepthCamera | None = None
+    """The camera that measured depth; None if depth has the pixels of the images."""
+    points: SfmPoints | None = None
+    """Points known of the place, if any."""
+    metric: bool = True
+    """Whether lengths are metres; if not, their unit is unknown and nothing can fly there."""
+    frame_names: Sequence[str] = ()
+    """What each frame is called where it was read from; empty if only numbers are known."""
+    dropped: Sequence[str] = ()
+    """Why frames were left out, one message each that names the file."""
 
     def __len__(self) -> int:
         return len(self.X_WCs)
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether any frame has depth."""
+        return self.load_depth is not no_depth
+
+    def registered_depth(self, i: int) -> NDArray[np.float32]:
+        """Returns the depth (height, width) [m] of frame i in the pixels of its image.
+
+        0 where it is unknown, everywhere if the frame has none.
+
+        Raises:
+            OSError, ValueError: if its file cannot be read or is of another size.
+        """
+        depth = self.load_depth(i)
+        if depth is None:
+            return np.zeros((self.height, self.width), np.float32)
+        if self.depth_camera is None:
+            return depth
+        camera = self.depth_camera
+        return registered_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
+
     def frame(self, i: int) -> CaptureFrame:
-        """Loads frame i, 0 <= i < len(self).
+        """Loads frame i, 0 <= i < len(self), with its registered depth.
 
         Raises:
             IndexError: if there is no such frame.
@@ -58,7 +115,7 @@ class Capture:
         """
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {self.name}: it has the frames 0 to {len(self) - 1}")
-        return CaptureFrame(self.load_image(i), self.load_depth(i), self.X_WCs[i], self.K)
+        return CaptureFrame(self.load_image(i), self.registered_depth(i), self.X_WCs[i], self.K)
 
     def frames(self) -> Iterator[CaptureFrame]:
         """Loads one frame after the other."""

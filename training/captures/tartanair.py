@@ -85,6 +85,7 @@ def read_tartanair_v1(path: str | Path) -> Capture:
         X_WCs=X_WCs,
         load_image=load_image,
         load_depth=load_depth,
+        frame_names=[file.name for file in image_files],
     )
 
 
