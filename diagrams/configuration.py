@@ -3,7 +3,9 @@
 import dataclasses
 import difflib
 from pathlib import Path
-from typing import Any, cast
+from textwrap import indent
+from types import UnionType
+from typing import Any, cast, get_type_hints
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
@@ -39,10 +41,12 @@ def load_config[Config](
         if not equals:
             raise ValueError(f"override {override!r} has no value; write FIELD=VALUE")
         *parents, field = name.split(".")
-        text = f"{field}: {value}"
-        for parent in reversed(parents):
-            text = f"{parent}:\n" + "".join(f"  {line}\n" for line in text.splitlines())
-        config = _updated(config, text, f"override {override!r}")
+        text = tagged = f"{field}: {value}"
+        for depth in reversed(range(len(parents))):
+            tag = _tag_of(config, parents[: depth + 1])
+            text = f"{parents[depth]}:\n{indent(text, '  ')}"
+            tagged = f"{parents[depth]}: {tag}\n{indent(tagged, '  ')}"
+        config = _updated(config, text, f"override {override!r}", tagged)
     return config
 
 
@@ -51,11 +55,27 @@ def dump_config(config: Any) -> str:
     return cast(str, yaml_dump_typed(config))
 
 
-def _updated[Config](config: Config, text: str, source: str) -> Config:
-    """`config` with the fields that the YAML `text` gives; `source` names the text in errors."""
+def _tag_of(config: Any, path: list[str]) -> str:
+    """The YAML tag that keeps the type which a field has now, where it may have several."""
+    owner = config
+    for name in path[:-1]:
+        owner = getattr(owner, name, None)
+    if not dataclasses.is_dataclass(owner):
+        return ""
+    schema = get_type_hints(type(owner)).get(path[-1])
+    value = getattr(owner, path[-1], None)
+    several = isinstance(schema, UnionType) and dataclasses.is_dataclass(value)
+    return f"!{type(value).__name__}" if several else ""
+
+
+def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -> Config:
+    """`config` with the fields that the YAML `text` gives; `source` names the text in errors.
+
+    `tagged` is the same text with the types of fields that may have several.
+    """
     try:
         _check_names(config, yaml.load(text, _NamesLoader), "")
-        return yaml_load_typed(schema=type(config), data=text, defaults=config)
+        return yaml_load_typed(schema=type(config), data=tagged or text, defaults=config)
     except yaml.YAMLError as error:
         raise ValueError(f"{source} is not YAML: {error}") from None
     except AssertionError:  # How Drake's reader refuses a plain value where fields belong.

@@ -38,7 +38,8 @@ class Flight:
     commands: np.ndarray  # (N, 4): thrust [m/s^2], body rates [rad/s]
     # (N,) [m] Distance to the nearest surface less the vehicle's radius; NaN outside the world.
     clearances: np.ndarray
-    # (M, size) One row a plan, its time first; see flysplat.systems.policies.hypotheses.
+    # (M, size) One row a plan, its time first; see flysplat.systems.policies.hypotheses. (0, 0) of
+    # policies that return none.
     hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialisation
 
@@ -154,15 +155,11 @@ def _record(
 ) -> Flight:
     logs = {
         name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
-        for name in ("state", "command", "hypotheses")
+        for name in ("state", "command")
     }
     times = logs["state"].sample_times().copy()
     # Copies: what a log returns is a view of memory that the diagram owns.
-    states, commands, hypotheses = (log.data().T.copy() for log in logs.values())
-    # A log samples before the policy updates at the same instant: it lacks the last plan.
-    last_plan = _evaluated(diagram, "hypotheses", root)
-    if last_plan[0] != hypotheses[-1, 0]:
-        hypotheses = np.vstack([hypotheses, last_plan])
+    states, commands = (log.data().T.copy() for log in logs.values())
     if root.get_time() > times[-1]:
         times = np.append(times, root.get_time())
         states = np.vstack([states, _evaluated(diagram, "state", root)])
@@ -173,9 +170,22 @@ def _record(
         states=states,
         commands=commands,
         clearances=world.distance_field.distance(states[:, :3]) - VEHICLE_RADIUS,
-        hypotheses=hypotheses[np.isfinite(hypotheses[:, 0])],
+        hypotheses=_recorded_plans(diagram, root),
         wall_time=wall_time,
     )
+
+
+def _recorded_plans(diagram: Diagram, root: Context) -> np.ndarray:
+    """All plans that were made (M, size), or (0, 0) of a policy that makes none."""
+    if not diagram.HasOutputPort("hypotheses"):
+        return np.empty((0, 0))
+    sink = cast(VectorLogSink, diagram.GetSubsystemByName("hypotheses_log"))
+    plans = sink.FindLog(root).data().T.copy()
+    # A log samples before the policy updates at the same instant: it lacks the last plan.
+    last = _evaluated(diagram, "hypotheses", root)
+    if last[0] != plans[-1, 0]:
+        plans = np.vstack([plans, last])
+    return plans[np.isfinite(plans[:, 0])]
 
 
 def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:

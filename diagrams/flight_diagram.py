@@ -4,15 +4,17 @@ from typing import cast
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.systems.sensors import CameraInfo
 
+from flysplat.diagrams.add_policy import AddPolicy
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.esdf_collision import EsdfCollision
+from flysplat.systems.policies.hypotheses import num_hypotheses_in
 from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
-from flysplat.systems.policies.privileged_planner import PrivilegedPlanner
+from flysplat.systems.policies.onboard_camera import OnboardCamera
 from flysplat.systems.splats.baked_scene import BakedScene
 from flysplat.systems.splats.splat_camera import SplatCamera
 from flysplat.systems.vehicle.flatness_controller import FlatnessController
@@ -33,13 +35,18 @@ LOG_PERIOD = 0.02  # [s]
 
 
 def BuildFlightDiagram(
-    scenario: Scenario, world: World, meshcat: Meshcat | None = None, video: bool = False
+    scenario: Scenario,
+    world: World,
+    meshcat: Meshcat | None = None,
+    video: bool = False,
+    camera: bool = True,
 ) -> Diagram:
     """
     Builds the diagram of one flight.
 
-    Systems, by name: `plant`, `pose`, `camera`, `collision`, `goal`, `policy`, `selector`,
-    `controller`, and the loggers `state_log`, `command_log`, `hypotheses_log`; with Meshcat also
+    Systems, by name: `plant`, `pose`, `collision`, `goal`, `policy`, `controller`, and the loggers
+    `state_log`, `command_log`; with a camera `camera`; with a policy that sees `policy_camera`,
+    with one that returns hypotheses `selector` and `hypotheses_log`; with Meshcat also
     `flight_visualizer` and `camera_visualizer`, with video `video`.
 
     .. pydrake_system::
@@ -56,58 +63,60 @@ def BuildFlightDiagram(
         - in_collision
         - field_state
 
+    The port `hypotheses` is there if the policy has it, the images if there is a camera.
+
     Args:
         scenario: who flies, how, from where to where; see `sample_initial_state` for its start.
         world: what is flown in.
         meshcat: draws the flight there when given.
         video: records the camera's images at its rate, for `VideoRecorder.save` to write.
+        camera: whether the scenario's camera is there; Meshcat and videos need it, flights do not.
     """
     builder = DiagramBuilder()
 
     plant = builder.AddNamedSystem("plant", QuadrotorPlant(scenario.vehicle))
     pose = builder.AddNamedSystem("pose", StateToPose())
-    camera = builder.AddNamedSystem("camera", MakeCamera(scenario, world))
     collision = builder.AddNamedSystem("collision", EsdfCollision(world.distance_field))
     goal = builder.AddNamedSystem("goal", ConstantVectorSource(goal_of(scenario, world)))
-    policy = builder.AddNamedSystem(
-        "policy", PrivilegedPlanner(world.esdf, scenario.policy, scenario.vehicle)
-    )
-    selector = builder.AddNamedSystem(
-        "selector",
-        HypothesisSelector(scenario.policy.lattice.num_hypotheses, scenario.controller.lookahead),
-    )
+    policy = AddPolicy(builder, scenario.policy, world, scenario.vehicle)
     controller = builder.AddNamedSystem(
         "controller", FlatnessController(scenario.controller, scenario.vehicle)
     )
 
     state = plant.GetOutputPort("state")
     builder.Connect(state, pose.GetInputPort("state"))
-    builder.Connect(pose.GetOutputPort("pose"), camera.GetInputPort("body_pose"))
     builder.Connect(state, collision.GetInputPort("state"))
     builder.Connect(state, policy.GetInputPort("state"))
     builder.Connect(goal.get_output_port(), policy.GetInputPort("goal"))
-    builder.Connect(policy.GetOutputPort("hypotheses"), selector.GetInputPort("hypotheses"))
-    builder.Connect(state, selector.GetInputPort("state"))
-    builder.Connect(selector.GetOutputPort("waypoint"), controller.GetInputPort("waypoint"))
+    _ConnectDecision(builder, scenario, state, policy, controller)
     builder.Connect(state, controller.GetInputPort("state"))
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
+
+    policy_camera = getattr(scenario.policy, "camera", None)
+    gaussians = BakedScene(world.gaussians) if camera or policy_camera else None
+    if gaussians is not None and policy_camera is not None:
+        _AddPolicyCamera(builder, policy_camera, gaussians, world, pose, policy)
 
     exported = {
         plant: ["state"],
         controller: ["command"],
-        policy: ["hypotheses"],
-        camera: ["color_image", "depth_image_32f", "depth_image_16u"],
         collision: ["clearance", "in_collision", "field_state"],
     }
+    if policy.HasOutputPort("hypotheses"):
+        exported[policy] = ["hypotheses"]
+    if gaussians is not None and camera:
+        onboard = builder.AddNamedSystem("camera", MakeCamera(scenario, world, gaussians))
+        builder.Connect(pose.GetOutputPort("pose"), onboard.GetInputPort("body_pose"))
+        exported[onboard] = ["color_image", "depth_image_32f", "depth_image_16u"]
     for system, names in exported.items():
         for name in names:
             builder.ExportOutput(system.GetOutputPort(name), name)
 
     for system, name in ((plant, "state"), (controller, "command")):
         LogVectorOutput(system.GetOutputPort(name), builder, LOG_PERIOD).set_name(f"{name}_log")
-    LogVectorOutput(policy.GetOutputPort("hypotheses"), builder, 1 / scenario.policy.rate).set_name(
-        "hypotheses_log"
-    )
+    if policy.HasOutputPort("hypotheses"):
+        log = LogVectorOutput(policy.GetOutputPort("hypotheses"), builder, 1 / scenario.policy.rate)
+        log.set_name("hypotheses_log")
 
     if meshcat is not None:
         _AddMeshcat(builder, scenario, world, meshcat)
@@ -118,19 +127,22 @@ def BuildFlightDiagram(
             "video", VideoRecorder(config.width, config.height, config.fps)
         )
         for name in ("color_image", "depth_image_16u"):
-            builder.Connect(camera.GetOutputPort(name), recorder.GetInputPort(name))
+            onboard = builder.GetSubsystemByName("camera")
+            builder.Connect(onboard.GetOutputPort(name), recorder.GetInputPort(name))
 
     diagram = builder.Build()
     diagram.set_name("flight")
     return diagram
 
 
-def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
-    """The scenario's camera, looking at the world's Gaussians."""
+def MakeCamera(
+    scenario: Scenario, world: World, gaussians: BakedScene | None = None
+) -> SplatCamera:
+    """The scenario's camera, looking at the world's Gaussians, or at them as baked elsewhere."""
     config = scenario.camera
     center_x, center_y = config.principal_point()
     return SplatCamera(
-        BakedScene(world.gaussians),
+        gaussians or BakedScene(world.gaussians),
         CameraInfo(
             width=config.width,
             height=config.height,
@@ -146,6 +158,54 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
         far=config.clipping_far,
         background=world.background,
     )
+
+
+def _AddPolicyCamera(
+    builder: DiagramBuilder,
+    config: OnboardCamera,
+    gaussians: BakedScene,
+    world: World,
+    pose: System,
+    policy: System,
+) -> None:
+    """Adds the camera through which a policy sees; it renders when the policy looks."""
+    camera = builder.AddNamedSystem(
+        "policy_camera",
+        SplatCamera(
+            gaussians,
+            config.camera_info(),
+            config.X_BC(),
+            min_depth=config.min_depth,
+            max_depth=config.max_depth,
+            background=world.background,
+        ),
+    )
+    builder.Connect(pose.GetOutputPort("pose"), camera.GetInputPort("body_pose"))
+    for name in ("color_image", "depth_image_32f"):
+        if policy.HasInputPort(name):
+            builder.Connect(camera.GetOutputPort(name), policy.GetInputPort(name))
+
+
+def _ConnectDecision(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    state: OutputPort,
+    policy: System,
+    controller: System,
+) -> None:
+    """Leads what the policy decides to the controller's port of that kind."""
+    if policy.HasOutputPort("hypotheses"):
+        hypotheses = policy.GetOutputPort("hypotheses")
+        selector = builder.AddNamedSystem(
+            "selector",
+            HypothesisSelector(num_hypotheses_in(hypotheses.size()), scenario.controller.lookahead),
+        )
+        builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
+        builder.Connect(state, selector.GetInputPort("state"))
+        builder.Connect(selector.GetOutputPort("waypoint"), controller.GetInputPort("waypoint"))
+    else:
+        kind = "acceleration" if policy.HasOutputPort("acceleration") else "waypoint"
+        builder.Connect(policy.GetOutputPort(kind), controller.GetInputPort(kind))
 
 
 def goal_of(scenario: Scenario, world: World) -> np.ndarray:
@@ -173,11 +233,12 @@ def _AddMeshcat(
     systems = {system.get_name(): system for system in builder.GetMutableSystems()}
     plant, policy = systems["plant"], systems["policy"]
     camera = cast(SplatCamera, systems["camera"])
-    flight = builder.AddNamedSystem(
-        "flight_visualizer", FlightVisualizer(meshcat, scenario.policy.lattice.num_hypotheses)
-    )
+    plans = policy.HasOutputPort("hypotheses")
+    count = num_hypotheses_in(policy.GetOutputPort("hypotheses").size()) if plans else 0
+    flight = builder.AddNamedSystem("flight_visualizer", FlightVisualizer(meshcat, count))
     builder.Connect(plant.GetOutputPort("state"), flight.GetInputPort("state"))
-    builder.Connect(policy.GetOutputPort("hypotheses"), flight.GetInputPort("hypotheses"))
+    if plans:
+        builder.Connect(policy.GetOutputPort("hypotheses"), flight.GetInputPort("hypotheses"))
     picture = builder.AddNamedSystem(
         "camera_visualizer",
         CameraVisualizer(

@@ -8,6 +8,7 @@ from pydrake.common.schema import Rotation, Transform
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
 
+from flysplat.diagrams.add_policy import PolicyConfig
 from flysplat.diagrams.worlds.forest import ForestConfig
 from flysplat.diagrams.worlds.make_world import WorldConfig
 from flysplat.systems.policies.privileged_planner import PrivilegedPlannerConfig
@@ -68,8 +69,10 @@ class Scenario:
     # [s] The flight ends after this time.
     timeout: float = 60.0
     vehicle: QuadrotorParams = field(default_factory=QuadrotorParams)
+    # What onlookers see from the vehicle; a policy that sees has a camera of its own.
     camera: CameraConfig = field(default_factory=_default_camera)
-    policy: PrivilegedPlannerConfig = field(default_factory=PrivilegedPlannerConfig)
+    # Who flies: the privileged planner, or (!ReactiveConfig, ...) another of `add_policy.py`.
+    policy: PolicyConfig = field(default_factory=PrivilegedPlannerConfig)
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
     simulator: SimulatorConfig = field(default_factory=_default_simulator)
 
@@ -89,6 +92,7 @@ class Scenario:
             valid = point is None or (len(point) == 3 and np.isfinite(point).all())
             _check(name, point, valid, "three finite numbers x, y, z in metres")
         self.world.validate()
+        self.policy.validate()
         _check_camera(self.camera)
         _check_simulator(self.simulator)
 

@@ -35,6 +35,21 @@ def hypotheses_size(num_hypotheses: int) -> int:
     return _HEADER + num_hypotheses * (NUM_WAYPOINTS * 3 + 1)
 
 
+def num_hypotheses_in(size: int) -> int:
+    """How many hypotheses a vector of this length holds.
+
+    Raises:
+        ValueError: if no number of hypotheses takes this length.
+    """
+    count, rest = divmod(size - _HEADER, NUM_WAYPOINTS * 3 + 1)
+    if count < 1 or rest:
+        raise ValueError(
+            f"A hypotheses port has size {size}, but K hypotheses take "
+            f"{_HEADER} + {NUM_WAYPOINTS * 3 + 1} K; see `Hypotheses.to_vector`."
+        )
+    return count
+
+
 def unplanned(num_hypotheses: int) -> np.ndarray:
     """The vector that stands for "no plan yet": NaN throughout."""
     return np.full(hypotheses_size(num_hypotheses), np.nan)

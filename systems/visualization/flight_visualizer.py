@@ -36,7 +36,8 @@ class FlightVisualizer(LeafSystem):
         """
         Args:
             meshcat: where to draw.
-            num_hypotheses: how many trajectories the `hypotheses` port carries.
+            num_hypotheses: how many trajectories the `hypotheses` port carries; without any there
+                is no such port, and no fan.
             period: time between two pictures [s].
             path: Meshcat path under which everything is drawn.
         """
@@ -46,7 +47,8 @@ class FlightVisualizer(LeafSystem):
         self._period = period
         self._path = path
         self.DeclareVectorInputPort("state", 13)
-        self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
+        if num_hypotheses:
+            self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
         # The trail's next segment starts where the last picture showed the vehicle.
         self._last_position = self.DeclareDiscreteState(np.full(3, np.nan))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
@@ -65,7 +67,8 @@ class FlightVisualizer(LeafSystem):
         X_WB = pose_from_state(self._evaluated("state", context))
         self._meshcat.SetTransform(f"{self._path}/vehicle", X_WB, time)
         self._draw_trail(context, page, time, X_WB)
-        self._draw_fan(context, page, time)
+        if self._num_hypotheses:
+            self._draw_fan(context, page, time)
         return EventStatus.Succeeded()
 
     def _draw_trail(self, context: Context, page: int, time: float, X_WB: RigidTransform) -> None:

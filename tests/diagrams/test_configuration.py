@@ -102,3 +102,13 @@ def test_scenario_refuses_what_cannot_be_flown(override, message):
 def test_default_scenario_is_valid():
     """The defaults can be flown."""
     Scenario().validate()
+
+
+def test_override_keeps_the_type_that_a_file_chose(tmp_path):
+    """An override of a field of another policy or world than the default's sets that field."""
+    path = tmp_path / "scenario.yaml"
+    path.write_text("world: !SceneConfig {path: a}\npolicy: !ReactiveConfig {speed: 1.5}\n")
+    overrides = ["world.path=b", "policy.camera.width=32"]
+    scenario = load_config(Scenario(), path, overrides)
+    assert scenario.world == SceneConfig(path="b")
+    assert (scenario.policy.speed, scenario.policy.camera.width) == (1.5, 32)

@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from flysplat.systems.policies.hypotheses import Hypotheses, hypotheses_size, unplanned
+from flysplat.systems.policies.hypotheses import (
+    Hypotheses,
+    hypotheses_size,
+    num_hypotheses_in,
+    unplanned,
+)
 
 
 def some_hypotheses(count=3, plan_time=2.0):
@@ -80,3 +85,11 @@ def test_errors_name_sizes_and_remedy():
         Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.zeros(2))
     with pytest.raises(ValueError, match="is 0, but a policy returns at least 1"):
         hypotheses_size(0)
+
+
+def test_size_tells_the_number_of_hypotheses():
+    """The number is found back from the size; a size of no number is refused."""
+    assert [num_hypotheses_in(hypotheses_size(k)) for k in (1, 3, 7)] == [1, 3, 7]
+    for size in (8, 13, 40):
+        with pytest.raises(ValueError, match=f"size {size}"):
+            num_hypotheses_in(size)

@@ -1,0 +1,63 @@
+"""All policies: their configurations, their names, and how each becomes part of a diagram."""
+
+from collections.abc import Callable
+
+from pydrake.systems.framework import DiagramBuilder, System
+
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.policies.privileged_planner import PrivilegedPlanner, PrivilegedPlannerConfig
+from flysplat.systems.policies.reactive import Reactive
+from flysplat.systems.policies.reactive_planner import ReactiveConfig
+from flysplat.systems.policies.straight import Straight, StraightConfig
+from flysplat.systems.policies.trajectory_lattice import LatticeConfig
+from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+
+PolicyConfig = PrivilegedPlannerConfig | StraightConfig | ReactiveConfig
+"""A configuration has `rate` [Hz] and `validate()`, and `camera`, an `OnboardCamera`, if its policy
+sees. Configurations import without torch."""
+
+POLICIES: dict[str, Callable[[float], PolicyConfig]] = {
+    "planner": lambda speed: PrivilegedPlannerConfig(lattice=LatticeConfig(speed=speed)),
+    "straight": lambda speed: StraightConfig(speed=speed),
+    "reactive": lambda speed: ReactiveConfig(speed=speed),
+}
+"""By its name, the configuration of each policy that flies at a speed [m/s]."""
+
+
+def policy_named(name: str, speed: float = 2.0) -> PolicyConfig:
+    """The configuration of the policy `name` for a nominal speed [m/s].
+
+    Raises:
+        ValueError: if there is no such policy, or it does not fly at this speed.
+    """
+    if name not in POLICIES:
+        raise ValueError(f"there is no policy {name!r}; the policies are {', '.join(POLICIES)}")
+    config = POLICIES[name](speed)
+    config.validate()
+    return config
+
+
+def AddPolicy(
+    builder: DiagramBuilder, config: PolicyConfig, world: World, vehicle: QuadrotorParams
+) -> System:
+    """
+    Adds the policy of `config` under the name `policy`, unconnected.
+
+    A policy has the inputs `state` and `goal`, and `depth_image_32f` or `color_image` if it sees
+    through the camera `config.camera`; and one of the outputs `hypotheses` (see
+    `flysplat.systems.policies.hypotheses`), `acceleration` (3) and `waypoint` (3).
+
+    Args:
+        builder: of the diagram.
+        config: which policy, and its parameters.
+        world: read by privileged policies alone.
+        vehicle: what policies may know of the vehicle that they fly.
+    """
+    match config:
+        case PrivilegedPlannerConfig():
+            policy = PrivilegedPlanner(world.esdf, config, vehicle)
+        case StraightConfig():
+            policy = Straight(config)
+        case ReactiveConfig():
+            policy = Reactive(config)
+    return builder.AddNamedSystem("policy", policy)

@@ -1,0 +1,197 @@
+"""Avoidance from depth images alone: which velocity to take next, given a cloud of seen points.
+
+Candidate velocities point in a fan about the goal. Each is followed as a vehicle would, by a
+first-order response, and costs what is left of the way at its end, its nearness to points that were
+seen, and its way through space that no image has shown to be free.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from flysplat.systems.collision.soft_barrier import soft_barrier
+from flysplat.systems.policies.onboard_camera import OnboardCamera
+from flysplat.systems.policies.trajectory_lattice import rotation_to
+from flysplat.systems.policies.velocity_tracking import RESPONSE_TIME
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+_REACH = 3.0  # [m] Points farther than this from a trajectory cost nothing.
+_SAMPLE_PERIOD = 0.15  # [s]
+_FREE_RADIUS = 0.6  # [m] Space around the vehicle itself, taken to be free.
+
+
+@dataclass
+class ReactiveConfig:
+    """The camera, the candidates and the weights of their cost; lengths are in metres.
+
+    The cost of a candidate with samples p_i, d_i from the nearest seen point, is::
+
+        |p_G - p_N| + height_weight |z_G - z_N|
+        + sum (barrier_weight soft(d_i) + contact_weight max(0, r + margin - d_i)
+               + unseen_weight [p_i unseen]) |p_i - p_(i-1)|
+        + acceleration_weight |v - v_0|²
+
+    with the soft barrier of equation (3), its margin `barrier_margin`.
+    """
+
+    camera: OnboardCamera = field(default_factory=OnboardCamera)
+    # [m/s] Greatest speed.
+    speed: float = 2.0
+    # [Hz] Images and decisions per second.
+    rate: float = 15.0
+    # [-] Of each block of pixels the nearest counts; blocks across and down the image.
+    columns: int = 16
+    rows: int = 9
+    # [-] How many images are remembered.
+    memory: int = 30
+    # [s] How far ahead candidates are followed.
+    horizon: float = 1.5
+    # [-] Number of directions to the sides, and [deg] the largest angle from the goal's direction.
+    num_yaws: int = 21
+    max_yaw: float = 100.0
+    # [-] Number of directions up and down, and [deg] the largest angle.
+    num_pitches: int = 5
+    max_pitch: float = 30.0
+    # [-] Speeds as fractions of the greatest.
+    speed_fractions: list[float] = field(default_factory=lambda: [0.25, 0.5, 0.75, 1.0])
+    # [m] Clearance kept for errors of tracking and for what lies between pixels.
+    margin: float = 0.15
+    barrier_margin: float = 0.5
+    # Weights, see above.
+    height_weight: float = 0.3
+    barrier_weight: float = 4.0
+    contact_weight: float = 100.0
+    unseen_weight: float = 2.0
+    acceleration_weight: float = 0.02
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        self.camera.validate()
+        _check("speed", self.speed, 0.0 < self.speed <= 20.0, "positive and at most 20 m/s")
+        _check("rate", self.rate, 0.0 < self.rate <= 1000.0, "positive and at most 1000 Hz")
+        for name, size in (("columns", self.camera.width), ("rows", self.camera.height)):
+            value = getattr(self, name)
+            divides = 1 <= value <= size and size % value == 0
+            _check(name, value, divides, f"a divisor of the camera's {size} pixels")
+        for name, largest in (("memory", 300), ("num_yaws", 100), ("num_pitches", 100)):
+            _check(
+                name, getattr(self, name), 1 <= getattr(self, name) <= largest, f"1 to {largest}"
+            )
+        _check("horizon", self.horizon, 0.3 <= self.horizon <= 10.0, "0.3 to 10 s")
+        _check("max_yaw", self.max_yaw, 0.0 <= self.max_yaw <= 180.0, "0 to 180 deg")
+        _check("max_pitch", self.max_pitch, 0.0 <= self.max_pitch < 90.0, "0 to less than 90 deg")
+        in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
+        _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
+        weights = [f"{name}_weight" for name in ("height", "barrier", "contact", "unseen")]
+        for name in (*weights, "acceleration_weight", "margin", "barrier_margin"):
+            _check(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, "at least 0")
+
+
+def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
+    """The nearest point of each block of pixels: p_CQ (rows * columns, 3) [m], NaN where none is.
+
+    Args:
+        depth: (H, W) [m] planar; infinity is nothing in range, 0 is nearer than the camera's range
+            and is taken to be where that begins.
+    """
+    camera = config.camera
+    shape = (config.rows, camera.height // config.rows, config.columns, -1)
+    depth = np.maximum(depth, camera.min_depth)
+    blocks = depth.reshape(shape).swapaxes(1, 2).reshape(config.rows * config.columns, -1)
+    nearest = blocks.argmin(axis=1)[:, None]
+    z = np.take_along_axis(blocks, nearest, axis=1)  # (rows * columns, 1)
+    slopes = camera.ray_slopes().reshape(*shape, 3).swapaxes(1, 2).reshape(*blocks.shape, 3)
+    points = np.take_along_axis(slopes, nearest[..., None], axis=1)[:, 0]
+    return np.where(np.isfinite(z), points * np.where(np.isfinite(z), z, 0.0), np.nan)
+
+
+def candidate_velocities(to_goal: np.ndarray, config: ReactiveConfig) -> np.ndarray:
+    """The velocities v (N, 3) [m/s] in a fan about the direction to the goal; the last is rest."""
+    yaw, pitch, fraction = np.meshgrid(
+        np.deg2rad(np.linspace(-config.max_yaw, config.max_yaw, config.num_yaws)),
+        np.deg2rad(np.linspace(-config.max_pitch, config.max_pitch, config.num_pitches)),
+        config.speed_fractions,
+        indexing="ij",
+    )
+    directions = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
+    v = config.speed * (fraction * np.stack(directions)).reshape(3, -1).T
+    return np.vstack([v @ rotation_to(to_goal).T, np.zeros(3)])
+
+
+def responses(
+    p_WB: np.ndarray, v_WB: np.ndarray, velocities: np.ndarray, horizon: float
+) -> np.ndarray:
+    """Positions (N, S, 3) [m] while the velocity approaches each of `velocities` (N, 3).
+
+    v(t) = v + (v_0 - v) e^(-t/tau): the motion that `tracking_acceleration` leads to.
+    """
+    times = _SAMPLE_PERIOD * np.arange(1, round(horizon / _SAMPLE_PERIOD) + 1)[:, None]
+    lag = RESPONSE_TIME * -np.expm1(-times / RESPONSE_TIME)  # (S, 1) [s]
+    return p_WB + velocities[:, None] * (times - lag) + v_WB * lag
+
+
+def is_seen(p_CQ: np.ndarray, depth: np.ndarray, camera: OnboardCamera) -> np.ndarray:
+    """Whether the image shows the points p_CQ (..., 3) [m] to be free: (...,) bool.
+
+    So it does inside the image and before its depth (H, W) [m].
+    """
+    z = np.maximum(p_CQ[..., 2], 1e-6)
+    u = camera.focal_length * p_CQ[..., 0] / z + 0.5 * camera.width
+    v = camera.focal_length * p_CQ[..., 1] / z + 0.5 * camera.height
+    inside = (p_CQ[..., 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    row = np.where(inside, v, 0).astype(np.intp)
+    column = np.where(inside, u, 0).astype(np.intp)
+    return inside & (p_CQ[..., 2] < depth[row, column])
+
+
+def candidate_costs(
+    positions: np.ndarray,
+    velocities: np.ndarray,
+    p_WB: np.ndarray,
+    v_WB: np.ndarray,
+    p_WG: np.ndarray,
+    points_W: np.ndarray,
+    seen: np.ndarray,
+    config: ReactiveConfig,
+) -> np.ndarray:
+    """The costs (N,) [m] of candidates, see `ReactiveConfig`.
+
+    Args:
+        positions: (N, S, 3) [m] along each.
+        velocities: (N, 3) [m/s] that each leads to.
+        p_WB, v_WB: where and how fast the vehicle is.
+        p_WG: (3,) [m] the goal.
+        points_W: (M, 3) [m] seen surfaces.
+        seen: (N, S) whether the positions are seen to be free.
+    """
+    distances = np.full(positions.shape[:2], _REACH)
+    if len(points_W):
+        distances = KDTree(points_W).query(positions, distance_upper_bound=_REACH)[0]
+    distances = np.minimum(distances, _REACH)
+    starts = np.broadcast_to(p_WB, (len(positions), 1, 3))
+    steps = np.linalg.norm(np.diff(positions, axis=1, prepend=starts), axis=2)  # (N, S) [m]
+    barrier = soft_barrier(distances, VEHICLE_RADIUS, margin=config.barrier_margin)
+    contact = np.maximum(VEHICLE_RADIUS + config.margin - distances, 0.0)
+    away = np.linalg.norm(positions - p_WB, axis=2) > _FREE_RADIUS
+    unseen = ~seen & away
+    to_goal = p_WG - positions[:, -1]
+    along = (
+        config.barrier_weight * barrier
+        + config.contact_weight * contact
+        + config.unseen_weight * unseen
+    )
+    return (
+        np.linalg.norm(to_goal, axis=1)
+        + config.height_weight * np.abs(to_goal[:, 2])
+        + (along * steps).sum(axis=1)
+        + config.acceleration_weight * np.square(velocities - v_WB).sum(axis=1)
+    )
+
+
+def _check(name: str, value: object, valid: bool, limit: str) -> None:
+    if not valid:
+        raise ValueError(
+            f"ReactiveConfig.{name} is {value} but must be {limit}; see the comment at the field."
+        )

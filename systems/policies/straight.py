@@ -1,0 +1,71 @@
+"""The policy that looks at nothing: what a world asks of a policy is what this one lacks."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from flysplat.systems.policies.velocity_tracking import (
+    approach_velocity,
+    tracking_acceleration,
+)
+
+
+@dataclass
+class StraightConfig:
+    """How fast the straight line is flown."""
+
+    # [m/s]
+    speed: float = 2.0
+    # [Hz] Decisions per second.
+    rate: float = 15.0
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name, largest in (("speed", 20.0), ("rate", 1000.0)):
+            value = getattr(self, name)
+            if not 0.0 < value <= largest or math.isnan(value):
+                raise ValueError(
+                    f"StraightConfig.{name} is {value}; it must be positive and at most {largest:g}"
+                )
+
+
+class Straight(LeafSystem):
+    """Flies straight to the goal at a set speed, whatever stands there.
+
+    .. pydrake_system::
+
+        name: Straight
+        input_ports:
+        - state
+        - goal
+        output_ports:
+        - acceleration
+
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``goal`` (3): p_WG [m], W frame.
+    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded; a discrete state, zero before
+      the first update.
+
+    Updates at ``rate`` (15 Hz) from time 0 with the acceleration that leads to the velocity towards
+    the goal: see `approach_velocity` and `tracking_acceleration`.
+
+    Raises:
+        ValueError: from the constructor on a config out of range.
+    """
+
+    def __init__(self, config: StraightConfig | None = None) -> None:
+        super().__init__()
+        self._config = config or StraightConfig()
+        self._config.validate()
+        self._state_port = self.DeclareVectorInputPort("state", 13)
+        self._goal_port = self.DeclareVectorInputPort("goal", 3)
+        self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / self._config.rate, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = np.asarray(self._state_port.Eval(context))
+        p_WG = np.asarray(self._goal_port.Eval(context))
+        v_wanted = approach_velocity(state[0:3], p_WG, self._config.speed)
+        discrete_state.set_value(tracking_acceleration(state[3:6], v_wanted))

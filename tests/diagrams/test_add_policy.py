@@ -1,0 +1,49 @@
+"""Every policy flies, and is found by its name."""
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+
+from flysplat.diagrams.add_policy import POLICIES, policy_named
+from flysplat.diagrams.flight import Outcome, fly
+from flysplat.diagrams.flight_diagram import BuildFlightDiagram
+from flysplat.diagrams.scenario import Scenario
+
+
+@pytest.mark.parametrize(
+    ("name", "outcome"), [("straight", Outcome.COLLISION), ("reactive", Outcome.GOAL)]
+)
+def test_policies_fly_with_a_post_in_the_way(name, outcome, post_world):
+    """The straight policy hits the post, the reactive one goes round; neither leaves plans."""
+    scenario = Scenario(timeout=20.0, start_radius=0.0, policy=policy_named(name))
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    flight = fly(diagram, scenario, post_world)
+    assert flight.outcome == outcome
+    assert flight.hypotheses.shape == (0, 0)
+    assert diagram.HasSubsystemNamed("policy_camera") == (name == "reactive")
+    assert not diagram.HasSubsystemNamed("camera")
+
+
+def test_onlooking_camera_changes_no_flight(post_world):
+    """With Meshcat and video the same flight results, bit for bit."""
+    scenario = Scenario(timeout=1.0, policy=policy_named("reactive"))
+    scenario.camera.width, scenario.camera.height = 32, 24
+    bare = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    shown = BuildFlightDiagram(scenario, post_world, Meshcat(), video=True)
+    watched = fly(shown, scenario, post_world)
+    np.testing.assert_array_equal(bare.states, watched.states)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_name_gives_a_policy_of_that_speed(name):
+    """Each name gives a valid configuration, which the speed changes."""
+    assert policy_named(name, 1.5) != policy_named(name, 2.5)
+    assert policy_named(name, 1.5).rate > 0
+
+
+def test_unknown_policy_and_speed_are_refused():
+    """An unknown name lists the known ones; a speed that cannot be flown is named."""
+    with pytest.raises(ValueError, match=r"no policy 'Planner'; .* planner, straight, reactive"):
+        policy_named("Planner")
+    with pytest.raises(ValueError, match=r"speed is -1"):
+        policy_named("planner", -1.0)

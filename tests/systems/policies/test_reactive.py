@@ -1,0 +1,170 @@
+"""The classical policy that sees depth."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.sensors import ImageDepth32F
+
+from flysplat.systems.policies.onboard_camera import OnboardCamera
+from flysplat.systems.policies.reactive import Reactive
+from flysplat.systems.policies.reactive_planner import (
+    ReactiveConfig,
+    candidate_costs,
+    candidate_velocities,
+    is_seen,
+    nearest_points,
+    responses,
+)
+from flysplat.systems.policies.velocity_tracking import RESPONSE_TIME
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+
+CONFIG = ReactiveConfig()
+
+
+def empty_image() -> np.ndarray:
+    return np.full((CONFIG.camera.height, CONFIG.camera.width), np.inf)
+
+
+def test_nearest_points_are_those_of_single_pixels():
+    """A near pixel stands for its block, at its own ray and depth; blocks without any are NaN and
+    a pixel nearer than the camera's range counts as at its beginning.
+    """
+    depth = empty_image()
+    depth[5, 9], depth[6, 10] = 2.0, 3.0  # Both in block (1, 2).
+    depth[35, 63] = 0.0
+    points = nearest_points(depth, CONFIG).reshape(CONFIG.rows, CONFIG.columns, 3)
+    np.testing.assert_allclose(points[1, 2], 2.0 * CONFIG.camera.ray_slopes()[5, 9])
+    np.testing.assert_allclose(points[8, 15], 0.1 * CONFIG.camera.ray_slopes()[35, 63])
+    assert np.isfinite(points[..., 0]).sum() == 2
+
+
+def test_responses_solve_the_tracking_equation():
+    """Positions follow v' = (v_wanted - v) / tau, integrated numerically."""
+    p, v, wanted = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, -1.0]), np.array([0.0, 1.0, 1.0])
+    positions = responses(p, v, wanted[None], horizon=1.5)[0]
+    step, expected = 1e-4, []
+    for k in range(1, 15001):
+        v = v + step * (wanted - v) / RESPONSE_TIME
+        p = p + step * v
+        if k % 1500 == 0:
+            expected.append(p)
+    np.testing.assert_allclose(positions, expected, atol=1e-3)
+
+
+def test_seen_is_inside_the_image_and_before_its_depth():
+    """Points before a surface are seen; behind it, beside the image and behind the camera not."""
+    depth = empty_image()
+    depth[:] = 4.0
+    points = np.array([[0, 0, 3.9], [0, 0, 4.1], [1.9, 0, 2], [2.1, 0, 2], [0, 0, -1]], float)
+    np.testing.assert_array_equal(
+        is_seen(points, depth, CONFIG.camera), [True, False, True, False, False]
+    )
+
+
+def cost_of(points_W, velocities, seen=True):
+    p_WB, v_WB, p_WG = np.zeros(3), np.array([2.0, 0, 0]), np.array([10.0, 0, 0])
+    velocities = np.array(velocities, dtype=float)
+    positions = responses(p_WB, v_WB, velocities, CONFIG.horizon)
+    known = np.full(positions.shape[:2], seen)
+    points_W = np.reshape(points_W, (-1, 3))
+    return candidate_costs(
+        positions, velocities, p_WB, v_WB, p_WG, points_W, known, CONFIG
+    ), positions
+
+
+def test_cost_in_the_open_is_the_way_left():
+    """Without obstacles, in seen space, a candidate costs the distance from its end to the goal."""
+    (cost,), positions = cost_of([], [[2.0, 0, 0]])
+    assert cost == pytest.approx(10.0 - positions[0, -1, 0], abs=0.01)
+
+
+def test_contact_and_the_unseen_cost():
+    """Touching a seen point costs more than any way around; unseen space costs by its length."""
+    ahead = [2.0, 0, 0]
+    (through, beside), _ = cost_of([[2.0, 0, 0]], [ahead, [1.2, 1.2, 0]])
+    assert through > beside
+    (hit,), _ = cost_of([[2.0, 0, 0]], [ahead])
+    (missed,), _ = cost_of([[2.0, VEHICLE_RADIUS + CONFIG.margin + 0.1, 0]], [ahead])
+    assert hit > missed + 10.0
+    (unseen,), positions = cost_of([], [ahead], seen=False)
+    (seen,), _ = cost_of([], [ahead])
+    far = positions[0, :, 0] > 0.6
+    steps = np.diff(positions[0, :, 0], prepend=0.0)
+    assert unseen - seen == pytest.approx(CONFIG.unseen_weight * steps[far].sum())
+
+
+def test_fan_is_about_the_goal_and_ends_with_rest():
+    """The middle of the fan points to the goal, no candidate is faster than the speed."""
+    v = candidate_velocities(np.array([0.0, 5.0, 0.0]), CONFIG)
+    speeds = np.linalg.norm(v, axis=1)
+    assert speeds.max() == pytest.approx(CONFIG.speed)
+    assert np.abs(v - [0, CONFIG.speed, 0]).max(axis=1).min() < 1e-9
+    np.testing.assert_array_equal(v[-1], np.zeros(3))
+
+
+def decide(depth: np.ndarray) -> np.ndarray:
+    policy = Reactive()
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("state").FixValue(context, hover_state([0.0, 0.0, 2.0]))
+    policy.GetInputPort("goal").FixValue(context, [10.0, 0.0, 2.0])
+    image = ImageDepth32F(CONFIG.camera.width, CONFIG.camera.height)
+    image.mutable_data[..., 0] = depth
+    policy.GetInputPort("depth_image_32f").FixValue(context, Value(image))
+    simulator = Simulator(policy, context)
+    simulator.AdvanceTo(0.01)
+    return policy.GetOutputPort("acceleration").Eval(simulator.get_context())
+
+
+def test_flies_ahead_in_the_open_and_aside_of_a_post():
+    """It accelerates to the goal when nothing is seen; a post left of the middle sends it right, a
+    post right of it left.
+    """
+    ahead = decide(empty_image())
+    assert ahead[0] > 3.0
+    assert np.abs(ahead[1:]).max() < 0.5
+    post = empty_image()
+    post[:, 26:34] = 2.0  # From left of the middle to just right of it.
+    right = decide(post)
+    assert right[1] < -0.5
+    left = decide(post[:, ::-1])
+    assert left[1] == pytest.approx(-right[1])
+
+
+def test_remembers_what_it_no_longer_sees():
+    """Points of an image stay in the state, in the world frame, until `memory` images later."""
+    config = ReactiveConfig(memory=2)
+    policy = Reactive(config)
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("state").FixValue(context, hover_state([0.0, 0.0, 2.0], yaw=np.pi / 2))
+    policy.GetInputPort("goal").FixValue(context, [0.0, 10.0, 2.0])
+    simulator = Simulator(policy, context)
+    simulator.Initialize()
+    for k, depth in enumerate((3.0, np.inf, np.inf, np.inf)):
+        image = ImageDepth32F(config.camera.width, config.camera.height)
+        image.mutable_data[..., 0] = depth
+        policy.GetInputPort("depth_image_32f").FixValue(context, Value(image))
+        simulator.AdvanceTo((k + 0.5) / config.rate)
+        points = context.get_discrete_state(1).value().reshape(-1, 3)
+        known = points[np.isfinite(points[:, 0])]
+        assert len(known) == (144 if k < 2 else 0)
+        if k < 2:
+            np.testing.assert_allclose(known[:, 1], 3.1, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("speed", 0.0),
+        ("columns", 15),
+        ("memory", 0),
+        ("speed_fractions", [1.5]),
+        ("contact_weight", -1.0),
+        ("camera", OnboardCamera(width=0)),
+    ],
+)
+def test_bad_config_is_named(field, value):
+    """A value out of range names the field."""
+    name = "OnboardCamera.width" if field == "camera" else f"ReactiveConfig.{field}"
+    with pytest.raises(ValueError, match=name):
+        Reactive(ReactiveConfig(**{field: value}))

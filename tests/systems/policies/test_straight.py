@@ -1,0 +1,56 @@
+"""The policy that flies straight."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from flysplat.systems.policies.straight import Straight, StraightConfig
+from flysplat.systems.policies.velocity_tracking import (
+    MAX_ACCELERATION,
+    RESPONSE_TIME,
+    approach_velocity,
+    tracking_acceleration,
+)
+from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
+
+
+def test_velocity_points_to_the_goal_and_falls_near_it():
+    """Far away it has the set speed; within 0.75 s of the goal it is in proportion to the way."""
+    p_WG = np.array([3.0, -4.0, 2.0])
+    far = approach_velocity(np.array([0.0, 0.0, 2.0]), p_WG, speed=2.0)
+    np.testing.assert_allclose(far, [1.2, -1.6, 0.0])
+    near = approach_velocity(p_WG - [0.3, 0.0, 0.0], p_WG, speed=2.0)
+    np.testing.assert_allclose(near, [0.4, 0.0, 0.0])
+    np.testing.assert_array_equal(approach_velocity(p_WG, p_WG, 2.0), np.zeros(3))
+
+
+def test_tracking_is_exponential_and_limited():
+    """A point mass under it closes 1 - 1/e of a small difference in the response time; a large
+    difference asks for the greatest acceleration, in its direction.
+    """
+    v, wanted, step = np.zeros(3), np.array([0.5, 0.0, 0.2]), 1e-4
+    for _ in range(round(RESPONSE_TIME / step)):
+        v = v + step * tracking_acceleration(v, wanted)
+    np.testing.assert_allclose(v, wanted * (1 - np.exp(-1)), rtol=1e-3)
+    large = tracking_acceleration(np.zeros(3), np.array([0.0, -10.0, 0.0]))
+    np.testing.assert_allclose(large, [0.0, -MAX_ACCELERATION, 0.0])
+
+
+def test_system_decides_by_state_and_goal():
+    """The output is zero before the first update and the tracking acceleration after it."""
+    policy = Straight(StraightConfig(speed=3.0))
+    context = policy.CreateDefaultContext()
+    policy.GetInputPort("state").FixValue(context, hover_state([1.0, 2.0, 3.0]))
+    policy.GetInputPort("goal").FixValue(context, [11.0, 2.0, 3.0])
+    port = policy.GetOutputPort("acceleration")
+    np.testing.assert_array_equal(port.Eval(context), np.zeros(3))
+    simulator = Simulator(policy, context)
+    simulator.AdvanceTo(0.01)
+    np.testing.assert_allclose(port.Eval(simulator.get_context()), [MAX_ACCELERATION, 0, 0])
+
+
+@pytest.mark.parametrize(("field", "value"), [("speed", 0.0), ("speed", np.nan), ("rate", -1.0)])
+def test_bad_config_is_named(field, value):
+    """A value out of range names the field."""
+    with pytest.raises(ValueError, match=rf"StraightConfig.{field} is {value}"):
+        Straight(StraightConfig(**{field: value}))
