@@ -15,6 +15,7 @@ _STEEPEST = 10.0
 # and large leaves no gaps to look through.
 _SPREAD = 0.4
 _UNDERLAY_SPREAD = 0.6
+_SPREAD_ALONE = 0.5
 # How much farther from the camera than the surface the underlay stands, as a fraction of depth:
 # enough that it is drawn behind; on oblique surfaces more, up to _MAX_SETBACK. Cells of it have
 # at least _UNDERLAY_SIZE pixels.
@@ -132,15 +133,19 @@ def frame_gaussians(
     contrast: float,
     max_size: int,
     max_extent: float,
+    underlay: bool = True,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Returns centres p_WQ (n, 3) [m], covariances in W (n, 3, 3) [m^2] and colours (n, 3).
 
     Arguments as for `BlockMeans` and `BlockMeans.split`. The Gaussians of the cells are narrow, for
     narrow ones stay sharp; so that nothing shines through between them and where frames meet, wide
-    ones from larger cells, whatever their texture, lie a little behind.
+    ones from larger cells, whatever their texture, lie a little behind: the underlay. Without it
+    the Gaussians of the cells are wider, for optimisation to sharpen.
     """
     means = BlockMeans(frame, image, wanted, 2 * max_size)
     surface = means.split(contrast, max_size, 0.75, max_extent)
+    if not underlay:
+        return *cell_gaussians(frame, surface, _SPREAD_ALONE), surface.color
     under = means.split(np.inf, 2 * max_size, 0.05, 2 * max_extent)
     under = under.select(under.size >= _UNDERLAY_SIZE)
     # Gaussians are drawn in order of the depths of their centres, so an underlay must be farther

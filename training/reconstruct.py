@@ -1,11 +1,13 @@
 """From a capture to a scene folder that can be flown in."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from flysplat.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
@@ -13,67 +15,37 @@ from flysplat.diagrams.worlds.start_and_goal import choose_start_and_goal
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.distance_field import FieldState
 from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from flysplat.systems.splats.gaussian_scene import GaussianScene
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from flysplat.training.captures.capture import Capture
 from flysplat.training.captures.read_capture import read_capture
-from flysplat.training.depth_gaussians import frame_gaussians, principal_axes
-from flysplat.training.overlap import STRIDE, View, find_new_pixels, load_views
+from flysplat.training.checkpoint import Checkpoint
+from flysplat.training.held_out import HeldOutFigures
+from flysplat.training.initial_gaussians import (
+    Detail,
+    gaussians_from_depth,
+    gaussians_from_points,
+    random_points,
+)
+from flysplat.training.lpips import Lpips
+from flysplat.training.optimize import Optimization, extent_of_cameras, one_torch_thread
+from flysplat.training.overlap import View
 from flysplat.training.photometry import Photometry, estimate_photometry
+from flysplat.training.reconstruct_config import ReconstructConfig
+from flysplat.training.reconstruction_views import ReconstructionViews, ShrunkFrames, shrink_factor
+from flysplat.training.scene_distance_field import (
+    DepthSource,
+    FieldDifference,
+    compare_fields,
+    fuse,
+    rendered_depth,
+    unit_of,
+)
 
-
-@dataclass(kw_only=True)
-class ReconstructConfig:
-    """How a capture becomes a scene."""
-
-    iterations: int = 0
-    """Steps of optimisation; 0 takes depth and colours as they are."""
-    max_gaussians: int = 180_000
-    """More are never made: texture is resolved as finely as they allow."""
-    contrast: float = 0.05
-    """Standard deviation of colour (0 to 1) that one Gaussian may hide."""
-    max_cell: int = 16
-    """[px] of the image that one Gaussian of the surface may cover; a power of two."""
-    max_extent: float = 0.06
-    """Length on the surface that one Gaussian of it may cover, as a fraction of its distance from
-    the camera: seen from closer by, large ones are drawn badly."""
-    opacity: float = 0.99
-    """Opacity of every Gaussian, in (0, 1]."""
-    voxel_size: float = 0.05
-    """[m], of the distance field."""
-    max_range: float = 8.0
-    """[m], depth beyond which the distance field does not believe the camera."""
-    seed: int = 0
-    """Of the sampling of pixels that are compared between frames."""
-
-    def validate(self) -> None:
-        """Raises ValueError for values that make no sense."""
-        for name, limit in (
-            ("max_gaussians", 1),
-            ("contrast", 0.001),
-            ("max_extent", 0.001),
-            ("voxel_size", 0.005),
-        ):
-            if not limit <= getattr(self, name) < np.inf:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, at least {limit} and finite is needed"
-                )
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}, at least 0 is needed")
-        if self.iterations != 0:
-            raise ValueError(
-                f"iterations is {self.iterations}: optimisation is not available yet, use 0"
-            )
-        if self.max_cell not in (1, 2, 4, 8, 16, 32, 64):
-            raise ValueError(f"max_cell is {self.max_cell}, a power of two up to 64 is needed")
-        if not 0 < self.opacity <= 1:
-            raise ValueError(f"opacity is {self.opacity}, it must be in (0, 1]")
-        if not self.max_range > self.voxel_size:
-            raise ValueError(
-                f"max_range is {self.max_range} m, more than the voxel size {self.voxel_size} m is "
-                "needed"
-            )
+# Opacity with which Gaussians on surfaces start into the optimisation.
+_FIRST_OPACITY = 0.7
+# Depth of random Gaussians, in extents of the cameras.
+_RANDOM_DEPTH = (0.1, 10.0)
 
 
 @dataclass(frozen=True)
@@ -91,6 +63,9 @@ class ReconstructSummary:
     p_WS: NDArray[np.float64]  # (3,) [m]
     p_WG: NDArray[np.float64]  # (3,) [m]
     geodesic: float  # [m], length of the shortest path from start to goal
+    held_out: HeldOutFigures | None = None
+    field_difference: FieldDifference | None = None
+    warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         def vector(p: NDArray) -> str:
@@ -108,108 +83,231 @@ class ReconstructSummary:
             "default goal [m]": vector(self.p_WG),
             "shortest path [m]": f"{self.geodesic:.1f}",
         }
-        return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
+        if self.held_out is not None:
+            rows["held-out frames"] = self.held_out
+        if self.field_difference is not None:
+            rows["rendered field"] = f"{self.field_difference} (against captured depth)"
+        lines = [f"{name:<18} {value}" for name, value in rows.items()]
+        return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
 
 
-def run(*, capture: str | Path, out: str | Path, config: ReconstructConfig) -> ReconstructSummary:
+def run(
+    *, capture: str | Path, out: str | Path, config: ReconstructConfig, restart: bool = False
+) -> ReconstructSummary:
     """Turns the capture in a folder into the scene folder `out`, and prints a summary.
+
+    While it runs, checkpoints are kept in the folder `.NAME.partial` beside `out`; run again after
+    an interruption, it goes on from there and ends in the same scene, bit for bit. With `restart`
+    it begins anew.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a damaged capture, a config that makes no sense,
-            a folder `out` that cannot be written or holds something else, or a capture that saw no
-            space large enough for the vehicle. Nothing is written then.
+            a checkpoint of another run, or a folder `out` that cannot be written or holds something
+            else. No scene is written then.
     """
     config.validate()
     check_scene_target(out)
-    summary = reconstruct(read_capture(capture), Path(out), config)
+    summary = reconstruct(
+        read_capture(capture), Path(out), config, path=str(capture), restart=restart
+    )
     print(summary)
     return summary
 
 
-def reconstruct(capture: Capture, out: Path, config: ReconstructConfig) -> ReconstructSummary:
-    """Writes the scene folder `out`; see `run`."""
-    views = list(tqdm(load_views(capture), "loading", len(capture), unit="frame"))
-    photometry = estimate_photometry(views, config.seed)
-    esdf = _distance_field(capture, config)
-    p_WS, p_WG, geodesic = choose_start_and_goal(esdf, VEHICLE_RADIUS)
-    gaussians, background = _gaussians(capture, views, photometry, config)
-    world = World(capture.name, gaussians, esdf, esdf, background, p_WS, p_WG)
+def reconstruct(
+    capture: Capture,
+    out: Path,
+    config: ReconstructConfig,
+    *,
+    path: str = "",
+    restart: bool = False,
+) -> ReconstructSummary:
+    """Writes the scene folder `out`; see `run`. `path` says where the capture lies."""
+    config.validate()
+    every = config.hold_out if config.iterations else 0
+    held_out = list(range(0, len(capture), every)) if every else []
+    fitted = [i for i in range(len(capture)) if i not in held_out]
+    factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
+    frames = ShrunkFrames(capture, fitted, factor)
+    photometry = estimate_photometry(
+        [View.of(frame) for frame in tqdm(frames, "comparing brightness", unit="frame")],
+        config.seed,
+    )
+    gains = np.ones(len(capture))
+    gains[fitted] = photometry.gains
+    checkpoint = None
+    figures = None
+    if config.iterations == 0:
+        gaussians, background = gaussians_from_depth(frames, photometry, _detail(config))
+        how = "depth back-projected"
+    else:
+        views = ReconstructionViews(frames, photometry)
+        withheld = None
+        if held_out:
+            unknown = Photometry(np.ones(len(held_out)), photometry.vignetting)
+            withheld = ReconstructionViews(ShrunkFrames(capture, held_out, factor), unknown)
+        checkpoint = Checkpoint(out, config, views)
+        if restart:
+            checkpoint.remove()
+        background = mean_color(views)
+        optimization = Optimization(
+            config,
+            views,
+            withheld,
+            background,
+            lambda: _initial(capture, frames, photometry, views, config),
+            checkpoint,
+            _perceptual(config),
+        )
+        optimization.run()
+        gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
+        with one_torch_thread():
+            figures = optimization.measure()
+        if figures is not None:
+            gains[held_out] = figures.gains
+        how = f"{config.representation}, {config.iterations} steps"
+
+    field, difference = _distance_field(capture, fitted, gaussians, factor, config)
+    p_WS, p_WG, geodesic, warnings = _start_and_goal(capture, field)
     write_scene_folder(
         out,
-        world,
-        provenance=f"{capture.source}, {len(capture)} frames, depth back-projected",
-        gains=[float(gain) for gain in photometry.gains],
+        World(capture.name, gaussians, field, field, background, p_WS, p_WG),
+        provenance=f"{capture.source}, {len(capture)} frames, {how}",
+        gains=[float(gain) for gain in gains],
         vignetting=photometry.vignetting,
+        metric=capture.metric,
+        representation=config.representation if config.iterations else "3dgs",
+        capture=path and str(Path(path).absolute()),
+        held_out=held_out,
+        image_width=capture.width // factor if factor > 1 else 0,
     )
+    if checkpoint is not None:
+        checkpoint.remove()
     return ReconstructSummary(
         scene=out,
         frames=len(capture),
         gaussians=len(gaussians),
         vignetting=photometry.vignetting,
         gain_range=(float(photometry.gains.min()), float(photometry.gains.max())),
-        lower_W=esdf.lower_W,
-        upper_W=esdf.upper_W,
-        observed_free_volume=esdf.volume(FieldState.FREE),
+        lower_W=field.lower_W,
+        upper_W=field.upper_W,
+        observed_free_volume=field.volume(FieldState.FREE),
         p_WS=p_WS,
         p_WG=p_WG,
         geodesic=geodesic,
+        held_out=figures,
+        field_difference=difference,
+        warnings=(*capture.dropped, *warnings),
     )
 
 
-def _distance_field(capture: Capture, config: ReconstructConfig) -> Esdf:
-    """Fuses the depth images; space that no image saw is marked unknown."""
+def _start_and_goal(
+    capture: Capture, field: Esdf
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[str, ...]]:
+    """Returns p_WS, p_WG, the length of the shortest path [m] and warnings.
 
-    def depths() -> Iterator[NDArray[np.float32]]:
-        return (capture.registered_depth(i) for i in range(len(capture)))
+    Where nothing can fly, the scene can still be looked at: the ends are those of the capture.
+    """
+    try:
+        if capture.metric:
+            return *choose_start_and_goal(field, VEHICLE_RADIUS), ()
+        reason = "its scale is unknown"
+    except ValueError as error:
+        reason = str(error)
+    p_WS, p_WG = (capture.X_WCs[i].translation() for i in (0, -1))
+    return p_WS, p_WG, float("nan"), (f"this scene cannot be flown in: {reason}",)
 
-    lower_W, upper_W = bounds_of_depth_images(depths(), capture.K, capture.X_WCs, config.max_range)
-    return esdf_from_depth_images(
-        depths(),
-        capture.K,
+
+def mean_color(views: ReconstructionViews) -> tuple[float, float, float]:
+    """Returns the mean colour of the images, freed of gains and vignetting, in 0 to 1."""
+    means = torch.stack([views.target(k).mean(dim=(0, 1)) for k in range(len(views))])
+    red, green, blue = means.mean(dim=0).clamp(0, 1).tolist()
+    return red, green, blue
+
+
+def _initial(
+    capture: Capture,
+    frames: Sequence,
+    photometry: Photometry,
+    views: ReconstructionViews,
+    config: ReconstructConfig,
+) -> GaussianScene:
+    """Returns the Gaussians to start from.
+
+    Raises:
+        ValueError: if the capture lacks what is asked for.
+    """
+    has = {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
+    kind = config.initialization
+    if kind == "auto":
+        kind = next(name for name, there in has.items() if there)
+    if not has[kind]:
+        raise ValueError(
+            f"initialization is {kind!r}, but {capture.name} has none; choose "
+            + " or ".join(repr(name) for name, there in has.items() if there)
+        )
+    if kind == "depth":
+        return gaussians_from_depth(frames, photometry, _detail(config))[0]
+    if capture.points is not None and kind == "points":
+        points = capture.points
+        return gaussians_from_points(points.p_WQ, points.colors)
+    _, extent = extent_of_cameras(views)
+    near, far = (extent * depth for depth in _RANDOM_DEPTH)
+    count = config.initial_gaussians
+    return gaussians_from_points(*random_points(frames, count, near, far, config.seed))
+
+
+def _detail(config: ReconstructConfig) -> Detail:
+    optimized = config.iterations > 0
+    return Detail(
+        max_gaussians=config.initial_gaussians if optimized else config.max_gaussians,
+        contrast=config.contrast,
+        max_cell=config.max_cell,
+        max_extent=config.max_extent,
+        opacity=_FIRST_OPACITY if optimized else config.opacity,
+        optimized=optimized,
+    )
+
+
+def _perceptual(config: ReconstructConfig) -> Callable[[Tensor, Tensor], Tensor] | None:
+    return Lpips() if config.lpips_weight > 0 else None
+
+
+def _distance_field(
+    capture: Capture,
+    fitted: Sequence[int],
+    gaussians: GaussianScene,
+    factor: int,
+    config: ReconstructConfig,
+) -> tuple[Esdf, FieldDifference | None]:
+    """Fuses depth, rendered or captured; and, if the capture has depth and was optimised, compares
+    the former with that of all captured depth."""
+    every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
+    if config.iterations == 0:
+        return fuse(every, config.voxel_size, config.max_range), None
+    K = capture.K.copy()
+    K[:2] /= factor
+    rendered = rendered_depth(
+        gaussians,
+        config.representation,
+        K,
+        capture.width // factor,
+        capture.height // factor,
         capture.X_WCs,
-        lower_W,
-        upper_W,
-        config.voxel_size,
-        config.max_range,
+        config.renderer_threads,
     )
-
-
-def _gaussians(
-    capture: Capture, views: Sequence[View], photometry: Photometry, config: ReconstructConfig
-) -> tuple[GaussianScene, tuple[float, float, float]]:
-    """Returns the Gaussians of all frames, each point once, and their mean colour."""
-    # A gain is a rough account of another tone curve, so other images are preferred to odd ones.
-    odd = np.flatnonzero(np.abs(np.log(photometry.gains / np.median(photometry.gains))) > 0.05)
-    new = find_new_pixels(views, last=odd.tolist())
-
-    def gaussians_of(i: int) -> tuple[NDArray, NDArray, NDArray]:
-        frame = capture.frame(i)
-        height, width = frame.depth.shape
-        factor = photometry.factor(i, height, width)
-        image = (frame.image / (255 * factor[..., None])).astype(np.float32)
-        wanted = new[i].repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width]
-        return frame_gaussians(frame, image, wanted, contrast, max_cell, max_extent)
-
-    # Fewer, coarser cells until the Gaussians fit: first where texture asks for fine ones, then
-    # everywhere.
-    contrast, max_cell, max_extent = config.contrast, config.max_cell, config.max_extent
-    while True:
-        progress = tqdm(range(len(capture)), f"Gaussians, contrast {contrast:.2f}", unit="frame")
-        parts = [gaussians_of(i) for i in progress]
-        if sum(len(p_WQ) for p_WQ, _, _ in parts) <= config.max_gaussians:
-            break
-        if contrast < 1:
-            contrast *= 1.3
-        elif max_cell < 64:
-            max_cell, max_extent = 2 * max_cell, 2 * max_extent
-        else:
-            raise ValueError(
-                f"max_gaussians is {config.max_gaussians}: too few for {len(capture)} frames, even "
-                f"with cells of {max_cell} pixels; allow more, or use fewer frames"
-            )
-    p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*parts, strict=True))
-    quats, scales = principal_axes(covariances)
-    opacities = np.full(len(p_WQ), config.opacity)
-    red, green, blue = np.clip(colors.mean(axis=0), 0, 1)
-    scene = GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
-    return scene, (float(red), float(green), float(blue))
+    unit = unit_of(rendered, capture.metric)
+    voxel_size, max_range = config.voxel_size * unit, config.max_range * unit
+    if not capture.has_depth:
+        return fuse(rendered, voxel_size, max_range), None
+    truth = fuse(every, voxel_size, max_range)
+    field = fuse(rendered, voxel_size, max_range, (truth.lower_W, truth.upper_W))
+    difference = compare_fields(field, truth)
+    if config.distance_field == "rendered":
+        return field, difference
+    seen = DepthSource(
+        lambda k: capture.registered_depth(fitted[k]),
+        capture.K,
+        [capture.X_WCs[i] for i in fitted],
+    )
+    return fuse(seen, voxel_size, max_range), difference
