@@ -1,16 +1,22 @@
 """The embedded world: a seeded forest to fly through, needing no data."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
 from flysplat.diagrams.worlds import forest_ground, forest_surroundings, forest_trees
+from flysplat.diagrams.worlds.blueprint import Blueprint
 from flysplat.diagrams.worlds.forest_config import CLEARANCE, INSET, ForestConfig
-from flysplat.diagrams.worlds.forest_layout import MARGIN, lay_out
-from flysplat.diagrams.worlds.light import Daylight
+from flysplat.diagrams.worlds.forest_layout import MARGIN, ForestLayout, lay_out
+from flysplat.diagrams.worlds.light import Daylight, Sunlit
 from flysplat.diagrams.worlds.surfaces import merged
+from flysplat.diagrams.worlds.textures import smoothstep
 from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.esdf_build import esdf_from_distance_field
+from flysplat.systems.splats.gaussian_scene import GaussianScene
 
 
 def make_forest(config: ForestConfig, seed: int = 0) -> World:
@@ -30,44 +36,107 @@ def make_forest(config: ForestConfig, seed: int = 0) -> World:
     Raises:
         ValueError: for values with which no forest can be grown, or a negative seed.
     """
-    config.validate()
-    if seed < 0:
-        raise ValueError(f"seed = {seed} must be 0 or more")
-    # One stream of random numbers per part: a change to one part leaves the others as they are.
-    layout_rng, light_rng, *rngs = (np.random.default_rng([seed, k]) for k in range(10))
-    p_WS = np.array([INSET, 0.0, config.flight_height])
-    p_WG = np.array([config.length - INSET, 0.0, config.flight_height])
-    layout = lay_out(config, layout_rng, [p_WS[:2], p_WG[:2]], CLEARANCE)
-    light = Daylight.sampled(light_rng)
+    forest = Forest(config, seed)
+    blueprint = forest.blueprint()
+    field, haze = blueprint.distance_field, forest.light.haze
+    return World(
+        name="forest",
+        gaussians=forest.gaussians(),
+        distance_field=field,
+        esdf=esdf_from_distance_field(field, config.voxel_size),
+        background=(float(haze[0]), float(haze[1]), float(haze[2])),
+        p_WS=blueprint.p_WS,
+        p_WG=blueprint.p_WG,
+    )
 
-    shading = layout.outside(layout.trees.base) < config.height
 
-    def sunlit(p: NDArray) -> NDArray:
-        trees = layout.trees
-        past = light.past_trunks(
-            p, trees.at(2.0)[shading, :2], trees.radius[shading], config.height + 3
+class Forest:
+    """What `config` and `seed` determine of a forest: where things stand, and the light.
+
+    Raises:
+        ValueError: see `make_forest`.
+    """
+
+    def __init__(self, config: ForestConfig, seed: int) -> None:
+        config.validate()
+        if seed < 0:
+            raise ValueError(f"seed = {seed} must be 0 or more")
+        self.config, self.seed = config, seed
+        # One stream of random numbers a part: a change to one part leaves the others as they are.
+        layout_rng, light_rng = (np.random.default_rng([seed, k]) for k in range(2))
+        self.p_WS = np.array([INSET, 0.0, config.flight_height])
+        self.p_WG = np.array([config.length - INSET, 0.0, config.flight_height])
+        ends = [self.p_WS[:2], self.p_WG[:2]]
+        self.layout: ForestLayout = lay_out(config, layout_rng, ends, CLEARANCE)
+        self.light = Daylight.sampled(light_rng)
+
+    def sunlit(self, p: NDArray) -> NDArray:
+        """Part of the sun (N,) in [0, 1] that trunks and leaves let through to p (N, 3) [m]."""
+        shading, trees, top = self._shading, self.layout.trees, self.config.height + 3
+        past = self.light.past_trunks(p, trees.at(2.0)[shading, :2], trees.radius[shading], top)
+        return past * self.light.through_canopy(p, top, self.seed)
+
+    @cached_property
+    def _shading(self) -> NDArray[np.bool_]:
+        return self.layout.outside(self.layout.trees.base) < self.config.height
+
+    def blueprint(self) -> Blueprint:
+        """The forest before anything is drawn."""
+        solids, scenery = self.layout.solids()
+        return Blueprint(
+            name="forest",
+            lower_W=self.layout.lower,
+            upper_W=self.layout.upper,
+            solids=solids,
+            scenery=scenery,
+            p_WS=self.p_WS,
+            p_WG=self.p_WG,
+            light=lambda _: ForestLight(self.light, self.sunlit),
+            surroundings=lambda: self._surroundings(self._streams()),
+            seed=self.seed,
+            voxel_size=self.config.voxel_size,
         )
-        return past * light.through_canopy(p, config.height + 3, seed)
 
-    gaussians = merged(
-        [
-            forest_trees.trunks(layout, light, sunlit, rngs[0]),
+    def gaussians(self) -> GaussianScene:
+        """What cameras see."""
+        layout, light, rngs = self.layout, self.light, self._streams()
+        crowns, *around = self._surroundings(rngs)
+        return merged(
+            [
+                forest_trees.trunks(layout, light, self.sunlit, rngs[0]),
+                crowns,
+                forest_ground.floor(layout, light, self.sunlit, rngs[2]),
+                forest_ground.litter(layout, light, self.sunlit, rngs[3]),
+                *forest_ground.rocks_and_logs(layout, light, self.sunlit, rngs[4]),
+                *around,
+            ]
+        )
+
+    def _streams(self) -> Sequence[np.random.Generator]:
+        return [np.random.default_rng([self.seed, k]) for k in range(2, 10)]
+
+    def _surroundings(self, rngs: Sequence[np.random.Generator]) -> list[GaussianScene]:
+        """Crowns, bushes and the far edge of the trees."""
+        layout, light = self.layout, self.light
+        return [
             forest_trees.crowns(layout, light, rngs[1]),
-            forest_ground.floor(layout, light, sunlit, rngs[2]),
-            forest_ground.litter(layout, light, sunlit, rngs[3]),
-            *forest_ground.rocks_and_logs(layout, light, sunlit, rngs[4]),
             forest_surroundings.bushes(layout, light, rngs[5]),
             forest_surroundings.edge(layout, light, MARGIN + 3, 9.0, rngs[6]),
             forest_surroundings.edge(layout, light, MARGIN + 9, 13.0, rngs[7]),
         ]
-    )
-    field = AnalyticDistanceField(layout.shapes(), layout.lower, layout.upper)
-    return World(
-        name="forest",
-        gaussians=gaussians,
-        distance_field=field,
-        esdf=esdf_from_distance_field(field, config.voxel_size),
-        background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),
-        p_WS=p_WS,
-        p_WG=p_WG,
-    )
+
+
+@dataclass(frozen=True, eq=False)
+class ForestLight:
+    """The light of a forest as an `Illumination`."""
+
+    daylight: Daylight
+    sunlit: Sunlit
+
+    @property
+    def haze(self) -> NDArray[np.float64]:
+        return self.daylight.haze
+
+    def irradiance(self, p_W: NDArray, n_W: NDArray) -> NDArray[np.float64]:
+        foot = 0.55 + 0.45 * smoothstep(-0.1, 0.5, p_W[:, 2] + np.abs(n_W[:, 2]))
+        return self.daylight.irradiance(n_W, self.sunlit(p_W)) * foot[:, None]

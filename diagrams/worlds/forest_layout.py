@@ -7,15 +7,20 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from flysplat.diagrams.worlds.forest_config import ForestConfig
+from flysplat.diagrams.worlds.plot import Plot
 from flysplat.diagrams.worlds.poisson_disk import poisson_disk
+from flysplat.diagrams.worlds.solid import Solid
 from flysplat.diagrams.worlds.textures import BIRCH, OAK, PINE
-from flysplat.systems.collision.shapes import Capsule, HalfSpace, Shape, Sphere
+from flysplat.systems.collision.shapes import Capsule, HalfSpace, Sphere
 
 MARGIN = 14.0
 """[m], width of the belt of trees around the flyable volume."""
 
 BURIED = 1.0
 """[m], how deep trunks reach into the ground."""
+
+
+_BARK = {OAK: "oak", PINE: "pine", BIRCH: "birch"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,20 +42,12 @@ class Trees:
 
 
 @dataclass(frozen=True, eq=False)
-class ForestLayout:
+class ForestLayout(Plot):
     """Trees, rocks and fallen logs on the ground z = 0."""
 
-    lower: NDArray[np.float64]  # (3,) [m], flyable volume
-    upper: NDArray[np.float64]  # (3,) [m]
     trees: Trees
     rocks: NDArray[np.float64]  # (M, 4) [m], spheres: centre and radius
     logs: NDArray[np.float64]  # (L, 7) [m], capsules: two ends and radius
-
-    def outside(self, p: ArrayLike) -> NDArray[np.float64]:
-        """Returns how far p (N, 2 or more) [m] are from the volume in plan, (N,), 0 inside."""
-        p = np.asarray(p)[:, :2]
-        beyond = np.maximum(self.lower[:2] - p, p - self.upper[:2])
-        return np.linalg.norm(np.clip(beyond, 0, None), axis=1)
 
     def room(self, p: ArrayLike) -> NDArray[np.float64]:
         """Returns how far p (N, 2 or more) [m] are, in plan, from what stands or lies on the
@@ -69,24 +66,42 @@ class ForestLayout:
             room = np.minimum(room, gap - foot)
         return room
 
-    def shapes(self) -> list[Shape]:
-        """Returns everything that can be the nearest surface to a point of the volume.
+    def solids(self) -> tuple[list[Solid], list[Solid]]:
+        """Returns everything that can be the nearest surface to a point of the volume; and the
+        trees that cannot, and what of trunks is further up.
 
-        The ground is never further from such a point than the volume is high, so what stands
-        further from the volume than that is left out, and the distances stay exact.
+        The ground is never further from such a point than the volume is high, so the distances are
+        exact without what stands further from the volume than that.
         """
         ceiling = self.upper[2]
         trees = self.trees
         near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
-        trunks = zip(
-            trees.at(-BURIED)[near], trees.at(ceiling + 2)[near], trees.radius[near], strict=True
-        )
-        return [
-            HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0),
-            *(Capsule(p_A, p_B, float(r)) for p_A, p_B, r in trunks),
-            *(Capsule(log[:3], log[3:6], float(log[6])) for log in self.logs),
-            *(Sphere(rock[:3], float(rock[3])) for rock in self.rocks),
+        foot, top = trees.at(-BURIED), trees.at(ceiling + 2)
+        trunks = [
+            Solid(Capsule(p_A, p_B, float(r)), _BARK[species], k)
+            for k, (p_A, p_B, r, species) in enumerate(
+                zip(foot, top, trees.radius, trees.species, strict=True)
+            )
         ]
+        ground = Solid(HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0), "forest_floor")
+        logs = (Capsule(log[:3], log[3:6], float(log[6])) for log in self.logs)
+        rocks = (Sphere(rock[:3], float(rock[3])) for rock in self.rocks)
+        solids = [
+            ground,
+            *(trunk for trunk, is_near in zip(trunks, near, strict=True) if is_near),
+            *(Solid(log, "oak", k) for k, log in enumerate(logs)),
+            *(Solid(rock, "stone", k) for k, rock in enumerate(rocks)),
+        ]
+        tips = trees.base + 0.85 * trees.height[:, None] * trees.lean
+        upper = [
+            Solid(Capsule(p_A, np.array([*tip, 0.85 * h]), float(0.55 * r)), trunk.material, k)
+            for k, (p_A, tip, h, r, trunk) in enumerate(
+                zip(top, tips, trees.height, trees.radius, trunks, strict=True)
+            )
+            if 0.85 * h > ceiling + 2.5
+        ]
+        far = [trunk for trunk, is_near in zip(trunks, near, strict=True) if not is_near]
+        return solids, far + upper
 
 
 def lay_out(

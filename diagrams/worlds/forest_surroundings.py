@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flysplat.diagrams.worlds import textures
-from flysplat.diagrams.worlds.forest_layout import MARGIN, ForestLayout
+from flysplat.diagrams.worlds.forest_layout import MARGIN
 from flysplat.diagrams.worlds.light import HAZE_RANGE, Daylight, hazed
+from flysplat.diagrams.worlds.plot import Plot
 from flysplat.diagrams.worlds.surfaces import Surfels, colored
 from flysplat.diagrams.worlds.textures import OAK, mix, smoothstep
 from flysplat.systems.splats.gaussian_scene import GaussianScene
@@ -14,11 +15,11 @@ BUSHES, LEAVES = 170, 26
 """Bushes drawn, some of which fall into the volume and are left out, and leaves on each."""
 
 
-def bushes(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> GaussianScene:
+def bushes(plot: Plot, light: Daylight, rng: np.random.Generator) -> GaussianScene:
     """Grows leafy half-spheres in the belt of trees, out of reach of the volume."""
     reach = MARGIN - 3
-    foot = rng.uniform(layout.lower[:2] - reach, layout.upper[:2] + reach, (BUSHES, 2))
-    foot = foot[layout.outside(foot) > 2.0]
+    foot = rng.uniform(plot.lower[:2] - reach, plot.upper[:2] + reach, (BUSHES, 2))
+    foot = foot[plot.outside(foot) > 2.0]
     n = rng.normal(size=(len(foot), LEAVES, 3))
     n[..., 2] = np.abs(n[..., 2])
     n = _unit(n)
@@ -30,18 +31,18 @@ def bushes(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
     t = _unit(np.cross(n, rng.normal(size=n.shape)))
     extent = rng.uniform(0.7, 1.3, (len(p), 1)) * (0.19, 0.11)
     shade = 0.45 + 0.55 * smoothstep(0.0, 0.8, p[:, 2])
-    sunlit = light.through_canopy(p, layout.upper[2] + 3, seed=5)
+    sunlit = light.through_canopy(p, plot.upper[2] + 3, seed=5)
     colors = light.shaded(textures.leaf(OAK, p) * shade[:, None], n, sunlit, leafy=True)
-    colors = hazed(colors, light.haze, layout.outside(p), HAZE_RANGE)
+    colors = hazed(colors, light.haze, plot.outside(p), HAZE_RANGE)
     return colored(Surfels(p, n, t, extent), colors, 0.9)
 
 
 def edge(
-    layout: ForestLayout, light: Daylight, away: float, top: float, rng: np.random.Generator
+    plot: Plot, light: Daylight, away: float, top: float, rng: np.random.Generator
 ) -> GaussianScene:
     """Hangs a curtain of large patches `away` from the volume, ragged on top; both in metres."""
     spacing = 1.1
-    centre, half = (layout.lower + layout.upper)[:2] / 2, (layout.upper - layout.lower)[:2] / 2
+    centre, half = (plot.lower + plot.upper)[:2] / 2, (plot.upper - plot.lower)[:2] / 2
     angle = np.arange(0, 2 * np.pi, spacing / (half.max() + away))
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     on_box = np.clip(around / np.abs(around).max(axis=1, keepdims=True), -1, 1) * half

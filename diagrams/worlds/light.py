@@ -57,17 +57,22 @@ class Daylight:
             sunlit: (N,) in [0, 1], the part of the sun that reaches the surface.
             leafy: leaves let light through, so both their sides are lit by sun on either.
         """
+        linear = np.asarray(albedo) ** GAMMA * self.irradiance(normal, sunlit, leafy)
+        return developed(linear)
+
+    def irradiance(
+        self, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
+    ) -> NDArray[np.float64]:
+        """Returns the light, linear (N, 3), that falls on surfaces; arguments as of `shaded`."""
         normal = np.asarray(normal)
         facing = normal @ self.direction
         facing = 0.35 + 0.65 * np.abs(facing) if leafy else np.clip(facing, 0, None)
         up = 0.5 + 0.5 * normal[:, 2:]
-        light = (
+        return (
             self.sun * (np.asarray(sunlit) * facing)[:, None]
             + self.sky * (0.35 + 0.65 * up)
             + self.ground * (1 - up)
         )
-        linear = np.asarray(albedo) ** GAMMA * light
-        return ((1 - np.exp(-1.25 * linear)) ** (1 / GAMMA)).astype(np.float32)
 
     def through_canopy(self, p: ArrayLike, height: float, seed: int) -> NDArray[np.float32]:
         """Part of the sun that gaps in the leaves at `height` [m] let through to p (N, 3) [m]."""
@@ -103,6 +108,11 @@ class Daylight:
             edge = np.clip((across[near] - radius) / blur, -1, 1)
             lit[near] = np.minimum(lit[near], 0.5 + 0.5 * edge)
         return lit
+
+
+def developed(linear: ArrayLike) -> NDArray[np.float32]:
+    """Returns the sRGB colours of linear light: exposed like film, so that nothing clips."""
+    return ((1 - np.exp(-1.25 * np.asarray(linear))) ** (1 / GAMMA)).astype(np.float32)
 
 
 def hazed(colors: ArrayLike, haze: ArrayLike, distance: ArrayLike, range_: float) -> NDArray:

@@ -50,7 +50,9 @@ def _layout(config: ForestConfig, seed: int):
     p_WG = np.array([config.length - 1.5, 0, config.flight_height])
     rng = np.random.default_rng(seed)
     layout = lay_out(config, rng, [p_WS[:2], p_WG[:2]], CLEARANCE)
-    return layout, AnalyticDistanceField(layout.shapes(), layout.lower, layout.upper), p_WS, p_WG
+    shapes = [solid.shape for solid in layout.solids()[0]]
+    field = AnalyticDistanceField(shapes, layout.lower, layout.upper)
+    return layout, field, p_WS, p_WG
 
 
 def _digest(world: World) -> str:

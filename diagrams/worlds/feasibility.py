@@ -1,0 +1,94 @@
+"""Whether a way from start to goal exists, proven by search on the distance field."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from flysplat.diagrams.worlds.blueprint import Blueprint
+from flysplat.systems.collision.distance_field import DistanceField
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+CLEARANCE = 0.8
+"""[m], least distance of start and goal from everything, the bounds included."""
+
+TRIES = 60
+"""Draws of an instance before its parameters are refused."""
+
+TRAINING_SEEDS = 1_000_000
+"""First seed of worlds for training; benchmarks fly in those below."""
+
+
+def drawn(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Blueprint:
+    """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
+
+    Raises:
+        ValueError: for a negative seed, or if none of `TRIES` instances is feasible.
+    """
+    if seed < 0:
+        raise ValueError(f"seed = {seed} must be 0 or more")
+    name = "world"
+    for attempt in range(TRIES):
+        blueprint = draw(np.random.default_rng([seed, attempt]))
+        name = blueprint.name
+        if is_feasible(blueprint):
+            return blueprint
+    raise ValueError(
+        f"{name}: none of {TRIES} instances drawn from seed {seed} leaves a vehicle of radius "
+        f"{VEHICLE_RADIUS} m a way from start to goal; use fewer or smaller obstacles, or more room"
+    )
+
+
+def is_feasible(blueprint: Blueprint) -> bool:
+    """Whether start and goal are clear and a way between them is proven: on a coarse grid, which
+    shows most ways, or else on a fine one, which shows ways through gaps of 0.9 m."""
+    field = blueprint.distance_field
+    ends = np.stack([blueprint.p_WS, blueprint.p_WG])
+    if not (conservative_distance(field, ends) >= CLEARANCE).all():
+        return False
+    return any(
+        connects(field, blueprint.p_WS, blueprint.p_WG, VEHICLE_RADIUS, spacing)
+        for spacing in (0.3, 0.12)
+    )
+
+
+def conservative_distance(field: DistanceField, p_WQ: NDArray) -> NDArray[np.float64]:
+    """Distance (...,) [m] of points p_WQ (..., 3) inside the bounds to surfaces and the bounds."""
+    to_bounds = np.minimum(p_WQ - field.lower_W, field.upper_W - p_WQ).min(axis=-1)
+    return np.minimum(field.distance(p_WQ), to_bounds)
+
+
+def connects(
+    field: DistanceField, p_WS: NDArray, p_WG: NDArray, radius: float, spacing: float
+) -> bool:
+    """Whether a grid proves that a sphere of `radius` [m] can fly from p_WS to p_WG (3,) [m].
+
+    Neighbours along an axis, `spacing` h [m] apart, both further than radius + h / 2 from every
+    obstacle, are joined by a free segment: no point of it is further than h / 2 from one of them,
+    and distances change no faster than the way. The exact field is asked, so that no branch or wire
+    falls between the points of the grid.
+    """
+    grid = grid_distances(field, spacing)
+    free = grid > radius + spacing / 2
+    cells = [
+        tuple(np.clip(((p - field.lower_W) / spacing).astype(int), 0, np.array(free.shape) - 1))
+        for p in (p_WS, p_WG)
+    ]
+    part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
+    return bool(part[cells[0]] == part[cells[1]] > 0)
+
+
+def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
+    """`conservative_distance` (nx, ny, nz) [m] at lower_W + (i + 0.5) spacing."""
+    shape = np.maximum(((field.upper_W - field.lower_W) / spacing + 1e-6).astype(int), 1)
+    x, y, z = (
+        low + spacing * (np.arange(n) + 0.5) for low, n in zip(field.lower_W, shape, strict=True)
+    )
+    grid = np.empty(shape)
+    cube = 8  # points close together share their nearest shapes
+    for i, j, k in np.ndindex(*(-(-shape // cube))):
+        part = tuple(slice(cube * a, cube * (a + 1)) for a in (i, j, k))
+        p = np.stack(np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij"), axis=-1)
+        grid[part] = conservative_distance(field, p)
+    return grid

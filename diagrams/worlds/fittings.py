@@ -1,0 +1,144 @@
+"""What procedural worlds are put together from: boxes, halls, signs, daylight, lamps."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.diagrams.worlds import forest_surroundings
+from flysplat.diagrams.worlds.illumination import Illumination, Lamplight, Sunlight
+from flysplat.diagrams.worlds.light import Daylight
+from flysplat.diagrams.worlds.materials import SIGN
+from flysplat.diagrams.worlds.plot import Plot
+from flysplat.diagrams.worlds.solid import Solid
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.collision.shapes import Box, HalfSpace, Shape
+from flysplat.systems.splats.gaussian_scene import GaussianScene
+
+WALL = 0.3
+"""[m], thickness of walls."""
+
+INSET = 1.5
+"""[m], distance of start and goal from the ends of the volume."""
+
+
+def box(lower: ArrayLike, upper: ArrayLike, material: str, seed: int) -> Solid:
+    """An upright box between two corners (3,) [m]."""
+    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    return Solid(Box(RigidTransform((lower + upper) / 2), upper - lower), material, seed)
+
+
+def turned_box(p_W: ArrayLike, R_W: RotationMatrix, size: ArrayLike, material: str, seed: int):
+    """A box about p_W (3,) [m] with edges `size` (3,) [m] along the axes of R_W."""
+    return Solid(Box(RigidTransform(R_W, np.asarray(p_W, float)), size), material, seed)
+
+
+def ground(material: str, seed: int = 0) -> Solid:
+    """The ground z = 0."""
+    return Solid(HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0), material, seed)
+
+
+def hall(lower: NDArray, upper: NDArray, materials: list[str], rng: np.random.Generator):
+    """Four walls around the volume [lower, upper], their inner faces on its bounds, each of one of
+    the `materials`. Returns the solids."""
+    (x0, y0, _), (x1, y1, z1) = lower, upper
+    sides = (
+        ((x0 - WALL, y0 - WALL, 0), (x1 + WALL, y0, z1)),
+        ((x0 - WALL, y1, 0), (x1 + WALL, y1 + WALL, z1)),
+        ((x0 - WALL, y0, 0), (x0, y1, z1)),
+        ((x1, y0, 0), (x1 + WALL, y1, z1)),
+    )
+    return [
+        box(low, high, materials[rng.integers(len(materials))], int(rng.integers(1000)))
+        for low, high in sides
+    ]
+
+
+def signs_on(
+    wall: Solid, face: int, number: int, heights: tuple[float, float], rng: np.random.Generator
+) -> list[Solid]:
+    """Screws up to `number` signs, 2 cm thick, to one upright side of an upright box: face 0 is -x,
+    1 +x, 2 -y, 3 +y. `heights` [m] of their lower edges."""
+    assert isinstance(wall.shape, Box)
+    half, p = np.asarray(wall.shape.size) / 2, wall.shape.X_WS.translation()
+    k, sign = face // 2, 2 * (face % 2) - 1
+    along = 1 - k
+    room = half[along] - SIGN[0] / 2 - 0.1
+    if room <= 0:
+        return []
+    places = (np.arange(number) + rng.uniform(0.2, 0.8, number)) / number * 2 * room - room
+    signs = []
+    for place in places:
+        low = rng.uniform(*heights)
+        center, size = p.copy(), np.full(3, 0.02)
+        center[k] += sign * (half[k] + 0.01)
+        center[along] += place
+        center[2] = low + SIGN[1] / 2
+        size[along], size[2] = SIGN
+        signs.append(box(center - size / 2, center + size / 2, "signage", int(rng.integers(1000))))
+    return signs
+
+
+def daylight(rng: np.random.Generator) -> tuple[Daylight, Callable[[Esdf], Illumination]]:
+    """An hour of the day, and its light with the shadows of a distance field."""
+    hour = Daylight.sampled(rng)
+    return hour, lambda esdf: Sunlight(hour, esdf)
+
+
+def lamplight(
+    lower: NDArray, upper: NDArray, rng: np.random.Generator
+) -> Callable[[Esdf], Illumination]:
+    """Lamps under the roof z = upper[2], about 4 m apart."""
+    n = np.maximum(np.round((upper - lower)[:2] / 4.0).astype(int), 1)
+    i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
+    plan = lower[:2] + (np.stack([i, j], axis=-1).reshape(-1, 2) + 0.5) * (upper - lower)[:2] / n
+    warmth = rng.uniform(-0.5, 1.0)
+    tint = np.array([1.0, 0.96 - 0.05 * warmth, 0.92 - 0.2 * warmth]) * rng.uniform(0.8, 1.15)
+    lamps = np.column_stack([plan, np.full(len(plan), upper[2])])
+    return lambda esdf: Lamplight(lamps, tint, esdf)
+
+
+def trees_around(plot: Plot, hour: Daylight, seed: int) -> Callable[[], list[GaussianScene]]:
+    """Draws bushes and two rows of trees far around the volume."""
+
+    def draw() -> list[GaussianScene]:
+        rngs = [np.random.default_rng([seed, 50 + k]) for k in range(3)]
+        return [
+            forest_surroundings.bushes(plot, hour, rngs[0]),
+            forest_surroundings.edge(plot, hour, 15.0, 9.0, rngs[1]),
+            forest_surroundings.edge(plot, hour, 22.0, 14.0, rngs[2]),
+        ]
+
+    return draw
+
+
+def start_and_goal(
+    lower: NDArray,
+    upper: NDArray,
+    rng: np.random.Generator,
+    heights: tuple[float, float] = (1.2, 2.4),
+) -> tuple[NDArray, NDArray]:
+    """Draws a start (3,) and a goal (3,) [m] at the two ends of the volume along x."""
+    aside = min(0.3 * (upper - lower)[1], (upper - lower)[1] / 2 - INSET)
+    y, z = (lower + upper)[1] / 2 + rng.uniform(-aside, aside, 2), rng.uniform(*heights, 2)
+    return (
+        np.array([lower[0] + INSET, y[0], z[0]]),
+        np.array([upper[0] - INSET, y[1], z[1]]),
+    )
+
+
+def clear_of(shape: Shape, points: list[NDArray], clearance: float) -> bool:
+    """Whether all `points` (3,) [m] are at least `clearance` [m] from a shape."""
+    return bool((type(shape).distances(np.array(points), *shape.parameters()) >= clearance).all())
+
+
+def check_positive(config: object, *names: str) -> None:
+    """
+    Raises:
+        ValueError: for a field of `config` that is not positive and finite, or above 200.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if not 0 < value <= 200:
+            raise ValueError(f"{name} = {value} must be more than 0, at most 200")

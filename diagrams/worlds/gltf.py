@@ -1,0 +1,120 @@
+"""Worlds as glTF files, for Drake's render engines and everything else that reads meshes."""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flysplat.diagrams.worlds.blueprint import Blueprint
+from flysplat.diagrams.worlds.solid_mesh import Mesh, mesh_of, mesh_of_gaussians
+from flysplat.diagrams.worlds.surfaces import merged
+from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from flysplat.systems.files import written_atomically
+
+_FLOAT, _UINT = 5126, 5125  # component types
+_VERTICES, _INDICES = 34962, 34963  # targets of buffer views
+_NEAREST, _LINEAR, _CLAMP = 9728, 9729, 33071
+
+
+def write_gltf(blueprint: Blueprint, path: Path, texel: float = 0.02) -> None:
+    """Writes the world of a blueprint as one self-contained .gltf file.
+
+    Its light is baked into the pictures, which are emitted as they are: an engine shows the same
+    colours whatever lamps it has. The file is y-up, as glTF is: W's (x, y, z) is its (x, z, -y).
+    Drake's render engines turn glTF's y up to z themselves: there it stands in W at the identity.
+
+    Args:
+        texel: [m], size of a pixel of the pictures on the solids.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    light = blueprint.light(
+        esdf_from_distance_field(blueprint.distance_field, blueprint.voxel_size)
+    )
+    meshes = mesh_of(blueprint, light, texel)
+    surroundings = blueprint.surroundings()
+    if surroundings:
+        meshes.append(mesh_of_gaussians(merged(surroundings)))
+    with written_atomically(path) as temporary:
+        temporary.write_text(json.dumps(_document(meshes)))
+
+
+def _document(meshes: list[Mesh]) -> dict[str, Any]:
+    """The meshes as a glTF 2.0 document with everything embedded."""
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "flysplat"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(meshes)))}],
+        "samplers": [
+            {"magFilter": f, "minFilter": f, "wrapS": _CLAMP, "wrapT": _CLAMP}
+            for f in (_NEAREST, _LINEAR)
+        ],
+    }
+    for name in (
+        "nodes", "meshes", "materials", "textures", "images", "accessors", "bufferViews", "buffers"
+    ):  # fmt: skip
+        document[name] = []
+    for k, mesh in enumerate(meshes):
+        x, y, z = mesh.vertices.T
+        position = np.column_stack([x, z, -y]).astype(np.float32)  # z-up to y-up
+        attributes = {
+            "POSITION": _accessor(document, position, "VEC3", _VERTICES),
+            "TEXCOORD_0": _accessor(document, mesh.uv.astype(np.float32), "VEC2", _VERTICES),
+        }
+        indices = mesh.triangles.astype(np.uint32).reshape(-1, 1)
+        primitive = {
+            "attributes": attributes,
+            "indices": _accessor(document, indices, "SCALAR", _INDICES),
+            "material": k,
+        }
+        document["nodes"].append({"mesh": k})
+        document["meshes"].append({"primitives": [primitive]})
+        document["materials"].append(
+            {
+                "pbrMetallicRoughness": {
+                    "baseColorFactor": [0, 0, 0, 1],
+                    "metallicFactor": 0,
+                    "roughnessFactor": 1,
+                },
+                "emissiveFactor": [1, 1, 1],
+                "emissiveTexture": {"index": k},
+                "doubleSided": not mesh.smooth,
+            }
+        )
+        document["textures"].append({"source": k, "sampler": int(mesh.smooth)})
+        document["images"].append({"uri": _picture_uri(mesh)})
+    return document
+
+
+def _accessor(document: dict[str, Any], array: np.ndarray, kind: str, target: int) -> int:
+    content = array.tobytes()
+    number = len(document["accessors"])
+    document["buffers"].append(
+        {
+            "byteLength": len(content),
+            "uri": "data:application/octet-stream;base64," + base64.b64encode(content).decode(),
+        }
+    )
+    document["bufferViews"].append({"buffer": number, "byteLength": len(content), "target": target})
+    document["accessors"].append(
+        {
+            "bufferView": number,
+            "componentType": _UINT if array.dtype == np.uint32 else _FLOAT,
+            "count": len(array),
+            "type": kind,
+            "min": array.min(axis=0).tolist(),
+            "max": array.max(axis=0).tolist(),
+        }
+    )
+    return number
+
+
+def _picture_uri(mesh: Mesh) -> str:
+    """The picture as a data URI: JPEG, but PNG where pixels must not run into each other."""
+    kind, options = ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 92]) if mesh.smooth else ("png", [])
+    _, content = cv2.imencode(f".{kind}", mesh.picture[..., ::-1], options)
+    return f"data:image/{kind};base64,{base64.b64encode(content.tobytes()).decode()}"
