@@ -60,7 +60,7 @@ def test_materials_have_colours_and_something_to_see(material):
     rng = np.random.default_rng(1)
     uv = rng.uniform(0, 2, (4000, 2))
     ground = material in ("grass", "paving", "forest_floor")
-    shape, height = (HalfSpace([0.0, 0, 1], 0.0), 0 * uv[:, 0]) if ground else (BOX, uv[:, 1])
+    shape, height = (HalfSpace([0.0, 0, 1], 0.0), 0 * uv[:, 0]) if ground else (BOX, 3 + uv[:, 1])
     p = np.column_stack([uv, height])
     colors, again, other = (Solid(shape, material, seed).albedo(uv, p) for seed in (3, 3, 5))
     assert colors.shape == (4000, 3)
