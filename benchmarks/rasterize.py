@@ -236,7 +236,7 @@ def print_share_of_limit(scene: GaussianScene, X_WC: RigidTransform) -> None:
         frame = _native.kept_frame(renderer)
         gradients = np.zeros((frame.splat_count, 16), np.float32)
         call = lambda r=renderer, f=frame, g=gradients: _native.raster_backward(  # noqa: E731
-            r, f, v_image, v_alpha, image, alpha, black, False, False, g
+            r, f, v_image, v_alpha, image, alpha, black, False, False, g, m
         )
         least, _ = milliseconds(call)
         blocks, pairs = call(), renderer.pair_count

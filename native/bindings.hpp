@@ -5,6 +5,9 @@
 #include <nanobind/ndarray.h>
 
 #include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <initializer_list>
 #include <stdexcept>
 
 #include "renderer.hpp"
@@ -57,6 +60,37 @@ inline void check_size(const Output& out, int width, int height, size_t channels
   require(out.shape(0) == static_cast<size_t>(height) &&
               out.shape(1) == static_cast<size_t>(width) && out.shape(2) == channels,
           "an output array has the wrong shape");
+}
+
+// Where an image of colour (3 channels), depth (1) or both (4) and its alpha are to be written.
+inline Image output_image(const Output& image, const Output& alpha, int width, int height,
+                          bool expected_depth, const Floats<nb::shape<3>>& background) {
+  const size_t channels = image.shape(2);
+  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
+  check_size(image, width, height, channels);
+  check_size(alpha, width, height, 1);
+  Image out{};
+  if (channels >= 3) out.color = image.data();
+  if (channels != 3) out.depth = image.data() + channels - 1;
+  out.color_stride = out.depth_stride = static_cast<int>(channels);
+  out.expected_depth = expected_depth;
+  out.alpha = alpha.data();
+  std::copy_n(background.data(), 3, out.background);
+  return out;
+}
+
+// A numpy array that owns its memory, which is not initialised.
+template <typename T>
+nb::ndarray<nb::numpy, T> new_array(std::initializer_list<size_t> shape) {
+  size_t size = 1;
+  for (const size_t n : shape) size *= n;
+  auto* values = new T[size];
+  return {values, shape, nb::capsule(values, [](void* p) noexcept { delete[] static_cast<T*>(p); })};
+}
+
+// Pixels, rounded up; bounded, so that it fits an integer.
+inline int32_t radius_of(float extent) {
+  return static_cast<int32_t>(std::ceil(std::min(extent, 1073741824.0f)));
 }
 
 // Adds what the backward pass needs to the module.

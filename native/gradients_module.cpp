@@ -28,7 +28,8 @@ void check_pixels(const Pixels& array, const Camera& camera, size_t channels) {
 size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image, Pixels v_alpha,
                      Pixels image, Pixels alpha, Floats<nb::shape<3>> background,
                      bool expected_depth, bool absolute,
-                     Writable<nb::shape<-1, 16>> splat_gradients) {
+                     Writable<nb::shape<-1, 16>> splat_gradients,
+                     Writable<nb::shape<-1, 2>> v_means2d) {
   const Camera& camera = kept.frame->camera;
   const size_t channels = v_image.shape(2);
   require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
@@ -36,7 +37,8 @@ size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image
   check_pixels(image, camera, channels);
   check_pixels(v_alpha, camera, 1);
   check_pixels(alpha, camera, 1);
-  require(splat_gradients.shape(0) == kept.splats, "one row of gradients a splat is needed");
+  require(splat_gradients.shape(0) == kept.splats && v_means2d.shape(0) == kept.splats,
+          "one row of gradients a splat is needed");
   ImageGradient g{};
   if (channels >= 3) g.color = v_image.data();
   if (channels != 3) g.depth = v_image.data() + channels - 1;
@@ -50,7 +52,8 @@ size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
   return renderer.raster_backward(*kept.frame, g,
-                                  reinterpret_cast<SplatGradient*>(splat_gradients.data()));
+                                  reinterpret_cast<SplatGradient*>(splat_gradients.data()),
+                                  v_means2d.data());
 }
 
 // Returns PoseSums.
@@ -59,7 +62,7 @@ std::vector<double> project_backward(
     Opacities opacities, Colors colors, int sh_degree, Floats<nb::shape<-1, 16>> splat_gradients,
     Floats<nb::shape<-1, 2>> v_means2d, Writable<nb::shape<-1, 3>> v_means,
     Writable<nb::shape<-1, 4>> v_quats, Writable<nb::shape<-1, 3>> v_scales,
-    Writable<nb::ndim<1>> v_opacities, Writable<nb::shape<-1, -1, 3>> v_colors) {
+    Writable<nb::ndim<1>> v_opacities, Writable<nb::shape<-1, -1, 3>> v_colors, bool overwrite, bool overwrite_colors) {
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
   require(gaussians.count == kept.gaussians, "these are not the Gaussians of the frame");
@@ -75,7 +78,8 @@ std::vector<double> project_backward(
   const PoseSums sums = renderer.project_backward(
       *kept.frame, gaussians, reinterpret_cast<const SplatGradient*>(splat_gradients.data()),
       v_means2d.data(),
-      {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data()});
+      {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data(),
+       overwrite, overwrite_colors});
   return {std::begin(sums.values), std::end(sums.values)};
 }
 

@@ -23,6 +23,29 @@ static size_t first_nonfinite(const float* values, size_t count) {
   return count;
 }
 
+static bool all_within(const float* values, size_t count, float low, float high) {
+  uint32_t bits = 0xffff;
+  size_t i = 0;
+  for (; i + kLanes <= count; i += kLanes) {
+    const F16 v = load(values + i);
+    bits &= lane_bits((v >= F16(low)) & (v <= F16(high)));
+  }
+  bool within = bits == 0xffff;
+  for (; i < count; ++i) within = within && values[i] >= low && values[i] <= high;
+  return within;
+}
+
+static bool all_normalisable(const float* quats, size_t count) {
+  bool all = true;
+  for (size_t i = 0; i < count; ++i) {
+    const float* q = quats + 4 * i;
+    const float squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    all &= squared >= kMinSquaredNorm;
+    all &= squared <= kMaxSquaredNorm;
+  }
+  return all;
+}
+
 static float multiply_add(size_t rounds) {
   Register sums[kFmaChains];
   for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = Register{} + 1.0f * chain;
@@ -41,9 +64,9 @@ static float multiply_add(size_t rounds) {
 #define FS_STRING_OF(name) #name
 #define FS_STRING(name) FS_STRING_OF(name)
 static const Kernels kTable = {FS_STRING(FLYSPLAT_LEVEL), project_arrays, project_baked,
-                               bin_splats, raster_tile,
+                               bin_footprints<SplatFootprint>, raster_tile,
                                raster_tile_backward, gather_gradients, project_backward,
-                               first_nonfinite, multiply_add};
+                               first_nonfinite, all_within, all_normalisable, multiply_add};
 
 }  // namespace FLYSPLAT_LEVEL
 

@@ -1,9 +1,11 @@
 // Python bindings. Arguments are checked in Python, where errors can name tensors; here only what
 // memory safety needs is checked again.
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <cmath>
+#include <optional>
 
 #include "baked_scene.hpp"
 #include "bindings.hpp"
@@ -16,39 +18,44 @@ namespace {
 
 using namespace nb::literals;
 
-// What gsplat calls meta, for the splats of the last frame, in the order of the input.
-nb::tuple projected(Renderer& renderer) {
+nb::dict stage_seconds(const Renderer& renderer) {
+  const StageSeconds& s = renderer.seconds();
+  nb::dict seconds;
+  seconds["project"] = s.project;
+  seconds["sort"] = s.sort;
+  seconds["bin"] = s.bin;
+  seconds["raster"] = s.raster;
+  seconds["raster backward"] = s.raster_backward;
+  seconds["gather"] = s.gather;
+  seconds["project backward"] = s.project_backward;
+  return seconds;
+}
+
+// What gsplat calls meta, for the splats of the last frame, in the order of the input. Opacities are
+// the rows of `given`, or without it those that the splats had.
+nb::tuple projected(Renderer& renderer, std::optional<Opacities> given) {
   const std::scoped_lock lock(renderer.mutex());
+  require(!given || (renderer.frame() && given->size() == renderer.frame()->gaussians),
+          "these are not the Gaussians of the last frame");
   const size_t n = renderer.splat_count();
-  auto* values = new float[9 * n];
-  auto* ids = new int64_t[n];
-  nb::capsule value_owner(values, [](void* p) noexcept { delete[] static_cast<float*>(p); });
-  nb::capsule id_owner(ids, [](void* p) noexcept { delete[] static_cast<int64_t*>(p); });
-  float *radii = values, *means = values + 2 * n;
-  float *depths = values + 4 * n, *conics = values + 5 * n, *opacities = values + 8 * n;
-  size_t i = 0;
-  renderer.for_each_splat([&](const Splat& s) {
-    ids[i] = s.index;
-    radii[2 * i] = std::ceil(s.extent_x);
-    radii[2 * i + 1] = std::ceil(s.extent_y);
-    means[2 * i] = s.mean_x;
-    means[2 * i + 1] = s.mean_y;
-    depths[i] = s.depth;
+  const auto ids = new_array<int64_t>({n});
+  const auto radii = new_array<int32_t>({n, 2});
+  const auto means = new_array<float>({n, 2}), conics = new_array<float>({n, 3});
+  const auto depths = new_array<float>({n}), opacities = new_array<float>({n});
+  renderer.for_each_splat([&](size_t i, const Splat& s) {
+    ids.data()[i] = s.index;
+    radii.data()[2 * i] = radius_of(s.extent_x);
+    radii.data()[2 * i + 1] = radius_of(s.extent_y);
+    means.data()[2 * i] = s.mean_x;
+    means.data()[2 * i + 1] = s.mean_y;
+    depths.data()[i] = s.depth;
     const float scale = 1.0f / (kExponentScale * kExponentScale);
-    conics[3 * i] = s.ux * s.ux * scale;
-    conics[3 * i + 1] = s.ux * s.uy * scale;
-    conics[3 * i + 2] = (s.uy * s.uy + s.vy * s.vy) * scale;
-    opacities[i] = std::exp2(s.log2_opacity);
-    ++i;
+    conics.data()[3 * i] = s.ux * s.ux * scale;
+    conics.data()[3 * i + 1] = s.ux * s.uy * scale;
+    conics.data()[3 * i + 2] = (s.uy * s.uy + s.vy * s.vy) * scale;
+    opacities.data()[i] = given ? given->data()[s.index] : std::exp2(s.log2_opacity);
   });
-  const auto matrix = [&](float* data, size_t columns) {
-    return nb::ndarray<nb::numpy, float, nb::ndim<2>>(data, {n, columns}, value_owner);
-  };
-  return nb::make_tuple(nb::ndarray<nb::numpy, int64_t, nb::ndim<1>>(ids, {n}, id_owner),
-                        matrix(radii, 2), matrix(means, 2),
-                        nb::ndarray<nb::numpy, float, nb::ndim<1>>(depths, {n}, value_owner),
-                        matrix(conics, 3),
-                        nb::ndarray<nb::numpy, float, nb::ndim<1>>(opacities, {n}, value_owner));
+  return nb::make_tuple(ids, radii, means, depths, conics, opacities);
 }
 
 // Channels are colour (3), depth (1) or colour and depth (4), by the shape of `image`.
@@ -62,17 +69,7 @@ size_t render(Renderer& renderer, Means means, Quats quats, Means scales, Opacit
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
   const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip,
                                     eps2d, antialiased);
-  const size_t channels = image.shape(2);
-  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
-  check_size(image, width, height, channels);
-  check_size(alpha, width, height, 1);
-  Image out{};
-  if (channels >= 3) out.color = image.data();
-  if (channels != 3) out.depth = image.data() + channels - 1;
-  out.color_stride = out.depth_stride = static_cast<int>(channels);
-  out.expected_depth = expected_depth;
-  out.alpha = alpha.data();
-  std::copy_n(background.data(), 3, out.background);
+  const Image out = output_image(image, alpha, width, height, expected_depth, background);
 
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
@@ -113,12 +110,30 @@ NB_MODULE(_native, m) {
       "values"_a, "renderer"_a, "Index of the first NaN or infinity, or -1.");
 
   m.def(
+      "scene_is_valid",
+      [](Renderer& renderer, Means means, Quats quats, Means scales, Opacities opacities,
+         Floats<nb::ndim<1>> colors) {
+        const size_t n = means.shape(0);
+        require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n,
+                "arrays of Gaussians differ in length");
+        const GaussianArrays gaussians{n, means.data(), quats.data(), scales.data(),
+                                       opacities.data(), colors.data(), -1, 1};
+        const nb::gil_scoped_release release;
+        const std::scoped_lock lock(renderer.mutex());
+        return renderer.are_valid(gaussians, colors.size());
+      },
+      "renderer"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a,
+      "Whether every number can be rendered; may be false for scales below 1.2e-38.");
+
+  m.def(
       "first_zero_quaternion",
       [](Quats quats) -> int64_t {
         for (size_t i = 0; i < quats.shape(0); ++i) {
           const float* q = quats.data() + 4 * i;
           const float squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-          if (!(squared >= 1e-30f && squared <= 1e30f)) return static_cast<int64_t>(i);
+          if (!(squared >= kMinSquaredNorm && squared <= kMaxSquaredNorm)) {
+            return static_cast<int64_t>(i);
+          }
         }
         return -1;
       },
@@ -135,7 +150,8 @@ NB_MODULE(_native, m) {
       .def_prop_ro("simd", [](const Renderer& r) { return std::string(r.kernels().name); })
       .def_prop_ro("pair_count", &Renderer::pair_count,
                    "(Gaussian, tile) pairs of the last frame.")
-      .def("projected", &projected,
+      .def_prop_ro("seconds", &stage_seconds, "Seconds that each stage of the last frame took.")
+      .def("projected", &projected, "opacities"_a.none(),
            "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3), "
            "opacities (n,) of the last frame.")
       .def("render", &render);

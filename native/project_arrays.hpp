@@ -31,6 +31,27 @@ inline size_t cull_arrays(const GaussianArrays& g, const Camera& camera, size_t 
   return count;
 }
 
+// Sixteen Gaussians of the input.
+struct GatheredGaussians {
+  Vector16 mean;
+  F16 quat[4], scale[3], opacity;
+};
+
+FS_INLINE GatheredGaussians gather_gaussians(const GaussianArrays& g, const uint32_t* indices) {
+  alignas(64) float soa[11][kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const size_t i = indices[lane];
+    for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * i + axis];
+    for (int k = 0; k < 4; ++k) soa[3 + k][lane] = g.quats[4 * i + k];
+    for (int axis = 0; axis < 3; ++axis) soa[7 + axis][lane] = g.scales[3 * i + axis];
+    soa[10][lane] = g.opacities[i];
+  }
+  return {{load(soa[0]), load(soa[1]), load(soa[2])},
+          {load(soa[3]), load(soa[4]), load(soa[5]), load(soa[6])},
+          {load(soa[7]), load(soa[8]), load(soa[9])},
+          load(soa[10])};
+}
+
 // The columns of R(q) diag(scale), a factor of the covariance, for quaternions of any length.
 FS_INLINE void covariance_factor(const F16 q[4], const F16 scale[3], Vector16 columns[3]) {
   const F16 two = F16(2.0f) / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
@@ -47,6 +68,17 @@ FS_INLINE F16 dot(const Vector16& a, const Vector16& b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
+// Asks for the first `used` floats of rows that are read soon, all at once.
+FS_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint32_t* indices,
+                             uint32_t bits) {
+  constexpr int kFloatsPerLine = 16;
+  if (used <= kFloatsPerLine) return;
+  for (; bits; bits &= bits - 1) {
+    const float* row = rows + static_cast<size_t>(stride) * indices[__builtin_ctz(bits)];
+    for (int k = 0; k < used; k += kFloatsPerLine) __builtin_prefetch(row + k);
+  }
+}
+
 // Gathers the colours of the lanes in `bits` and evaluates them.
 FS_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
                              const Vector16& d_W, F16 color[3]) {
@@ -54,6 +86,7 @@ FS_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, u
   const int stored = g.sh_degree < 0 ? 1 : g.sh_coefficients;
   alignas(64) float soa[3 * 16][kLanes];
   for (int k = 0; k < 3 * used; ++k) store(soa[k], F16(0.0f));
+  prefetch_rows(g.colors, 3 * stored, 3 * used, indices, bits);
   for (; bits; bits &= bits - 1) {
     const int lane = __builtin_ctz(bits);
     const float* row = g.colors + static_cast<size_t>(3 * stored) * indices[lane];
@@ -76,27 +109,17 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
   size_t count = 0;
   for (size_t first = 0; first < candidate_count; first += kLanes) {
     const uint32_t* indices = candidates + first;
-    alignas(64) float soa[11][kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const size_t i = indices[lane];
-      for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * i + axis];
-      for (int k = 0; k < 4; ++k) soa[3 + k][lane] = g.quats[4 * i + k];
-      for (int axis = 0; axis < 3; ++axis) soa[7 + axis][lane] = g.scales[3 * i + axis];
-      soa[10][lane] = g.opacities[i];
-    }
-    const Vector16 d_W = from_centre(camera, load(soa[0]), load(soa[1]), load(soa[2]));
+    const GatheredGaussians in = gather_gaussians(g, indices);
+    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
     const Vector16 p_C = to_camera(camera, d_W);
     const F16 inverse_z = F16(1.0f) / p_C.z;
-    const F16 q[4] = {load(soa[3]), load(soa[4]), load(soa[5]), load(soa[6])};
-    const F16 scale[3] = {load(soa[7]), load(soa[8]), load(soa[9])};
     Vector16 columns[3], m[2];
-    covariance_factor(q, scale, columns);
+    covariance_factor(in.quat, in.scale, columns);
     projection_rows(camera, p_C, inverse_z, m);
     const Vector16 p0 = {dot(m[0], columns[0]), dot(m[0], columns[1]), dot(m[0], columns[2])};
     const Vector16 p1 = {dot(m[1], columns[0]), dot(m[1], columns[1]), dot(m[1], columns[2])};
     // An opacity of zero has no logarithm; any value below the cut serves.
-    const F16 opacity = load(soa[10]);
-    const F16 log2_opacity = log2(max(opacity, F16(1e-30f)));
+    const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
 
     SplatPack pack;
     uint32_t bits =

@@ -46,7 +46,7 @@ using namespace nb::literals;
 using Rows = Doubles<nb::shape<-1, 3>>;
 
 // Returns (ux, uy, vy) of every visible splat, which the derivative by the covariance needs.
-nb::ndarray<nb::numpy, float, nb::ndim<2>> render_projected(
+nb::ndarray<nb::numpy, float> render_projected(
     Renderer& renderer, Doubles<nb::shape<-1, 2>> means2d, Rows covariances, Opacities depths,
     Opacities opacities, Means colors, int width, int height, double radius_clip,
     bool expected_depth, Floats<nb::shape<3>> background, Output image, Output alpha, bool keep) {
@@ -57,41 +57,26 @@ nb::ndarray<nb::numpy, float, nb::ndim<2>> render_projected(
   require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
   require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
           "the image must have pixels, and at most 32768 a side");
-  const size_t channels = image.shape(2);
-  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
-  check_size(image, width, height, channels);
-  check_size(alpha, width, height, 1);
   const ProjectedArrays projected{n, means2d.data(), covariances.data(), depths.data(),
                                   opacities.data(), colors.data()};
   Camera camera{};
   camera.width = width;
   camera.height = height;
   camera.radius_clip = static_cast<float>(std::floor(radius_clip));
-  Image out{};
-  if (channels >= 3) out.color = image.data();
-  if (channels != 3) out.depth = image.data() + channels - 1;
-  out.color_stride = out.depth_stride = static_cast<int>(channels);
-  out.expected_depth = expected_depth;
-  out.alpha = alpha.data();
-  std::copy_n(background.data(), 3, out.background);
+  const Image out = output_image(image, alpha, width, height, expected_depth, background);
 
-  float* factors = nullptr;
-  size_t visible = 0;
   {
     const nb::gil_scoped_release release;
     const std::scoped_lock lock(renderer.mutex());
     renderer.render(projected, camera, out, keep);
-    visible = renderer.splat_count();
-    factors = new float[3 * visible];
-    size_t i = 0;
-    renderer.for_each_splat([&](const Splat& s) {
-      factors[i++] = s.ux;
-      factors[i++] = s.uy;
-      factors[i++] = s.vy;
-    });
   }
-  nb::capsule owner(factors, [](void* p) noexcept { delete[] static_cast<float*>(p); });
-  return nb::ndarray<nb::numpy, float, nb::ndim<2>>(factors, {visible, 3}, owner);
+  const auto factors = new_array<float>({renderer.splat_count(), 3});
+  renderer.for_each_splat([&](size_t i, const Splat& s) {
+    factors.data()[3 * i] = s.ux;
+    factors.data()[3 * i + 1] = s.uy;
+    factors.data()[3 * i + 2] = s.vy;
+  });
+  return factors;
 }
 
 }  // namespace

@@ -1,8 +1,8 @@
 // The derivative of projection.hpp and project_arrays.hpp, 16 Gaussians at a time.
 #pragma once
 
+#include "color_backward.hpp"
 #include "project_arrays.hpp"
-#include "spherical_harmonics_backward.hpp"
 
 namespace flysplat::FLYSPLAT_LEVEL {
 
@@ -104,34 +104,6 @@ struct GaussianGradientPack {
   F16 mean[3], quat[4], scale[3], opacity;
 };
 
-// Colours' part: writes rows of dL/dcolors and returns dL/d(p_W - centre).
-FS_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indices, int lanes,
-                                   const Vector16& d_W, const F16 color_gradient[3],
-                                   float* gradients) {
-  alignas(64) float soa[48][kLanes];
-  if (g.sh_degree < 0) {
-    for (int c = 0; c < 3; ++c) store(soa[c], color_gradient[c]);
-    for (int lane = 0; lane < lanes; ++lane) {
-      float* row = gradients + 3 * static_cast<size_t>(indices[lane]);
-      for (int c = 0; c < 3; ++c) row[c] += soa[c][lane];
-    }
-    return {F16(0.0f), F16(0.0f), F16(0.0f)};
-  }
-  const int used = 3 * (g.sh_degree + 1) * (g.sh_degree + 1);
-  const size_t stride = 3 * static_cast<size_t>(g.sh_coefficients);
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const float* row = g.colors + stride * indices[lane];
-    for (int k = 0; k < used; ++k) soa[k][lane] = row[k];
-  }
-  F16 direction[3] = {F16(0.0f), F16(0.0f), F16(0.0f)};
-  evaluate_sh_backward(g.sh_degree, soa[0], d_W.x, d_W.y, d_W.z, color_gradient, direction);
-  for (int lane = 0; lane < lanes; ++lane) {
-    float* row = gradients + stride * indices[lane];
-    for (int k = 0; k < used; ++k) row[k] += soa[k][lane];
-  }
-  return {direction[0], direction[1], direction[2]};
-}
-
 FS_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indices, int lanes,
                         const GaussianGradients& out) {
   alignas(64) float soa[11][kLanes];
@@ -192,23 +164,14 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     SplatGradientPack s;
     gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes,
                   g.sh_degree >= 0, indices, s);
-    alignas(64) float soa[11][kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const size_t i = indices[lane];
-      for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * i + axis];
-      for (int k = 0; k < 4; ++k) soa[3 + k][lane] = g.quats[4 * i + k];
-      for (int axis = 0; axis < 3; ++axis) soa[7 + axis][lane] = g.scales[3 * i + axis];
-      soa[10][lane] = g.opacities[i];
-    }
-    const Vector16 d_W = from_centre(camera, load(soa[0]), load(soa[1]), load(soa[2]));
+    const GatheredGaussians in = gather_gaussians(g, indices);
+    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
     const Vector16 p_C = to_camera(camera, d_W);
     const F16 inverse_z = F16(1.0f) / p_C.z;
-    const F16 q[4] = {load(soa[3]), load(soa[4]), load(soa[5]), load(soa[6])};
-    const F16 scale[3] = {load(soa[7]), load(soa[8]), load(soa[9])};
     const F16 unit[3] = {F16(1.0f), F16(1.0f), F16(1.0f)};
     Vector16 rotation[3], columns[3], m[2];
-    covariance_factor(q, unit, rotation);
-    for (int k = 0; k < 3; ++k) columns[k] = scale[k] * rotation[k];
+    covariance_factor(in.quat, unit, rotation);
+    for (int k = 0; k < 3; ++k) columns[k] = in.scale[k] * rotation[k];
     projection_rows(camera, p_C, inverse_z, m);
     const Vector16 p0 = {dot(m[0], columns[0]), dot(m[0], columns[1]), dot(m[0], columns[2])};
     const Vector16 p1 = {dot(m[1], columns[0]), dot(m[1], columns[1]), dot(m[1], columns[2])};
@@ -222,7 +185,7 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
       dm[i] = dp[i].x * columns[0] + (dp[i].y * columns[1] + dp[i].z * columns[2]);
     }
     GaussianGradientPack pack;
-    covariance_factor_backward(q, scale, rotation, dcolumns, pack.quat, pack.scale);
+    covariance_factor_backward(in.quat, in.scale, rotation, dcolumns, pack.quat, pack.scale);
     const Vector16 dp_C = projection_rows_backward(camera, p_C, inverse_z, dm, s, dR);
     dR[0] = dR[0] + dp_C.x * d_W;
     dR[1] = dR[1] + dp_C.y * d_W;
@@ -236,7 +199,7 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     pack.mean[0] = dd_W.x;
     pack.mean[1] = dd_W.y;
     pack.mean[2] = dd_W.z;
-    pack.opacity = s.log_opacity / load(soa[10]);
+    pack.opacity = s.log_opacity / in.opacity;
     add_rows(pack, indices, lanes, out);
   }
   const Vector16 vectors[5] = {dR[0], dR[1], dR[2], dp_sum, direction_sum};

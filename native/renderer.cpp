@@ -1,7 +1,9 @@
 #include "renderer.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <limits>
 #include <numeric>
 
 #include "dispatch.hpp"
@@ -77,7 +79,7 @@ Camera make_camera(const CameraParameters& p) {
 }
 
 Renderer::Renderer(int threads, const std::string& simd_level)
-    : kernels_(flysplat::kernels(simd_level)), pool_(threads) {}
+    : pool_(threads), kernels_(flysplat::kernels(simd_level)) {}
 
 void Renderer::render(const GaussianArrays& gaussians, const Camera& camera, const Image& image,
                       bool keep) {
@@ -109,12 +111,38 @@ size_t Frame::splat_count() const {
   return std::accumulate(chunk_counts.begin(), chunk_counts.end(), size_t{0});
 }
 
-void Renderer::for_each_splat(const std::function<void(const Splat&)>& visit) const {
-  if (!frame_) return;
-  for (size_t chunk = 0; chunk < frame_->chunk_counts.size(); ++chunk) {
-    const Splat* first = frame_->splats.data() + chunk * kChunkSize;
-    std::for_each(first, first + frame_->chunk_counts[chunk], visit);
-  }
+std::vector<size_t> Frame::chunk_starts() const {
+  std::vector<size_t> starts(chunk_counts.size());
+  std::exclusive_scan(chunk_counts.begin(), chunk_counts.end(), starts.begin(), size_t{0});
+  return starts;
+}
+
+double Renderer::lap() {
+  const auto now = std::chrono::steady_clock::now();
+  const std::chrono::duration<double> passed = now - lap_start_;
+  lap_start_ = now;
+  return passed.count();
+}
+
+bool Renderer::are_valid(const GaussianArrays& g, size_t color_floats) {
+  constexpr float kMost = std::numeric_limits<float>::max();
+  constexpr float kLeast = std::numeric_limits<float>::min();
+  const size_t chunks = (g.count + kChunkSize - 1) / kChunkSize;
+  std::atomic<bool> valid{true};
+  pool_.for_each(chunks, [&](size_t chunk) {
+    const size_t begin = chunk * kChunkSize;
+    const size_t count = std::min(g.count - begin, size_t{kChunkSize});
+    const size_t color_begin = color_floats * chunk / chunks;
+    const size_t color_count = color_floats * (chunk + 1) / chunks - color_begin;
+    if (!kernels_.all_within(g.means + 3 * begin, 3 * count, -kMost, kMost) ||
+        !kernels_.all_normalisable(g.quats + 4 * begin, count) ||
+        !kernels_.all_within(g.scales + 3 * begin, 3 * count, kLeast, kMost) ||
+        !kernels_.all_within(g.opacities + begin, count, 0.0f, 1.0f) ||
+        !kernels_.all_within(g.colors + color_begin, color_count, -kMost, kMost)) {
+      valid.store(false, std::memory_order_relaxed);
+    }
+  });
+  return valid;
 }
 
 // Takes memory that no backward pass waits for.
@@ -125,6 +153,7 @@ void Renderer::start_frame(const Camera& camera) {
   frame_ = found == frames_.end() ? frames_.emplace_back(std::make_shared<Frame>()) : *found;
   frame_->camera = camera;
   frame_->kept = false;
+  lap();
 }
 
 void Renderer::project(
@@ -140,6 +169,7 @@ void Renderer::project(
     frame.chunk_counts[chunk] = project(begin, std::min(count, begin + kChunkSize),
                                         frame.splats.data() + begin, depth_bits_.data() + begin);
   });
+  seconds_.project = lap();
 }
 
 // Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
@@ -150,11 +180,15 @@ void Renderer::bin(BinKernel kernel, int tiles_x, int tiles_y, bool keep) {
   const size_t tasks = pool_.threads() == 1 ? 1 : 2 * static_cast<size_t>(pool_.threads());
   const size_t visible = order_.size();
   bin_tasks_.resize(tasks);
+  if (keep) frame.ranges.resize(frame.splats.size());
   pool_.for_each(tasks, [&](size_t t) {
     BinTask& task = bin_tasks_[t];
     task.tile_counts.assign(tiles, 0);
     task.count = 0;
     const size_t end = visible * (t + 1) / tasks;
+    if (keep) {
+      for (size_t i = visible * t / tasks; i < end; ++i) frame.ranges[order_[i]] = {0, 0};
+    }
     for (size_t i = visible * t / tasks; i < end;) {
       i = kernel(frame.splats.data(), order_.data(), i, end, tiles_x, tiles_y, task.pairs.data(),
                  task.pairs.size(), &task.count, task.tile_counts.data());
@@ -176,8 +210,6 @@ void Renderer::bin(BinKernel kernel, int tiles_x, int tiles_y, bool keep) {
   frame.pairs.resize(sum);
   if (keep) {
     frame.slots.resize(sum);
-    frame.ranges.resize(frame.splats.size());
-    for (const uint32_t splat : order_) frame.ranges[splat] = {0, 0};
     uint32_t first = 0;
     for (BinTask& task : bin_tasks_) {
       task.first_slot = first;
@@ -198,20 +230,23 @@ void Renderer::bin(BinKernel kernel, int tiles_x, int tiles_y, bool keep) {
       range.end = k + 1;
     }
   });
+  seconds_.bin = lap();
 }
 
 void Renderer::sort() {
   const Frame& frame = *frame_;
-  items_.clear();
-  for (size_t chunk = 0; chunk < frame.chunk_counts.size(); ++chunk) {
+  const std::vector<size_t> starts = frame.chunk_starts();
+  items_.resize(frame.splat_count());
+  pool_.for_each(starts.size(), [&](size_t chunk) {
     const size_t first = chunk * kChunkSize;
-    for (size_t i = first; i < first + frame.chunk_counts[chunk]; ++i) {
-      items_.push_back({depth_bits_[i], static_cast<uint32_t>(i)});
+    for (size_t i = 0; i < frame.chunk_counts[chunk]; ++i) {
+      items_[starts[chunk] + i] = {depth_bits_[first + i], static_cast<uint32_t>(first + i)};
     }
-  }
+  });
   radix_sort(items_, sort_scratch_);
   order_.resize(items_.size());
   for (size_t i = 0; i < items_.size(); ++i) order_[i] = items_[i].value;
+  seconds_.sort = lap();
 }
 
 RasterInput Renderer::raster_input(const Frame& frame) const {
@@ -252,6 +287,7 @@ void Renderer::finish(const Image& image, bool keep) {
     input.stages_done = frame.stages_done.data();
   }
   pool_.for_each(tiles, [&](size_t tile) { kernels_.raster_tile(input, static_cast<int>(tile)); });
+  seconds_.raster = lap();
 }
 
 }  // namespace flysplat

@@ -1,4 +1,5 @@
 // The backward half of Renderer.
+#include <algorithm>
 #include <atomic>
 #include <memory>
 
@@ -17,15 +18,9 @@ Scratch* thread_scratch() {
   return scratch.get();
 }
 
-// Where each chunk's splats start in the order of the input.
-std::vector<size_t> chunk_starts(const Frame& frame) {
-  std::vector<size_t> starts(frame.chunk_counts.size());
-  size_t sum = 0;
-  for (size_t chunk = 0; chunk < starts.size(); ++chunk) {
-    starts[chunk] = sum;
-    sum += frame.chunk_counts[chunk];
-  }
-  return starts;
+// Rows [begin, end) of an array of `columns`.
+void zero_rows(float* values, size_t columns, size_t begin, size_t end) {
+  std::fill(values + columns * begin, values + columns * end, 0.0f);
 }
 
 }  // namespace
@@ -33,34 +28,52 @@ std::vector<size_t> chunk_starts(const Frame& frame) {
 // Every pair has a place of its own to write to, and a splat's pairs are added in the order of the
 // tiles: the sums do not depend on the threads.
 size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
-                                 SplatGradient* gradients) {
+                                 SplatGradient* gradients, float* means2d) {
   std::atomic<size_t> composited{0};
   RasterInput input = raster_input(frame);
   input.later_stages = frame.later_stages.data();
   input.transmittance = const_cast<float*>(frame.transmittance.data());
   input.stages_done = const_cast<uint32_t*>(frame.stages_done.data());
+  lap();
   if (pair_gradients_.size() < frame.pairs.size()) pair_gradients_.resize(frame.pairs.size());
   pool_.for_each(frame.stages_done.size(), [&](size_t tile) {
     composited += kernels_.raster_tile_backward(input, image, static_cast<int>(tile),
                                                 thread_scratch(), pair_gradients_.data());
   });
-  const std::vector<size_t> starts = chunk_starts(frame);
+  seconds_.raster_backward = lap();
+  const std::vector<size_t> starts = frame.chunk_starts();
   pool_.for_each(starts.size(), [&](size_t chunk) {
     const size_t first = chunk * kChunkSize;
     kernels_.gather_gradients(frame.splats.data() + first, frame.chunk_counts[chunk],
                               frame.ranges.data() + first, frame.slots.data(),
                               pair_gradients_.data(), gradients + starts[chunk]);
+    for (size_t i = starts[chunk]; i < starts[chunk] + frame.chunk_counts[chunk]; ++i) {
+      std::copy_n(gradients[i].mean, 2, means2d + 2 * i);
+    }
   });
+  seconds_.gather = lap();
   return composited;
 }
 
+// A chunk's splats come from the chunk's Gaussians, so each task owns the rows it writes.
 PoseSums Renderer::project_backward(const Frame& frame, const GaussianArrays& gaussians,
                                     const SplatGradient* gradients, const float* means2d,
                                     const GaussianGradients& out) {
-  const std::vector<size_t> starts = chunk_starts(frame);
+  lap();
+  const std::vector<size_t> starts = frame.chunk_starts();
   std::vector<PoseSums> sums(starts.size());
+  const size_t color_columns = 3 * static_cast<size_t>(gaussians.sh_coefficients);
   pool_.for_each(starts.size(), [&](size_t chunk) {
-    kernels_.project_backward(gaussians, frame.camera, frame.splats.data() + chunk * kChunkSize,
+    const size_t begin = chunk * kChunkSize;
+    const size_t end = std::min(gaussians.count, begin + kChunkSize);
+    if (out.overwrite) {
+      zero_rows(out.means, 3, begin, end);
+      zero_rows(out.quats, 4, begin, end);
+      zero_rows(out.scales, 3, begin, end);
+      zero_rows(out.opacities, 1, begin, end);
+    }
+    if (out.overwrite_colors) zero_rows(out.colors, color_columns, begin, end);
+    kernels_.project_backward(gaussians, frame.camera, frame.splats.data() + begin,
                               frame.chunk_counts[chunk], gradients + starts[chunk],
                               means2d + 2 * starts[chunk], out, &sums[chunk]);
   });
@@ -68,6 +81,7 @@ PoseSums Renderer::project_backward(const Frame& frame, const GaussianArrays& ga
   for (const PoseSums& part : sums) {
     for (size_t i = 0; i < std::size(total.values); ++i) total.values[i] += part.values[i];
   }
+  seconds_.project_backward = lap();
   return total;
 }
 

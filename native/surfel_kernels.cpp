@@ -9,7 +9,7 @@ namespace FLYSPLAT_LEVEL {
 #define FS_STRING_OF(name) #name
 #define FS_STRING(name) FS_STRING_OF(name)
 static const SurfelKernels kSurfelTable = {
-    FS_STRING(FLYSPLAT_LEVEL), project_surfels,         bin_surfels,
+    FS_STRING(FLYSPLAT_LEVEL), project_surfels,         bin_footprints<SurfelFootprint>,
     raster_surfels,            raster_surfels_backward, project_surfels_backward};
 
 }  // namespace FLYSPLAT_LEVEL

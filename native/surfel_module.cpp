@@ -51,7 +51,7 @@ void render(SurfelRenderer& renderer, Means means, Quats quats, Means scales,
 }
 
 // Adds to the arrays of gradients; returns that of the camera as (5, 3): R, t and the centre.
-nb::ndarray<nb::numpy, double, nb::ndim<2>> backward(
+nb::ndarray<nb::numpy, double> backward(
     SurfelRenderer& renderer, Means means, Quats quats, Means scales,
     Opacities opacities, Colors colors, int sh_degree, ConstPlane color,
     ConstPlane normal, ConstPlane depth, ConstPlane alpha, ConstPlane median, ConstPlane distort,
@@ -62,8 +62,8 @@ nb::ndarray<nb::numpy, double, nb::ndim<2>> backward(
               by_scales.size() == scales.size() && by_opacities.size() == opacities.size() &&
               by_colors.size() == colors.size(),
           "arrays of gradients have the wrong shape");
-  auto* values = new double[15];
-  nb::capsule owner(values, [](void* v) noexcept { delete[] static_cast<double*>(v); });
+  const auto by_camera_rows = new_array<double>({5, 3});
+  double* values = by_camera_rows.data();
   {
     const nb::gil_scoped_release release;
     const std::scoped_lock lock(renderer.mutex());
@@ -82,7 +82,7 @@ nb::ndarray<nb::numpy, double, nb::ndim<2>> backward(
     std::copy_n(by_camera.t, 3, values + 9);
     std::copy_n(by_camera.centre, 3, values + 12);
   }
-  return nb::ndarray<nb::numpy, double, nb::ndim<2>>(values, {5, 3}, owner);
+  return by_camera_rows;
 }
 
 // ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of the last
@@ -90,32 +90,22 @@ nb::ndarray<nb::numpy, double, nb::ndim<2>> backward(
 nb::tuple projected(SurfelRenderer& renderer) {
   const std::scoped_lock lock(renderer.mutex());
   const size_t n = renderer.splat_count();
-  auto* values = new float[8 * n];
-  auto* ids = new int64_t[n];
-  nb::capsule value_owner(values, [](void* p) noexcept { delete[] static_cast<float*>(p); });
-  nb::capsule id_owner(ids, [](void* p) noexcept { delete[] static_cast<int64_t*>(p); });
-  float *radii = values, *means = values + 2 * n, *depths = values + 4 * n;
-  float* normals = values + 5 * n;
-  size_t i = 0;
-  renderer.for_each_surfel([&](const Splat& bounds, const Surfel& s) {
-    ids[i] = bounds.index;
+  const auto ids = new_array<int64_t>({n});
+  const auto radii = new_array<int32_t>({n, 2});
+  const auto means = new_array<float>({n, 2}), normals = new_array<float>({n, 3});
+  const auto depths = new_array<float>({n});
+  renderer.for_each_surfel([&](size_t i, const Splat& bounds, const Surfel& s) {
+    ids.data()[i] = bounds.index;
     const float radius = disc_of(bounds).radius;
     const float reach_x = std::abs(bounds.mean_x - s.mean[0]) + bounds.extent_x;
     const float reach_y = std::abs(bounds.mean_y - s.mean[1]) + bounds.extent_y;
-    radii[2 * i] = std::ceil(std::max(reach_x, radius));
-    radii[2 * i + 1] = std::ceil(std::max(reach_y, radius));
-    std::copy_n(s.mean, 2, means + 2 * i);
-    depths[i] = s.depth;
-    std::copy_n(s.normal, 3, normals + 3 * i);
-    ++i;
+    radii.data()[2 * i] = radius_of(std::max(reach_x, radius));
+    radii.data()[2 * i + 1] = radius_of(std::max(reach_y, radius));
+    std::copy_n(s.mean, 2, means.data() + 2 * i);
+    depths.data()[i] = s.depth;
+    std::copy_n(s.normal, 3, normals.data() + 3 * i);
   });
-  const auto matrix = [&](float* data, size_t columns) {
-    return nb::ndarray<nb::numpy, float, nb::ndim<2>>(data, {n, columns}, value_owner);
-  };
-  return nb::make_tuple(nb::ndarray<nb::numpy, int64_t, nb::ndim<1>>(ids, {n}, id_owner),
-                        matrix(radii, 2), matrix(means, 2),
-                        nb::ndarray<nb::numpy, float, nb::ndim<1>>(depths, {n}, value_owner),
-                        matrix(normals, 3));
+  return nb::make_tuple(ids, radii, means, depths, normals);
 }
 
 }  // namespace

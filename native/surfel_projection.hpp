@@ -153,27 +153,6 @@ inline size_t cull_surfels(const GaussianArrays& g, const Camera& camera, size_t
   return count;
 }
 
-// Sixteen Gaussians of the input, gathered.
-struct SurfelInput {
-  Vector16 p_W;
-  F16 q[4], scale[2], opacity;
-};
-
-FS_INLINE SurfelInput gather_surfels(const GaussianArrays& g, const uint32_t* indices) {
-  alignas(64) float soa[10][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const size_t i = indices[lane];
-    for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * i + axis];
-    for (int k = 0; k < 4; ++k) soa[3 + k][lane] = g.quats[4 * i + k];
-    for (int k = 0; k < 2; ++k) soa[7 + k][lane] = g.scales[3 * i + k];
-    soa[9][lane] = g.opacities[i];
-  }
-  return {{load(soa[0]), load(soa[1]), load(soa[2])},
-          {load(soa[3]), load(soa[4]), load(soa[5]), load(soa[6])},
-          {load(soa[7]), load(soa[8])},
-          load(soa[9])};
-}
-
 inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, size_t begin,
                               size_t end, Splat* bounds, Surfel* surfels, uint32_t* depth_bits) {
   uint32_t candidates[kChunkSize + kLanes];
@@ -183,10 +162,10 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
   size_t count = 0;
   for (size_t first = 0; first < candidate_count; first += kLanes) {
     const uint32_t* indices = candidates + first;
-    const SurfelInput in = gather_surfels(g, indices);
-    const Vector16 d_W = from_centre(camera, in.p_W.x, in.p_W.y, in.p_W.z);
+    const GatheredGaussians in = gather_gaussians(g, indices);
+    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
     Vector16 t_W[3];
-    surfel_axes(in.q, t_W);
+    surfel_axes(in.quat, t_W);
     const SurfelPlane s = surfel_plane(camera, to_camera(camera, d_W), t_W, in.scale);
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
     SplatPack pack;

@@ -1,7 +1,7 @@
 // From gradients of surfels to those of the input and of the camera.
 #pragma once
 
-#include "sh_slope.hpp"
+#include "color_backward.hpp"
 #include "surfel_projection.hpp"
 
 namespace flysplat::FLYSPLAT_LEVEL {
@@ -95,49 +95,6 @@ FS_INLINE double masked_sum(const F16& a, uint32_t bits) {
   return total;
 }
 
-// Adds the gradients of colours, or of their coefficients, to rows of `out`; returns that of the
-// direction from the camera, which is zero without spherical harmonics.
-FS_INLINE Vector16 color_gradient(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
-                                  const Vector16& d_W, const F16 by_color[3], float* out) {
-  const F16 zero = F16(0.0f);
-  Vector16 by_direction = {zero, zero, zero};
-  const int used = g.sh_degree < 0 ? 1 : (g.sh_degree + 1) * (g.sh_degree + 1);
-  const size_t stride = 3 * static_cast<size_t>(g.sh_degree < 0 ? 1 : g.sh_coefficients);
-  F16 by[3] = {by_color[0], by_color[1], by_color[2]};
-  F16 basis[16] = {F16(1.0f)};
-  if (g.sh_degree >= 0) {
-    alignas(64) float soa[3 * 16][kLanes];
-    for (int k = 0; k < 3 * used; ++k) store(soa[k], zero);
-    for (uint32_t rest = bits; rest; rest &= rest - 1) {
-      const int lane = __builtin_ctz(rest);
-      const float* row = g.colors + stride * indices[lane];
-      for (int k = 0; k < 3 * used; ++k) soa[k][lane] = row[k];
-    }
-    // Colours held at zero do not follow their coefficients.
-    F16 color[3];
-    evaluate_sh(g.sh_degree, soa[0], d_W.x, d_W.y, d_W.z, color);
-    for (int c = 0; c < 3; ++c) by[c] = zero_unless(color[c] > zero, by[c]);
-    Vector16 slope[16];
-    sh_basis_and_slope(g.sh_degree, d_W, basis, slope);
-    for (int k = 1; k < used; ++k) {
-      F16 along = zero;
-      for (int c = 0; c < 3; ++c) along += by[c] * load(soa[3 * k + c]);
-      by_direction = sum(by_direction, scaled(slope[k], along));
-    }
-  }
-  alignas(64) float terms[3][kLanes], values[16][kLanes];
-  for (int c = 0; c < 3; ++c) store(terms[c], by[c]);
-  for (int k = 0; k < used; ++k) store(values[k], basis[k]);
-  for (; bits; bits &= bits - 1) {
-    const int lane = __builtin_ctz(bits);
-    float* row = out + stride * indices[lane];
-    for (int k = 0; k < used; ++k) {
-      for (int c = 0; c < 3; ++c) row[3 * k + c] += values[k][lane] * terms[c][lane];
-    }
-  }
-  return by_direction;
-}
-
 inline void project_surfels_backward(const GaussianArrays& input, const Camera& camera,
                                      const uint32_t* all_indices, const SurfelGradient* gradients,
                                      size_t count, const InputGradients& out,
@@ -157,10 +114,10 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     F16 g[16];
     for (int f = 0; f < 16; ++f) g[f] = load(soa[f]);
 
-    const SurfelInput in = gather_surfels(input, indices);
-    const Vector16 d_W = from_centre(camera, in.p_W.x, in.p_W.y, in.p_W.z);
+    const GatheredGaussians in = gather_gaussians(input, indices);
+    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
     Vector16 t_W[3];
-    surfel_axes(in.q, t_W);
+    surfel_axes(in.quat, t_W);
     const SurfelPlane s = surfel_plane(camera, to_camera(camera, d_W), t_W, in.scale);
     const PlaneGradient by = plane_gradient(camera, s, in.scale, g);
 
@@ -169,14 +126,20 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     const Vector16 by_normal = {towards * g[13], towards * g[14], towards * g[15]};
     const Vector16 by_t0 = sum(to_world(camera, by.t[0]), cross(t_W[1], by_normal));
     const Vector16 by_t1 = sum(to_world(camera, by.t[1]), cross(by_normal, t_W[0]));
-    const F16 by_color[3] = {g[10], g[11], g[12]};
+    F16 by_color[3] = {g[10], g[11], g[12]};
+    if (input.sh_degree >= 0) {
+      // Colours held at zero do not follow their coefficients.
+      F16 color[3];
+      gather_colors(input, indices, bits, d_W, color);
+      for (int c = 0; c < 3; ++c) by_color[c] = zero_unless(color[c] > zero, by_color[c]);
+    }
     const Vector16 by_d =
-        color_gradient(input, indices, bits, d_W, by_color, out.colors);
+        colors_backward(input, indices, static_cast<int>(lanes), d_W, by_color, out.colors);
     const Vector16 by_p = sum(to_world(camera, by.p), by_d);
 
     F16 rows[10] = {by_p.x, by_p.y, by_p.z, zero, zero, zero, zero, by.scale[0], by.scale[1],
                     g[9] / max(in.opacity, F16(1e-30f))};
-    quaternion_gradient(in.q, by_t0, by_t1, rows + 3);
+    quaternion_gradient(in.quat, by_t0, by_t1, rows + 3);
     alignas(64) float fields[10][kLanes];
     for (int f = 0; f < 10; ++f) store(fields[f], rows[f]);
     for (size_t lane = 0; lane < lanes; ++lane) {
@@ -189,7 +152,7 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
 
     if (!by_camera) continue;
     // p_C = R p_W + t and t_C = R t_W.
-    const F16 p_W[3] = {in.p_W.x, in.p_W.y, in.p_W.z};
+    const F16 p_W[3] = {in.mean.x, in.mean.y, in.mean.z};
     const F16 t0_W[3] = {t_W[0].x, t_W[0].y, t_W[0].z}, t1_W[3] = {t_W[1].x, t_W[1].y, t_W[1].z};
     const F16 by_p_C[3] = {by.p.x, by.p.y, by.p.z};
     const F16 by_t0_C[3] = {by.t[0].x, by.t[0].y, by.t[0].z};

@@ -190,7 +190,7 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
     write_surfel_block(out, s, in.width, in.height, left + kBlockSize * (b % 4),
                        top + kBlockSize * (b / 4));
     if constexpr (kRecord) {
-      BlockRecord& record = in.records[kBlocksPerTile * tile + b];
+      SurfelBlockRecord& record = in.records[kBlocksPerTile * tile + b];
       store(record.transmittance, s.last_transmittance);
       store(record.passed, s.passed);
       store(record.median, s.median_index);

@@ -17,7 +17,7 @@ struct BackwardBlock {
 
 FS_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
                                        const SurfelImages<const float>& g,
-                                       const BlockRecord& record, int left, int top) {
+                                       const SurfelBlockRecord& record, int left, int top) {
   alignas(64) float lanes[10][kLanes] = {};
   for_each_pixel(in.width, in.height, left, top, [&](int lane, size_t pixel) {
     for (int c = 0; c < 3; ++c) {
@@ -118,7 +118,7 @@ void raster_surfels_backward_of(const SurfelRasterInput& in, const SurfelImages<
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const int x = left + kBlockSize * (b % 4), y = top + kBlockSize * (b / 4);
     if (x >= in.width || y >= in.height) continue;
-    const BlockRecord& record = in.records[kBlocksPerTile * tile + b];
+    const SurfelBlockRecord& record = in.records[kBlocksPerTile * tile + b];
     blocks[b] = backward_block(in, g, record, x, y);
     for (int i = 0; i < kLanes; ++i) {
       if (record.passed[i] > passed[b]) passed[b] = record.passed[i];

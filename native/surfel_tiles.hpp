@@ -16,46 +16,28 @@ FS_INLINE uint32_t blocks_of_disc(const Disc& disc, const BlockGrid& grid, float
   return lane_bits(x * x + y * y <= F16(disc.radius * disc.radius));
 }
 
-inline size_t bin_surfels(const Splat* bounds, const uint32_t* order, size_t begin, size_t end,
-                          int tiles_x, int tiles_y, TilePair* pairs, size_t capacity,
-                          size_t* pair_count, uint32_t* tile_counts) {
-  const BlockGrid grid = block_grid();
-  size_t count = *pair_count;
-  size_t i = begin;
-  for (; i < end; ++i) {
-    if (i + kPrefetchAhead < end) __builtin_prefetch(bounds + order[i + kPrefetchAhead]);
-    const Splat& s = bounds[order[i]];
-    // A little more, here and below, so that rounding never hides a pixel.
-    Disc disc = disc_of(s);
-    disc.radius = disc.radius * 1.0001f + 1e-3f;
-    const TileRange disc_columns = tile_range(disc.x, disc.radius, tiles_x);
-    const TileRange disc_rows = tile_range(disc.y, disc.radius, tiles_y);
-    TileRange columns = tile_range(s.mean_x, s.extent_x, tiles_x);
-    TileRange rows = tile_range(s.mean_y, s.extent_y, tiles_y);
-    if (disc_columns.first < columns.first) columns.first = disc_columns.first;
-    if (disc_columns.last > columns.last) columns.last = disc_columns.last;
-    if (disc_rows.first < rows.first) rows.first = disc_rows.first;
-    if (disc_rows.last > rows.last) rows.last = disc_rows.last;
-    if (columns.last < columns.first || rows.last < rows.first) continue;
-    const size_t most = static_cast<size_t>(columns.last - columns.first + 1) *
-                        static_cast<size_t>(rows.last - rows.first + 1);
-    if (count + most > capacity) break;
-    const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
-    for (int row = rows.first; row <= rows.last; ++row) {
-      for (int column = columns.first; column <= columns.last; ++column) {
-        const float left = static_cast<float>(column * kTileSize);
-        const float top = static_cast<float>(row * kTileSize);
-        const uint32_t blocks = touched_blocks(s, grid, left, top, budget) |
-                                blocks_of_disc(disc, grid, left, top);
-        const uint32_t tile = static_cast<uint32_t>(row * tiles_x + column);
-        pairs[count] = {tile, {order[i], blocks}};
-        count += blocks != 0;
-        tile_counts[tile] += blocks != 0;
-      }
-    }
-  }
-  *pair_count = count;
-  return i;
+FS_INLINE TileRange united(const TileRange& a, const TileRange& b) {
+  return {a.first < b.first ? a.first : b.first, a.last > b.last ? a.last : b.last};
 }
+
+// The ellipse's blocks and the disc's.
+struct SurfelFootprint {
+  // A little more, so that rounding never hides a pixel.
+  static FS_INLINE Disc disc(const Splat& s) {
+    const Disc d = disc_of(s);
+    return {d.x, d.y, d.radius * 1.0001f + 1e-3f};
+  }
+  static FS_INLINE TileRange columns(const Splat& s, int tiles) {
+    const Disc d = disc(s);
+    return united(SplatFootprint::columns(s, tiles), tile_range(d.x, d.radius, tiles));
+  }
+  static FS_INLINE TileRange rows(const Splat& s, int tiles) {
+    const Disc d = disc(s);
+    return united(SplatFootprint::rows(s, tiles), tile_range(d.y, d.radius, tiles));
+  }
+  static FS_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
+    return SplatFootprint::blocks(s, grid, left, top) | blocks_of_disc(disc(s), grid, left, top);
+  }
+};
 
 }  // namespace flysplat::FLYSPLAT_LEVEL

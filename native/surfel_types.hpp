@@ -51,7 +51,7 @@ struct SurfelImages {
 // What the backward pass needs of a block of 16 pixels: the transmittance behind the last surfel
 // drawn, how many of the tile's surfels were passed before the pixel was full, which of them gave
 // the median depth (-1: none), and the sums of weights and of weighted depths.
-struct alignas(64) BlockRecord {
+struct alignas(64) SurfelBlockRecord {
   float transmittance[16], passed[16], median[16], alpha[16], depth[16];
 };
 
@@ -61,7 +61,7 @@ struct SurfelRasterInput {
   const uint32_t* tile_offsets;  // (tiles + 1,)
   int width, height, tiles_x;
   float near_plane;              // rays that meet a surfel nearer than this miss it [m]
-  BlockRecord* records;          // (tiles, 16), null when no backward pass follows
+  SurfelBlockRecord* records;          // (tiles, 16), null when no backward pass follows
 };
 
 // Derivatives of the loss, summed over the pixels of a tile, with respect to fields of a Surfel

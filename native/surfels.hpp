@@ -18,16 +18,12 @@ class SurfelRenderer : public Renderer {
   // Adds gradients of the last frame, of which `gaussians` must be the ones.
   CameraGradient backward(const GaussianArrays& gaussians,
                           const SurfelImages<const float>& gradients, const InputGradients& out);
-  // Visits the surfels of the last frame in the order of the input.
+  // As Renderer::for_each_splat: visit(i, bounds, surfel).
   template <typename Visit>
-  void for_each_surfel(const Visit& visit) const {
-    if (!frame_) return;
-    for (size_t chunk = 0; chunk < frame_->chunk_counts.size(); ++chunk) {
-      const size_t first = chunk * kChunkSize;
-      for (size_t i = first; i < first + frame_->chunk_counts[chunk]; ++i) {
-        visit(frame_->splats[i], surfels_[i]);
-      }
-    }
+  void for_each_surfel(const Visit& visit) {
+    for_each_splat([&](size_t i, const Splat& bounds) {
+      visit(i, bounds, surfels_[static_cast<size_t>(&bounds - frame_->splats.data())]);
+    });
   }
 
  private:
@@ -36,7 +32,7 @@ class SurfelRenderer : public Renderer {
   const SurfelKernels& surfel_kernels_;
   bool recorded_ = false;
   std::vector<Surfel> surfels_;
-  std::vector<BlockRecord> records_;
+  std::vector<SurfelBlockRecord> records_;
   std::vector<uint32_t> pair_offsets_, pair_slots_;
   std::vector<SurfelGradient> pair_gradients_, surfel_gradients_;
 };

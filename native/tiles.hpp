@@ -53,28 +53,42 @@ FS_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float t
   return lane_bits(min(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2) <= F16(budget));
 }
 
-inline size_t bin_splats(const Splat* splats, const uint32_t* order, size_t begin, size_t end,
-                         int tiles_x, int tiles_y, TilePair* pairs, size_t capacity,
-                         size_t* pair_count, uint32_t* tile_counts) {
+// Which tiles to look at, and which blocks of one of them a splat touches.
+struct SplatFootprint {
+  static FS_INLINE TileRange columns(const Splat& s, int tiles) {
+    return tile_range(s.mean_x, s.extent_x, tiles);
+  }
+  static FS_INLINE TileRange rows(const Splat& s, int tiles) {
+    return tile_range(s.mean_y, s.extent_y, tiles);
+  }
+  static FS_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
+    // A little more than log2(255 o), so that rounding here never hides a pixel.
+    const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
+    return touched_blocks(s, grid, left, top, budget);
+  }
+};
+
+// A BinKernel.
+template <typename Footprint>
+size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, size_t end,
+                      int tiles_x, int tiles_y, TilePair* pairs, size_t capacity,
+                      size_t* pair_count, uint32_t* tile_counts) {
   const BlockGrid grid = block_grid();
   size_t count = *pair_count;
   size_t i = begin;
   for (; i < end; ++i) {
     if (i + kPrefetchAhead < end) __builtin_prefetch(splats + order[i + kPrefetchAhead]);
     const Splat& s = splats[order[i]];
-    const TileRange columns = tile_range(s.mean_x, s.extent_x, tiles_x);
-    const TileRange rows = tile_range(s.mean_y, s.extent_y, tiles_y);
+    const TileRange columns = Footprint::columns(s, tiles_x), rows = Footprint::rows(s, tiles_y);
     if (columns.last < columns.first || rows.last < rows.first) continue;
     const size_t most = static_cast<size_t>(columns.last - columns.first + 1) *
                         static_cast<size_t>(rows.last - rows.first + 1);
     if (count + most > capacity) break;
-    // A little more than log2(255 o), so that rounding here never hides a pixel.
-    const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
     for (int row = rows.first; row <= rows.last; ++row) {
       for (int column = columns.first; column <= columns.last; ++column) {
         const uint32_t blocks =
-            touched_blocks(s, grid, static_cast<float>(column * kTileSize),
-                           static_cast<float>(row * kTileSize), budget);
+            Footprint::blocks(s, grid, static_cast<float>(column * kTileSize),
+                              static_cast<float>(row * kTileSize));
         const uint32_t tile = static_cast<uint32_t>(row * tiles_x + column);
         pairs[count] = {tile, {order[i], blocks}};
         count += blocks != 0;

@@ -13,6 +13,7 @@ constexpr int kBlocksPerTile = 16;   // 4 x 4, one bit each of Pair::blocks
 constexpr int kStageSize = 256;      // splats of a tile held at a time
 constexpr int kChunkSize = 2048;     // Gaussians projected by one task
 constexpr int kPrefetchAhead = 8;    // splats are read in an order that caches cannot guess
+constexpr float kMinSquaredNorm = 1e-30f, kMaxSquaredNorm = 1e30f;  // of quaternions
 constexpr int kBoundSize = 64;       // baked Gaussians that share one bounding box
 
 constexpr float kAlphaCut = 1.0f / 255.0f;
@@ -149,6 +150,8 @@ struct GaussianGradients {
   float* scales;
   float* opacities;
   float* colors;
+  // Whether rows, or those of colours, are to be written, zeros included, instead of added to.
+  bool overwrite, overwrite_colors;
 };
 
 // dL/dR_CW with the centre held (9, row-major), dL/dp_C (3) and dL/d(p_W - centre) by way of
@@ -188,12 +191,16 @@ struct Kernels {
   // Adds up the pairs of `count` splats.
   void (*gather_gradients)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
                            const PairGradient*, SplatGradient*);
-  // From `count` splats to the Gaussians they came from; `means2d` (count, 2) replaces mean.
+  // From `count` splats to the Gaussians they came from; `means2d` (count, 2) replaces mean. Adds.
   void (*project_backward)(const GaussianArrays&, const Camera&, const Splat*, size_t count,
                            const SplatGradient*, const float* means2d, const GaussianGradients&,
                            PoseSums*);
   // Index of the first value that is NaN or infinite, or count.
   size_t (*first_nonfinite)(const float*, size_t count);
+  // Whether low <= value <= high for all; NaN is not.
+  bool (*all_within)(const float*, size_t count, float low, float high);
+  // Whether all quaternions (count, 4) are long and short enough to be normalised.
+  bool (*all_normalisable)(const float* quats, size_t count);
   // kFmaChains independent products and sums of packs, `rounds` times: what the machine can do.
   float (*multiply_add)(size_t rounds);
 };

@@ -10,7 +10,13 @@ from torch import Tensor
 
 from flysplat import _native
 from flysplat.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
-from flysplat.systems.splats.rasterization_autograd import Composite, Project, Views, to_numpy
+from flysplat.systems.splats.rasterization_autograd import (
+    Composite,
+    Project,
+    Views,
+    joined,
+    to_numpy,
+)
 from flysplat.systems.splats.rasterization_checks import check_shapes, check_values
 from flysplat.systems.splats.rasterization_unscented import (
     RADIAL_COUNTS,
@@ -205,23 +211,23 @@ def rasterize(
         image, alpha = Composite.apply(views, means2d, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
     else:
         image, alpha = views.render(arrays, keep=False)
-        means2d = torch.from_numpy(np.concatenate([p[2] for p in views.projected]))
-    return image, alpha, _meta(views, means2d, opacities.detach())
+        means2d = views.means2d()
+    return image, alpha, _meta(views, means2d)
 
 
-def _meta(views: Views, means2d: Tensor, opacities: Tensor) -> dict[str, Any]:
-    ids, radii, _, depths, conics, compensated = (
-        torch.from_numpy(np.concatenate(parts)) for parts in zip(*views.projected, strict=True)
+def _meta(views: Views, means2d: Tensor) -> dict[str, Any]:
+    ids, radii, _, depths, conics, opacities = (
+        joined(parts) for parts in zip(*views.projected, strict=True)
     )
     counts = torch.tensor([len(p[0]) for p in views.projected])
     return {
         "camera_ids": torch.repeat_interleave(torch.arange(len(counts)), counts),
         "gaussian_ids": ids,
-        "radii": radii.int(),
+        "radii": radii,
         "means2d": means2d,
         "depths": depths,
         "conics": conics,
-        "opacities": compensated if views.antialiased else opacities[ids],
+        "opacities": opacities,
         "width": views.width,
         "height": views.height,
         "tile_size": TILE_SIZE,

@@ -5,6 +5,7 @@
 are the gradient of an ordinary intermediate tensor.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -74,7 +75,8 @@ class Views:
                 alpha[c].numpy(),
                 keep,
             )
-            self.projected.append(self.renderer.projected())
+            given = None if self.antialiased else gaussians["opacities"]
+            self.projected.append(self.renderer.projected(given))
             if keep:
                 self.frames.append(_native.kept_frame(self.renderer))
         return image, alpha
@@ -89,6 +91,10 @@ class Views:
         rows = colors[camera] if self.per_camera_colors else colors
         return rows if self.sh_degree is not None else rows[:, None, :]
 
+    def means2d(self) -> Tensor:
+        """(M, 2) [px] of the visible pairs."""
+        return joined([of_camera[2] for of_camera in self.projected])
+
     def splats_of(self) -> list[slice]:
         """Which rows of the M visible pairs belong to each camera."""
         ends = np.cumsum([0] + [frame.splat_count for frame in self.frames])
@@ -99,6 +105,10 @@ def to_numpy(tensor: Tensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
+def joined(parts: Sequence[NDArray]) -> Tensor:
+    return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts))
+
+
 class Project(torch.autograd.Function):
     """(means, quats, scales, opacities, colors, viewmats) -> means2d (M, 2) [px]."""
 
@@ -107,15 +117,17 @@ class Project(torch.autograd.Function):
         ctx.views = views
         ctx.save_for_backward(*inputs)
         views.rendered = views.render(_scene(inputs), keep=True)
-        return torch.from_numpy(np.concatenate([p[2] for p in views.projected]))
+        return views.means2d()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_means2d: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         views: Views = ctx.views
         inputs = ctx.saved_tensors
-        *scene_gradients, v_viewmats = [torch.zeros_like(t, memory_format=torch.contiguous_format)
-                                        for t in inputs]  # fmt: skip
+        *scene_gradients, v_viewmats = [
+            torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs
+        ]
+        v_viewmats.zero_()
         scene, gradients = _scene(inputs), _scene(scene_gradients)
         v_means2d = v_means2d.contiguous()
         v_splats, views.splat_gradients = views.splat_gradients, None
@@ -129,6 +141,8 @@ class Project(torch.autograd.Function):
                 v_splats[rows].numpy(),
                 v_means2d[rows].numpy(),
                 *views.scene_arguments(gradients, c)[:5],
+                c == 0,
+                c == 0 or views.per_camera_colors,
             )
             v_viewmats[c, :3] = torch.from_numpy(_pose_gradient(np.array(sums), views.poses[c]))
         return None, *scene_gradients, v_viewmats
@@ -156,6 +170,7 @@ class Composite(torch.autograd.Function):
         v_means2d = v_backgrounds = None
         if ctx.needs_input_grad[1]:
             v_splats = torch.empty(len(means2d), SPLAT_GRADIENT)
+            v_means2d = torch.empty(len(means2d), 2)
             for c, rows in enumerate(views.splats_of()):
                 _native.raster_backward(
                     views.renderer,
@@ -168,9 +183,9 @@ class Composite(torch.autograd.Function):
                     views.expected_depth,
                     views.absgrad,
                     v_splats[rows].numpy(),
+                    v_means2d[rows].numpy(),
                 )
             views.splat_gradients = v_splats
-            v_means2d = v_splats[:, :2].clone()
             if views.absgrad:
                 means2d.absgrad = v_splats[:, 2:4].clone()
         if ctx.needs_input_grad[2] and views.channels > 1:

@@ -6,6 +6,8 @@ from torch import Tensor
 
 from flysplat import _native
 
+SCENE = ("means", "quats", "scales", "opacities", "colors")
+
 
 def check_shapes(
     tensors: dict[str, Tensor], sh_degree: int | None, radial_counts: tuple[int, ...] = ()
@@ -54,12 +56,36 @@ def check_shapes(
         )
 
 
-def check_values(arrays: dict[str, np.ndarray], renderer: _native.Renderer) -> None:
-    """Raises ValueError for values that cannot be rendered, naming tensor, index and remedy."""
+def check_values(
+    arrays: dict[str, np.ndarray], renderer: _native.Renderer, scale_axes: int = 3
+) -> None:
+    """Raises ValueError for values that cannot be rendered, naming tensor, index and remedy.
+
+    Of scales, the first `scale_axes` matter.
+    """
+    scene = [arrays[name] for name in SCENE]
+    fine = _native.scene_is_valid(renderer, *scene[:4], scene[4].reshape(-1))
+    if not fine:
+        arrays = arrays | {"scales": np.ascontiguousarray(arrays["scales"][:, :scale_axes])}
     for name, array in arrays.items():
+        if fine and name in SCENE:
+            continue
         first = _native.first_nonfinite(array.reshape(-1), renderer)
         if first >= 0:
             raise _bad_value(name, array, first, "be finite")
+    if not fine:
+        _check_ranges(arrays)
+    for c, X_CW in enumerate(arrays["viewmats"].astype(np.float64)):
+        R = X_CW[:3, :3]
+        error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(X_CW[3] - (0, 0, 0, 1)).max())
+        if error > 1e-3:
+            raise ValueError(
+                f"viewmats[{c}] is not a rigid transform: R R^T or the last row is off by "
+                f"{error:.3g}, more than 0.001"
+            )
+
+
+def _check_ranges(arrays: dict[str, np.ndarray]) -> None:
     limits = {
         "scales": (lambda a: a <= 0, "be positive"),
         "opacities": (lambda a: (a < 0) | (a > 1), "lie in [0, 1]"),
@@ -75,14 +101,6 @@ def check_values(arrays: dict[str, np.ndarray], renderer: _native.Renderer) -> N
             f"quats[{first}] is {quats[first].tolist()}, which cannot be normalised; use "
             "(1, 0, 0, 0) for no rotation"
         )
-    for c, X_CW in enumerate(arrays["viewmats"].astype(np.float64)):
-        R = X_CW[:3, :3]
-        error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(X_CW[3] - (0, 0, 0, 1)).max())
-        if error > 1e-3:
-            raise ValueError(
-                f"viewmats[{c}] is not a rigid transform: R R^T or the last row is off by "
-                f"{error:.3g}, more than 0.001"
-            )
 
 
 def _bad_value(name: str, array: np.ndarray, flat_index: int, requirement: str) -> ValueError:

@@ -101,7 +101,7 @@ def render_unscented(
         image, alpha = Composite.apply(views, means2d, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
     else:
         image, alpha, _ = _render(views, ids, joined, keep=False)
-        means2d = torch.from_numpy(np.concatenate([p[2] for p in views.projected]))
+        means2d = views.means2d()
     return image, alpha, means2d  # pyright: ignore[reportReturnType]
 
 
@@ -188,7 +188,7 @@ def _render(
                 keep,
             )
         )
-        seen, *values = views.renderer.projected()
+        seen, *values = views.renderer.projected(opacities[rows])
         views.projected.append((of_camera[seen], *values))
         visible.append(first + seen)
         first = rows.stop
@@ -206,7 +206,7 @@ class PlaceSplats(torch.autograd.Function):
         image, alpha, ctx.visible = _render(views, ids, list(projected), keep=True)
         views.rendered = (image, alpha)
         ctx.save_for_backward(*projected)
-        return torch.from_numpy(np.concatenate([p[2] for p in views.projected]))
+        return views.means2d()
 
     @staticmethod
     @once_differentiable

@@ -10,6 +10,7 @@ from flysplat import _native
 from flysplat.systems.splats.baked_scene import check_camera, create_renderer
 from flysplat.systems.splats.depth_normals import depth_to_normals
 from flysplat.systems.splats.rasterization import CHANNELS, TILE_SIZE
+from flysplat.systems.splats.rasterization_autograd import joined
 from flysplat.systems.splats.rasterization_checks import check_shapes, check_values
 
 DEPTH_MODES = ("expected", "median")
@@ -111,8 +112,7 @@ def rasterize_surfels(
     frames = _Frames(view)
     arrays = {k: np.ascontiguousarray(t.detach().numpy()) for k, t in tensors.items()}
     # The third scale is not read; whatever it is, it is no error.
-    arrays["scales"] = np.ascontiguousarray(arrays["scales"][:, :2])
-    check_values(arrays, frames.renderers[0])
+    check_values(arrays, frames.renderers[0], scale_axes=2)
     color, normal, depth, alpha, median, distort = _Rasterize.apply(
         means, quats, scales, opacities, colors, viewmats, view, frames
     )
@@ -260,14 +260,14 @@ def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_cli
 
 def _meta(projected: list[tuple], opacities: np.ndarray, width: int, height: int) -> dict[str, Any]:
     ids, radii, means2d, depths, normals = (
-        torch.from_numpy(np.concatenate(parts)) for parts in zip(*projected, strict=True)
+        joined(parts) for parts in zip(*projected, strict=True)
     )
     return {
         "camera_ids": torch.repeat_interleave(
             torch.arange(len(projected)), torch.tensor([len(p[0]) for p in projected])
         ),
         "gaussian_ids": ids,
-        "radii": radii.clamp(max=2**30).int(),
+        "radii": radii,
         "means2d": means2d,
         "depths": depths,
         "normals": normals,
