@@ -40,7 +40,7 @@ def machine() -> str:
 
 
 def peak_growth(call: Callable[[], object]) -> float:
-    """MiB by which the resident memory peaks during a first call; NaN where Linux's /proc is not."""
+    """MiB by which the resident memory peaks during a first call; NaN without Linux's /proc."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     if not reset.exists():
         return float("nan")

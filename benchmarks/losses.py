@@ -9,14 +9,10 @@ native code alone. Times are of the wall clock, in milliseconds; on a busy machi
 what to read. Accuracy is against torch in float64.
 """
 
-import os
-import platform
-import time
 from collections.abc import Callable
-from pathlib import Path
 
-import numpy as np
 import torch
+from harness import header, machine, milliseconds, row
 from torch import Tensor
 from torch.nn.functional import conv2d
 
@@ -33,36 +29,12 @@ from flysplat.training.losses import (
     photometric_loss_torch,
 )
 
-REPEATS = 40
 SSIM_WEIGHT = 0.2
 EPSILON, FAR = 1e-3, 150.0  # [m]
 
 Loss = Callable[[Tensor], Tensor]
 Losses = dict[str, Loss]
 Kernel = Callable[[str], None]  # given the SIMD level
-
-
-def milliseconds(call: Callable[[], object]) -> tuple[float, float]:
-    """Minimum and median duration."""
-    durations = []
-    call()
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        call()
-        durations.append(1e3 * (time.perf_counter() - start))
-    return min(durations), float(np.median(durations))
-
-
-def machine() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    model = names[0] if names else platform.processor()
-    levels = ", ".join(_native.simd_levels())
-    return (
-        f"{model}, {os.cpu_count()} cores, {platform.platform()}, SIMD levels {levels}, torch "
-        f"{torch.__version__}"
-    )
 
 
 def photometric_by_squares(rendered: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
@@ -106,26 +78,24 @@ def table(name: str, size: str, rendered: Tensor, losses: Losses, kernel: Kernel
         assert x.grad is not None
         return x.grad
 
-    def row(*cells: object) -> None:
-        print("| " + " | ".join(map(str, (name, size, *cells))) + " |", flush=True)
-
     for level in _native.simd_levels():
         least, median = milliseconds(lambda level=level: kernel(level))
-        row(f"fused, kernel, {level}", f"{least:.3f}", f"{median:.3f}", "", "")
+        row(name, size, f"fused, kernel, {level}", f"{least:.3f}", f"{median:.3f}", "", "")
     expected = gradient_of(list(losses.values())[-1], rendered.double())
     fused = 0.0
     for how, loss in losses.items():
         error = (gradient_of(loss, rendered) - expected).abs().max() / expected.abs().max()
         least, median = milliseconds(lambda loss=loss: gradient_of(loss, rendered))
         fused = fused or least
-        row(how, f"{least:.3f}", f"{median:.3f}", f"{least / fused:.1f}", f"{error:.1e}")
+        row(
+            name, size, how, f"{least:.3f}", f"{median:.3f}", f"{least / fused:.1f}", f"{error:.1e}"
+        )
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    print(machine() + "\n")
-    print("| loss | size | how | min ms | median ms | times fused | gradient error |")
-    print("|---|---|---|---|---|---|---|")
+    print(machine())
+    header("loss", "size", "how", "min ms", "median ms", "times fused", "gradient error")
     for width, height in ((160, 120), (320, 240), (640, 480)):
         rendered, target, noisy, depth = scene(width, height)
         weights = depth_edge_weights(depth)

@@ -11,7 +11,8 @@ to read.
 from collections.abc import Callable
 
 import torch
-from rasterize import cameras_of, load_scene, machine, milliseconds, tensors_of
+from harness import header, machine, milliseconds, row
+from scenes import cameras_of, load_scene, tensors_of
 
 from flysplat import _native
 from flysplat.systems.splats import rasterize
@@ -30,9 +31,8 @@ def main() -> None:
     scene, X_WC = load_scene(COUNT)
     surfels = tensors_of(scene)
     surfels["quats"] = torch.randn(len(scene), 4, generator=torch.Generator().manual_seed(0))
-    print(f"{machine()}\n{len(scene):,} surfels, one thread; milliseconds, minimum (median)\n")
-    print("| size | SIMD | 3D forward | forward | forward + backward | with distortion |")
-    print("|---|---|---|---|---|---|", flush=True)
+    print(f"{machine()}\n{len(scene):,} surfels, one thread; milliseconds, minimum (median)")
+    header("size", "SIMD", "3D forward", "forward", "forward + backward", "with distortion")
     for width, height in ((160, 120), (320, 240), (640, 480)):
         viewmats, Ks = cameras_of(X_WC, width, height)
         view = {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
@@ -60,7 +60,7 @@ def main() -> None:
                     tensor.grad = None
 
             cells = [show(call) for call in (forward_3d, forward, both, lambda f=both: f(True))]
-            print("| " + " | ".join([f"{width}x{height}", level, *cells]) + " |", flush=True)
+            row(f"{width}x{height}", level, *cells)
 
 
 if __name__ == "__main__":

@@ -237,6 +237,11 @@ def _meta(views: Views, means2d: Tensor) -> dict[str, Any]:
     }
 
 
+def last_stages(threads: int = 1, simd: str = "") -> dict[str, float]:
+    """Seconds that the native stages of this Python thread's last image and gradient took."""
+    return _renderer(threads, simd).seconds
+
+
 def _renderer(threads: int, simd: str) -> _native.Renderer:
     renderers = _scratch.__dict__.setdefault("renderers", {})
     if (threads, simd) not in renderers:

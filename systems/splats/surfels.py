@@ -259,9 +259,7 @@ def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_cli
 
 
 def _meta(projected: list[tuple], opacities: np.ndarray, width: int, height: int) -> dict[str, Any]:
-    ids, radii, means2d, depths, normals = (
-        joined(parts) for parts in zip(*projected, strict=True)
-    )
+    ids, radii, means2d, depths, normals = (joined(parts) for parts in zip(*projected, strict=True))
     return {
         "camera_ids": torch.repeat_interleave(
             torch.arange(len(projected)), torch.tensor([len(p[0]) for p in projected])

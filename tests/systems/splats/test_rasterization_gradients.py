@@ -1,13 +1,11 @@
 """Tests of the CPU rasteriser's gradients against the float64 reference's autograd."""
 
 import gc
-import importlib.util
-import sys
 import weakref
-from pathlib import Path
 from typing import Any
 
 import pytest
+import reference_rasterizer as reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,18 +14,6 @@ from torch import Tensor
 from flysplat import _native
 from flysplat.systems.splats import rasterize
 
-
-def _load_reference():
-    path = Path(__file__).with_name("reference_rasterizer.py")
-    spec = importlib.util.spec_from_file_location("reference_rasterizer", path)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-reference = _load_reference()
 random_scene, single_gaussian = reference.random_scene, reference.single_gaussian
 
 LEVELS = _native.simd_levels()

@@ -1,33 +1,20 @@
 """Tests of the surfel renderer against an independent reference and analytic oracles."""
 
-import importlib.util
 import math
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
+import reference_surfels as reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference_rasterizer import random_scene as random_gaussians
+from reference_rasterizer import rotation_matrices
 
 from flysplat import _native
 from flysplat.systems.splats import rasterize, surfels
 from flysplat.systems.splats.depth_normals import depth_to_normals
 from flysplat.systems.splats.surfels import rasterize_surfels
-
-
-def _load(name):
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-rotation_matrices = _load("reference_rasterizer").rotation_matrices
-reference = _load("reference_surfels")
 
 LEVELS = _native.simd_levels()
 WIDTH, HEIGHT = 67, 45
@@ -35,30 +22,11 @@ LEARNED = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 OUTPUTS = ("color", "alpha", "normal", "depth", "median", "distort")
 
 
-def random_scene(
-    count=300, seed=0, sh_degree=None, cameras=1, size=(WIDTH, HEIGHT)
-) -> dict[str, Any]:
+def random_scene(**options) -> dict[str, Any]:
     """Surfels of many sizes in front of, around and behind cameras that look at the origin."""
-    g = torch.Generator().manual_seed(seed)
-    scene = {
-        "means": 1.5 * torch.randn(count, 3, generator=g),
-        "quats": 3 * torch.randn(count, 4, generator=g),
-        "scales": torch.exp(0.7 * torch.randn(count, 3, generator=g) - 2.3),
-        "opacities": torch.rand(count, generator=g),
-        "colors": torch.rand(count, 3, generator=g),
-    }
-    if sh_degree is not None:
-        K = (sh_degree + 1) ** 2
-        scene["colors"] = 0.4 * torch.randn(count, K, 3, generator=g)
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
-    for c in range(cameras):
-        q = torch.randn(1, 4, generator=g, dtype=torch.float64) * 0.1 + torch.tensor([1.0, 0, 0, 0])
-        viewmats[c, :3, :3] = rotation_matrices(q)[0]
-        viewmats[c, 2, 3] = 3.0 + c
-    width, height = size
-    K = torch.tensor([[0.9 * width, 0, 0.48 * width], [0, 1.1 * width, 0.55 * height], [0, 0, 1]])
-    scene["viewmats"] = viewmats.float()
-    scene["Ks"] = K.repeat(cameras, 1, 1)
+    scene = random_gaussians(**options)
+    # Between 1e-3 and 3 m, most about 0.1 m.
+    scene["scales"] = torch.exp(0.7 * (torch.log(scene["scales"]) + 2.5) - 2.3)
     return scene
 
 
