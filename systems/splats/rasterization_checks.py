@@ -1,4 +1,7 @@
-"""What the rasterisers refuse, and how they say so."""
+"""What the rasterisers refuse and how they say so, and what else they share."""
+
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -6,6 +9,8 @@ from torch import Tensor
 
 from flysplat import _native
 
+TILE_SIZE = 16  # [px]
+CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
 SCENE = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -107,3 +112,38 @@ def _bad_value(name: str, array: np.ndarray, flat_index: int, requirement: str) 
     index = np.unravel_index(flat_index, array.shape)
     where = ", ".join(str(int(i)) for i in index)
     return ValueError(f"{name}[{where}] is {array[index]:g}; it must {requirement}")
+
+
+def check_render_mode(render_mode: str) -> None:
+    if render_mode not in CHANNELS:
+        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+
+
+def check_device(means: Tensor) -> None:
+    if means.device.type != "cpu":
+        raise ValueError(f"tensors are on {means.device}; move them to 'cpu' or 'cuda'")
+
+
+def import_gsplat() -> ModuleType:
+    try:
+        import gsplat  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            "rendering CUDA tensors needs gsplat, which is not installed: "
+            "pip install 'flysplat[cuda]', or move the tensors to the CPU"
+        ) from error
+    return gsplat
+
+
+def pair_meta(counts: list[int], width: int, height: int) -> dict[str, Any]:
+    """gsplat's meta that both rasterisers have, for `counts` visible Gaussians of each camera."""
+    cameras = torch.arange(len(counts))
+    return {
+        "camera_ids": torch.repeat_interleave(cameras, torch.tensor(counts)),
+        "width": width,
+        "height": height,
+        "tile_size": TILE_SIZE,
+        "tile_width": -(-width // TILE_SIZE),
+        "tile_height": -(-height // TILE_SIZE),
+        "n_cameras": len(counts),
+    }

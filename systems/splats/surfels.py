@@ -1,4 +1,4 @@
-"""2D Gaussian splatting (surfels; Huang et al. 2024) on the CPU, with gradients."""
+"""2D Gaussian splatting (surfels; Huang et al. 2024): native on the CPU, gsplat on CUDA."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -9,9 +9,15 @@ from torch import Tensor
 from flysplat import _native
 from flysplat.systems.splats.baked_scene import check_camera, create_renderer
 from flysplat.systems.splats.depth_normals import depth_to_normals
-from flysplat.systems.splats.rasterization import CHANNELS, TILE_SIZE
 from flysplat.systems.splats.rasterization_autograd import joined
-from flysplat.systems.splats.rasterization_checks import check_shapes, check_values
+from flysplat.systems.splats.rasterization_checks import (
+    check_device,
+    check_render_mode,
+    check_shapes,
+    check_values,
+    import_gsplat,
+    pair_meta,
+)
 
 DEPTH_MODES = ("expected", "median")
 
@@ -51,6 +57,9 @@ def rasterize_surfels(
     has the plane's depth; gsplat blends the depths of the means. Rays that meet a surfel nearer
     than `near_plane` miss it.
 
+    float32 CPU tensors go to the native kernels, CUDA tensors to gsplat's own, whose differences
+    are those named above.
+
     Differentiable with respect to means, quats, scales (the first two), opacities, colors,
     viewmats and backgrounds. Which surfels a pixel sees, and which gives its median, is constant.
 
@@ -76,6 +85,7 @@ def rasterize_surfels(
 
     Raises:
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it).
+        ImportError: tensors are on a GPU and gsplat is not installed.
     """
     tensors = {
         "means": means,
@@ -90,8 +100,27 @@ def rasterize_surfels(
         tensors["backgrounds"] = backgrounds
     _check_options(render_mode, depth_mode, distloss, radius_clip)
     check_shapes(tensors, sh_degree)
-    if means.device.type != "cpu":
-        raise ValueError(f"tensors are on {means.device}; surfels render on 'cpu': use .cpu()")
+    if means.device.type == "cuda":
+        return import_gsplat().rasterization_2dgs(
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            viewmats,
+            Ks,
+            width,
+            height,
+            near_plane=near_plane,
+            far_plane=far_plane,
+            radius_clip=radius_clip,
+            sh_degree=sh_degree,
+            backgrounds=backgrounds,
+            render_mode=render_mode,
+            distloss=distloss,
+            depth_mode=depth_mode,
+        )
+    check_device(means)
     if Ks.requires_grad:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
     view = _View(
@@ -246,8 +275,7 @@ def _viewmat_gradient(by_camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:
 
 
 def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_clip: float) -> None:
-    if render_mode not in CHANNELS:
-        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+    check_render_mode(render_mode)
     if depth_mode not in DEPTH_MODES:
         raise ValueError(f"depth_mode is {depth_mode!r}; it must be one of {DEPTH_MODES}")
     if distloss and "D" not in render_mode:
@@ -260,20 +288,11 @@ def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_cli
 
 def _meta(projected: list[tuple], opacities: np.ndarray, width: int, height: int) -> dict[str, Any]:
     ids, radii, means2d, depths, normals = (joined(parts) for parts in zip(*projected, strict=True))
-    return {
-        "camera_ids": torch.repeat_interleave(
-            torch.arange(len(projected)), torch.tensor([len(p[0]) for p in projected])
-        ),
+    return pair_meta([len(p[0]) for p in projected], width, height) | {
         "gaussian_ids": ids,
         "radii": radii,
         "means2d": means2d,
         "depths": depths,
         "normals": normals,
         "opacities": torch.from_numpy(opacities)[ids],
-        "width": width,
-        "height": height,
-        "tile_size": TILE_SIZE,
-        "tile_width": -(-width // TILE_SIZE),
-        "tile_height": -(-height // TILE_SIZE),
-        "n_cameras": len(projected),
     }

@@ -426,7 +426,7 @@ def test_tensors_on_other_devices_are_refused():
 @pytest.mark.skipif(importlib.util.find_spec("gsplat") is not None, reason="gsplat is installed")
 def test_missing_gsplat_says_how_to_install_it():
     """CUDA tensors without gsplat get the install command."""
-    from flysplat.systems.splats import rasterization as module
+    from flysplat.systems.splats.rasterization_checks import import_gsplat
 
     with pytest.raises(ImportError, match=r"pip install 'flysplat\[cuda\]'"):
-        module._gsplat()
+        import_gsplat()
