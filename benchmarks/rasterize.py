@@ -5,8 +5,9 @@
 With FLYSPLAT_DATA set, the scenes are 100,000 and 500,000 points of TartanAir's hospital corridor;
 otherwise a synthetic room of the same size. "forward" is the whole call of `rasterize` on torch
 tensors, with its checks and meta; "+ backward" adds the gradients of all scene tensors and "+ Adam"
-torch's fused optimiser; "baked" is BakedScene.render. Times are of the wall clock, in milliseconds,
-the least of many; on a busy machine even those may be too long. PATH is a checkout of OpenSplat,
+torch's fused optimiser; "baked" is BakedScene.render. Times are CPU milliseconds of the
+process, the least of many calls; those by threads are of the wall clock, and too long on a machine
+that is not idle. PATH is a checkout of OpenSplat,
 whose CPU rasteriser is then built and timed (see opensplat.py).
 """
 

@@ -3,9 +3,8 @@
     python benchmarks/surfels.py
 
 The scene is that of benchmarks/rasterize.py, each point a disc that faces in a random direction.
-The loss is a sum over colour, depth, normals and, where it is named, distortion. Times are of the
-wall clock, in milliseconds, of whole calls on torch tensors; on a busy machine the minimum is what
-to read.
+The loss is a sum over colour, depth, normals and, where it is named, distortion. Times are CPU
+milliseconds of whole calls on torch tensors; on a busy machine the minimum is what to read.
 """
 
 from collections.abc import Callable
