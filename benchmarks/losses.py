@@ -5,7 +5,8 @@
 Three ways to the same numbers in torch: the windows of SSIM as one 11 x 11 convolution, as most
 trainers of splats have it; as two of 11, `photometric_loss_torch`; and for log depth
 `log_depth_loss_torch`. "whole call" is the function with its checks and autograd, "kernel" the
-native code alone. Times are CPU milliseconds; on a busy machine the minimum is what to read. Accuracy is against torch in float64.
+native code alone. Times are CPU milliseconds; on a busy machine the minimum is what to read.
+Accuracy is against torch in float64.
 """
 
 from collections.abc import Callable
