@@ -129,7 +129,7 @@ def _lens(camera: pycolmap.Camera, config: CaptureConfig) -> Lens:
         return Lens(K, camera.width, camera.height)
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        return camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+        return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
 
     return Lens(K, camera.width, camera.height, project)
 

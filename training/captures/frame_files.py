@@ -121,7 +121,7 @@ def open_frames(
             return image
         return cv2.remap(image, *found, interpolation)
 
-    R_WF, R_BC = RigidTransform(axes.R_WF, [0, 0, 0]), RigidTransform(axes.R_BC, [0, 0, 0])
+    R_WF, R_BC = RigidTransform(axes.R_WF), RigidTransform(axes.R_BC)
     depth_sizes = [frame.depth_size for frame in sound if frame.depth_size]
     return Capture(
         name=path.resolve().name,
@@ -171,8 +171,8 @@ def _of_usual_size(frames: Sequence[_Frame], messages: list[str], registered: bo
 
 def _size_message(file: Path, size: tuple[int, int], wanted: tuple[int, int]) -> str:
     return (
-        f"{file}: {size[0]}x{size[1]} pixels where {wanted[0]}x{wanted[1]} are expected; all images "
-        "of a camera, and all depths, must have one size"
+        f"{file}: {size[0]}x{size[1]} pixels where {wanted[0]}x{wanted[1]} are expected; all "
+        "images of a camera, and all depths, must have one size"
     )
 
 

@@ -54,7 +54,8 @@ def opencv_lens(
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         points = np.column_stack([rays, np.ones(len(rays))])
-        return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0][:, 0]
+        pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0]
+        return np.asarray(pixels, dtype=np.float64)[:, 0]
 
     return Lens(K, width, height, project)
 

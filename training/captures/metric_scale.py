@@ -101,7 +101,7 @@ def _factor_from_depth(capture: Capture) -> float:
     ratio = np.concatenate(ratios) if ratios else np.zeros(0)
     if len(ratio) < _FEWEST:
         raise ValueError(
-            f"scale.depth_folder: {len(ratio)} points have a measured depth, at least {_FEWEST} are "
-            "needed; is there a depth file for each of some images, named like it?"
+            f"scale.depth_folder: {len(ratio)} points have a measured depth, at least {_FEWEST} "
+            "are needed; is there a depth file for each of some images, named like it?"
         )
     return float(np.median(ratio))

@@ -125,8 +125,10 @@ def _lens(
             f"{file}: camera_model is {model}; known are {', '.join(sorted(_DISTORTION))}"
         )
     try:
-        size = values.get("w"), values.get("h")
-        width, height = (int(x) for x in (size if None not in size else image_size(image)))
+        if "w" in values and "h" in values:
+            width, height = int(values["w"]), int(values["h"])
+        else:
+            width, height = image_size(image)
         if config.intrinsics:
             fx, fy, cx, cy = config.intrinsics
         else:

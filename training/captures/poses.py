@@ -82,7 +82,7 @@ def _require_position(p: NDArray[np.float64], source: str) -> None:
 def stray_frames(positions: NDArray[np.float64]) -> NDArray[np.intp]:
     """Returns the numbers of positions (N, 3) so far from the others that they must be mistakes.
 
-    Those are farther from the median position than 20 times what nine in ten are, and than 10 m.
+    Those are farther from the median position than 20 times what four in five are, and than 10 m.
     """
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    return np.flatnonzero(distance > max(10.0, 20 * np.quantile(distance, 0.9)))
+    return np.flatnonzero(distance > max(10.0, 20 * np.quantile(distance, 0.8)))
