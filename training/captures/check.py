@@ -19,10 +19,10 @@ from scipy.optimize import minimize
 from flysplat.training.captures.capture import Capture
 from flysplat.training.captures.capture_config import CaptureConfig
 from flysplat.training.captures.read_capture import read_capture
-from flysplat.training.captures.registration import ColorFit, fit_color_camera
+from flysplat.training.captures.registration import ColorFit, fit_color_camera, grid_step
 
-_STEP = 8
-"""Every how manieth pixel, along each axis, is carried over."""
+_POINTS = 5000
+"""About how many pixels of an image are carried over."""
 _FEWEST = 200
 _LEAST_INSIDE = 0.1
 """Of the points, the fraction that must fall onto measured depth for a reading to count."""
@@ -227,8 +227,9 @@ def choose_pairs(capture: Capture, count: int) -> list[FramePair]:
         depth = capture.load_depth(i)
         if depth is None:
             continue
+        step = grid_step(depth, _POINTS)
         rows, columns = np.mgrid[
-            _STEP // 2 : depth.shape[0] : _STEP, _STEP // 2 : depth.shape[1] : _STEP
+            step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step
         ]
         z = depth[rows, columns].astype(np.float64)
         known = (z > 0) & np.isfinite(z)

@@ -17,7 +17,8 @@ from scipy.optimize import minimize
 
 from flysplat.training.captures.capture import Capture
 
-_STEP = 10
+_POINTS = 3000
+"""About how many pixels of an image are compared."""
 _BLUR = 1.5  # [px]
 _SAME_SURFACE = 0.03
 _FEWEST = 300
@@ -50,6 +51,11 @@ class ColorFit:
 class _ColoredPair:
     p_DQs: tuple[NDArray[np.float64], NDArray[np.float64]]  # (3, n) [m] each
     images: tuple[NDArray[np.float32], NDArray[np.float32]]  # (H, W), luminance
+
+
+def grid_step(image: NDArray, count: int) -> int:
+    """Returns every how manieth pixel along each axis to take so that about `count` are left."""
+    return max(1, round((image.size / count) ** 0.5))
 
 
 def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> ColorFit | None:
@@ -108,7 +114,8 @@ def _colored_pair(
     a, b = capture.load_depth(i), capture.load_depth(j)
     if a is None or b is None:
         return None
-    rows, columns = np.mgrid[0 : a.shape[0] : _STEP, 0 : a.shape[1] : _STEP]
+    step = grid_step(a, _POINTS)
+    rows, columns = np.mgrid[0 : a.shape[0] : step, 0 : a.shape[1] : step]
     z = a[rows, columns].astype(np.float64)
     known = (z > 0) & np.isfinite(z)
     z, rows, columns = z[known], rows[known], columns[known]

@@ -86,11 +86,16 @@ def fit_ground(
             "the scale or the up direction in another way"
         )
     n, d = best
-    inliers = p_WQ[np.abs(p_WQ @ n - d) < near]
-    center = inliers.mean(axis=0)
-    n = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
-    n = n if n @ up > 0 else -n
-    return n, float(n @ center)
+    for width in near * np.array([1, 0.5, 0.25, 0.125]):
+        # Narrower each time, so that the feet of walls count less.
+        inliers = p_WQ[np.abs(p_WQ @ n - d) < width]
+        if len(inliers) < 10:
+            break
+        center = inliers.mean(axis=0)
+        n = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
+        n = n if n @ up > 0 else -n
+        d = n @ center
+    return n, float(d)
 
 
 def raised(capture: Capture, up: str) -> Capture:

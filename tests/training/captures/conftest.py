@@ -55,7 +55,8 @@ def trace(X_WC: RigidTransform, rays: np.ndarray) -> View:
     d_W = d_C @ X_WC.rotation().matrix().T
     p_W = X_WC.translation()
     with np.errstate(divide="ignore"):
-        depth = np.where(d_W > 0, (UPPER - p_W) / d_W, (LOWER - p_W) / d_W).min(axis=-1)
+        depth = np.where(d_W > 0, UPPER - p_W, p_W - LOWER) / np.abs(d_W)
+    depth = depth.min(axis=-1)
     return View(X_WC, color_at(p_W + depth[..., None] * d_W), depth)
 
 

@@ -151,7 +151,7 @@ def test_distorted_model(model, K, shows_room, room_poses, trace_rays):
     K = np.array([[50.0, 0, 31], [0, 50, 25], [0, 0, 1]])
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-12)
-    rays = cv2.undistortPointsIter(pixels, K, np.array([-0.12, 0, 0, 0]), None, None, criteria)
+    rays = cv2.undistortPoints(pixels, K, np.array([-0.12, 0, 0, 0]), criteria=criteria)
     for i, X_WC in enumerate(room_poses):
         view = trace_rays(X_WC, rays.reshape(48, 64, 2))
         cv2.imwrite(str(model / f"images/{i:02d}.png"), view.image[..., ::-1])

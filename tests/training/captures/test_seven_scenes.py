@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from flysplat.training.captures.capture_config import CaptureConfig
 from flysplat.training.captures.read_capture import read_capture
 
-P_DC = [0.03, -0.01, 0.0]
+P_DC = [0.2, -0.1, 0.0]
 K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
 
 
@@ -48,7 +48,7 @@ def test_two_cameras(write, config, shows_room):
     """Poses are the depth camera's, images the colour camera's, and depth is carried over."""
     capture = read_capture(write(), config())
     assert capture.depth_camera is not None and len(capture) == 10 and not capture.dropped
-    shows_room(capture, color=0.5, depth=0.004)
+    shows_room(capture, color=0.5, depth=0.01)
 
 
 def test_invalid_depth(write, config):
@@ -105,7 +105,8 @@ def test_up_of_level_cameras(write, config):
          "000040.color.png: its position .* is far from all others"),
         (lambda p: (p / "frame-000040.depth.png").write_bytes(b""),
          "000040.depth.png: the file is empty"),
-        (lambda p: (p / "frame-000040.depth.png").unlink(), "000040.depth.png: the file is missing"),
+        (lambda p: (p / "frame-000040.depth.png").unlink(),
+         "000040.depth.png: the file is missing"),
         (lambda p: (p / "frame-000040.color.png").write_bytes(b"no image"),
          "000040.color.png: not a readable image"),
         (lambda p: (f := p / "frame-000040.color.png").write_bytes(f.read_bytes()[:-500]),

@@ -26,7 +26,7 @@ def write(tmp_path, room_views, room_poses):
         p = view.X_WC.translation()
         for offset in (-0.005, 0.005):
             # The camera passes the frame's place half-way between the two stamps.
-            row = (time + offset, *(p + [100 * offset, 0, 0]), x, y, z, w)
+            row = (time + offset, *(p + np.array([100 * offset, 0, 0])), x, y, z, w)
             lists["groundtruth"].append(" ".join(f"{value:.6f}" for value in row))
     for name, lines in lists.items():
         (tmp_path / f"{name}.txt").write_text("\n".join(lines) + "\n")
