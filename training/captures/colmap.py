@@ -7,6 +7,7 @@ configuration. COLMAP's image coordinates count as ours, from the corner of the 
 import dataclasses
 from pathlib import Path
 
+import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray

@@ -8,6 +8,7 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
 import pycolmap
 from PIL import Image
 from tqdm import tqdm

@@ -140,6 +140,7 @@ def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
     )
     report = check_capture(capture)
     assert "colour and depth are not registered" in report.mistake
+    assert report.color is not None
     assert report.color.focal_length == pytest.approx(110, rel=0.02)
     np.testing.assert_allclose(report.color.p_DC, p_DC[:2], atol=0.015)
     told = room(

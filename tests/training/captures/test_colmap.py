@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pycolmap
@@ -70,6 +73,7 @@ def test_model(model, room_poses, shows_room):
     assert capture.metric
     X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
     shows_room(capture, X_RW, color=0.5, depth=None)
+    assert capture.points is not None
     p_RQ = X_RW.multiply(capture.points.p_WQ.T).T
     to_wall = np.minimum(np.abs(p_RQ - [0, -1.5, 0]), np.abs(p_RQ - [6, 1.5, 2.5])).min(axis=1)
     assert to_wall.max() < 1e-9
@@ -195,3 +199,15 @@ def test_photographs_that_show_nothing(tmp_path):
 def _made(path):
     path.mkdir(parents=True)
     return path
+
+
+def test_images_can_be_written_after_pycolmap_is_loaded(tmp_path):
+    """Reading captures does not break OpenCV's PNG files, which libraries of pycolmap could."""
+    code = (
+        "import flysplat.training.captures.read_capture, cv2, numpy as np, sys\n"
+        "image = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)\n"
+        "cv2.imwrite(sys.argv[1], image)\n"
+        "sys.exit(int((cv2.imread(sys.argv[1]) != image).any()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], timeout=60)
+    assert done.returncode == 0

@@ -125,6 +125,7 @@ def test_points(write):
     vertices = PlyElement.describe(np.array(rows, dtype=kinds), "vertex")
     PlyData([vertices]).write(str(path / "points.ply"))
     points = read_capture(path).points
+    assert points is not None
     np.testing.assert_allclose(points.p_WQ, [[1, 2, 3]])
     np.testing.assert_allclose(points.colors, [[1, 0, 0.2]])
 

@@ -54,6 +54,7 @@ def test_two_cameras(write, config, shows_room):
 def test_invalid_depth(write, config):
     """0 and 65535 are unknown; the rest is in metres."""
     depth = read_capture(write(), config()).load_depth(0)
+    assert depth is not None
     np.testing.assert_array_equal(depth[0, :2], 0)
     assert (depth[1:] > 0).all() and depth.max() < 10
 
@@ -62,6 +63,7 @@ def test_depth_unit(write, config):
     """Another unit of depth scales it."""
     path = write()
     one, two = (read_capture(path, config(depth_unit=unit)).load_depth(3) for unit in (1000, 500))
+    assert one is not None
     np.testing.assert_allclose(two, 2 * one)
 
 
