@@ -99,9 +99,10 @@ def test_bad_config(tmp_path, write_room, change, message):
 
 
 def test_bad_capture_leaves_nothing(tmp_path, write_room):
-    """A capture with an unreadable frame is an error that names it, and writes nothing."""
+    """A capture with too many unreadable frames is an error that names one; nothing is written."""
     room = write_room(tmp_path / "room")
-    (room / "image_left" / "000004_left.png").write_bytes(b"x")
+    for i in (4, 5, 6):
+        (room / "image_left" / f"{i:06d}_left.png").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"000004_left\.png: not a readable image"):
         run(capture=room, out=tmp_path / "scene", config=CONFIG)
     assert list(tmp_path.iterdir()) == [room]
@@ -109,7 +110,7 @@ def test_bad_capture_leaves_nothing(tmp_path, write_room):
 
 def test_unknown_capture(tmp_path):
     """A folder that is no capture, or none at all, is refused."""
-    with pytest.raises(ValueError, match="no capture of a known kind; known is TartanAir V1"):
+    with pytest.raises(ValueError, match="no capture of a known kind; known are TartanAir V1"):
         run(capture=tmp_path, out=tmp_path / "scene", config=CONFIG)
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
         run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=CONFIG)

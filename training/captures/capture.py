@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from flysplat.training.captures.registered_depth import registered_depth
 
@@ -47,6 +47,19 @@ class SfmPoints:
     colors: NDArray[np.float64]  # (N, 3) red, green, blue, 0 to 1
 
 
+@dataclass(frozen=True, eq=False)
+class FileAxes:
+    """The axes in which the files of a capture gave their poses, before they were read as X_WC.
+
+    With the pose X_FB of a body B in a world F as the files have it, X_WC = R_WF X_FB R_BC.
+    """
+
+    name: str
+    """What they are called in messages."""
+    R_WF: RotationMatrix
+    R_BC: RotationMatrix
+
+
 def no_depth(i: int) -> None:
     """The `Capture.load_depth` of a capture without depth."""
 
@@ -81,6 +94,8 @@ class Capture:
     """What each frame is called where it was read from; empty if only numbers are known."""
     dropped: Sequence[str] = ()
     """Why frames were left out, one message each that names the file."""
+    axes: FileAxes | None = None
+    """The axes of the files, for those who doubt that they were read rightly."""
 
     def __len__(self) -> int:
         return len(self.X_WCs)

@@ -1,151 +1,134 @@
-"""TartanAir V1 sequences: `image_left/`, `depth_left/` and `pose_left.txt` in one folder.
+"""TartanAir sequences, V1 (`image_left/`, ...) and V2 (`image_lcam_front/`, ...).
 
-Layout and conventions as published with the data set (Wang et al., "TartanAir: A Dataset to Push
-the Limits of Visual SLAM", IROS 2020): `%06d_left.png`, `%06d_left_depth.npy` (float32, metres,
-along the optical axis), and one line `tx ty tz qx qy qz qw` a frame, the pose of a body (x forward,
-y right, z down) whose camera looks along x, in a north-east-down world. The horizontal field of
-view is 90 degrees.
+Layout and conventions as published with the data sets (Wang et al., "TartanAir: A Dataset to Push
+the Limits of Visual SLAM", IROS 2020, and TartanAir V2 after it). One line `tx ty tz qx qy qz qw` a
+frame is the pose of a body (x forward, y right, z down) whose camera looks along x, in a
+north-east-down world; the horizontal field of view is 90 degrees; depth is in metres along the
+optical axis, in V1 an array of float32, in V2 a PNG whose four channels are the bytes of a float32.
 """
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RotationMatrix
 
-from flysplat.training.captures.capture import Capture
+from flysplat.training.captures.capture import Capture, FileAxes
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.frame_files import FrameFiles, open_frames
+from flysplat.training.captures.image_files import (
+    numbered_files,
+    read_depth,
+    read_packed_depth,
+)
+from flysplat.training.captures.lens import Lens, pinhole
+from flysplat.training.captures.poses import pose_from_quaternion, read_rows
 
-# Optical axes (x right, y down, z forward) in the north-east-down body.
-_R_BC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
-# Our world is z up: north, west, up, with the origin of the data set's world.
-_X_WN = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])))
+AXES = FileAxes(
+    "north-east-down: camera looks along x, y right, z down",
+    # Our world is z up: north, west, up, with the origin of the data set's world.
+    R_WF=RotationMatrix(np.diag([1.0, -1.0, -1.0])),
+    # Optical axes (x right, y down, z forward) in the north-east-down body.
+    R_BC=RotationMatrix(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])),
+)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    kind: str
+    camera: str
+    depth_suffix: str
+    read_depth: Callable[[Path], NDArray[np.float32]]
+
+    @property
+    def parts(self) -> tuple[str, str, str]:
+        """The names of the image folder, the depth folder and the pose file."""
+        return f"image_{self.camera}", f"depth_{self.camera}", f"pose_{self.camera}.txt"
+
+
+_V1 = _Layout("TartanAir V1 sequence", "left", "depth.npy", lambda file: read_depth(file, unit=1))
+_V2 = _Layout("TartanAir V2 sequence", "lcam_front", "depth.png", read_packed_depth)
 
 
 def is_tartanair_v1(path: str | Path) -> bool:
     """Tells whether the folder looks like a TartanAir V1 sequence, whole or not."""
-    path = Path(path)
-    return (path / "pose_left.txt").exists() or (path / "image_left").is_dir()
+    return _is(_V1, Path(path))
 
 
-def read_tartanair_v1(path: str | Path) -> Capture:
+def is_tartanair_v2(path: str | Path) -> bool:
+    """Tells whether the folder looks like a TartanAir V2 sequence, whole or not."""
+    return _is(_V2, Path(path))
+
+
+def read_tartanair_v1(path: str | Path, config: CaptureConfig | None = None) -> Capture:
     """Opens a TartanAir V1 sequence; images and depths are loaded when asked for.
 
+    Frame i has line i of the poses. Frames of which a file is missing or damaged, or the pose is
+    none, are left out; see `frame_files`.
+
     Raises:
-        FileNotFoundError: if the folder, one of its parts or the file of a frame is missing.
-        ValueError: if the numbers of images, depths and poses differ, a file is empty, or a pose is
-            no pose. The message names the file.
+        FileNotFoundError: if the folder or one of its parts is missing.
+        ValueError: if the numbers of frames and poses differ, a line of the poses is not seven
+            numbers, or too many frames cannot be used. The message names the file.
     """
-    path = Path(path)
-    image_folder, depth_folder, pose_file = (
-        path / part for part in ("image_left", "depth_left", "pose_left.txt")
-    )
+    return _read(_V1, Path(path), config or CaptureConfig())
+
+
+def read_tartanair_v2(path: str | Path, config: CaptureConfig | None = None) -> Capture:
+    """Opens the front left camera of a TartanAir V2 sequence; see `read_tartanair_v1`."""
+    return _read(_V2, Path(path), config or CaptureConfig())
+
+
+def _is(layout: _Layout, path: Path) -> bool:
+    images, _, poses = layout.parts
+    return (path / poses).exists() or (path / images).is_dir()
+
+
+def _read(layout: _Layout, path: Path, config: CaptureConfig) -> Capture:
+    image_folder, depth_folder, pose_file = (path / part for part in layout.parts)
     for part in (path, image_folder, depth_folder, pose_file):
         if not part.exists():
             raise FileNotFoundError(
-                f"{part}: does not exist; a TartanAir V1 sequence is a folder with image_left/, "
-                "depth_left/ and pose_left.txt"
+                f"{part}: does not exist; a {layout.kind} is a folder with "
+                f"{layout.parts[0]}/, {layout.parts[1]}/ and {layout.parts[2]}"
             )
-    images = _numbered(image_folder, r"(\d+)_left\.png")
-    depths = _numbered(depth_folder, r"(\d+)_left_depth\.npy")
-    X_WCs = _read_poses(pose_file)
-    for number in sorted(images.keys() ^ depths.keys()):
-        have, lack = (images, depth_folder) if number in images else (depths, image_folder)
-        raise ValueError(
-            f"{lack}: no file for frame {number:06d}, but there is {have[number]} "
-            f"({len(images)} images, {len(depths)} depths); every frame needs both"
-        )
-    if len(images) != len(X_WCs):
-        raise ValueError(
-            f"{pose_file}: {len(X_WCs)} poses for {len(images)} images; one line a frame is needed"
-        )
-    for file in (*images.values(), *depths.values()):
-        if file.stat().st_size == 0:
-            raise ValueError(f"{file}: the file is empty; copy it again")
-
-    image_files = [images[number] for number in sorted(images)]
-    depth_files = [depths[number] for number in sorted(depths)]
-    height, width = _read_image(image_files[0]).shape[:2]
-
-    def load_image(i: int) -> NDArray[np.uint8]:
-        return _sized(_read_image(image_files[i]), image_files[i], (height, width, 3))
-
-    def load_depth(i: int) -> NDArray[np.float32]:
-        return _sized(_read_depth(depth_files[i]), depth_files[i], (height, width))
-
-    focal_length = width / 2
-    return Capture(
-        name=path.resolve().name,
-        source=f"TartanAir V1 sequence {path.resolve()}",
-        K=np.array([[focal_length, 0, width / 2], [0, focal_length, height / 2], [0, 0, 1.0]]),
-        width=width,
-        height=height,
-        X_WCs=X_WCs,
-        load_image=load_image,
-        load_depth=load_depth,
-        frame_names=[file.name for file in image_files],
+    images = numbered_files(image_folder, rf"(\d+)_{layout.camera}\.png")
+    depths = numbered_files(
+        depth_folder, rf"(\d+)_{layout.camera}_{re.escape(layout.depth_suffix)}"
     )
-
-
-def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Returns the files of `folder` by the number in their name."""
-    files = {}
-    for file in folder.iterdir():
-        if match := re.fullmatch(pattern, file.name):
-            files[int(match[1])] = file
-    if not files:
-        raise FileNotFoundError(f"{folder}: holds no file named like {pattern}")
-    return files
-
-
-def _read_poses(file: Path) -> list[RigidTransform]:
-    """Returns the camera poses X_WC of a pose file."""
-    X_WCs = []
-    for number, line in enumerate(file.read_text(errors="replace").splitlines(), start=1):
-        try:
-            row = np.array(line.split(), dtype=np.float64)
-        except ValueError:
-            row = np.array([])
-        if row.shape != (7,) or not np.isfinite(row).all():
-            raise ValueError(
-                f"{file}, line {number}: {line[:80]!r} is no pose; seven finite numbers "
-                "tx ty tz qx qy qz qw are needed"
-            )
-        x, y, z, w = row[3:]
-        norm = np.linalg.norm(row[3:])
-        if abs(norm - 1) > 1e-3:
-            raise ValueError(
-                f"{file}, line {number}: the quaternion has the length {norm:.6g}, 1 within 0.001 "
-                "is needed; the line should read tx ty tz qx qy qz qw"
-            )
-        R_NB = RotationMatrix(Quaternion(np.array([w, x, y, z]) / norm))
-        X_WCs.append(_X_WN @ RigidTransform(R_NB @ _R_BC, row[:3]))
-    return X_WCs
-
-
-def _read_image(file: Path) -> NDArray[np.uint8]:
-    image = cv2.imdecode(np.fromfile(file, dtype=np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ValueError(f"{file}: not a readable image; copy it again")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
-
-
-def _read_depth(file: Path) -> NDArray[np.float32]:
-    """Reads depth; what is no number or not in front of the camera becomes 0, unknown."""
-    try:
-        depth = np.load(file, allow_pickle=False).astype(np.float32)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{file}: not a readable array ({error}); copy it again") from error
-    depth[np.isnan(depth) | (depth < 0)] = 0
-    return depth
-
-
-def _sized(array: NDArray, file: Path, shape: tuple[int, ...]) -> NDArray:
-    if array.shape != shape:
+    rows = read_rows(pose_file, 7, "pose; seven numbers tx ty tz qx qy qz qw are needed")
+    numbers = sorted(images.keys() | depths.keys())
+    extra: list[str] = []
+    if len(numbers) != len(rows) and len(images) == len(rows):
+        extra = [f"{depths[i]}: there is no image for it" for i in depths.keys() - images.keys()]
+        numbers = list(images)
+    if len(numbers) != len(rows):
         raise ValueError(
-            f"{file}: an array of shape {array.shape}, but the first image of the sequence "
-            f"asks for {shape} (rows, columns, ...); all images and depths must have one size"
+            f"{pose_file}: {len(rows)} poses for {len(images)} images and {len(depths)} depths; "
+            "one line a frame is needed, or nobody can tell which pose is whose"
         )
-    return array
+
+    def frame(number: int, i: int) -> FrameFiles:
+        name = f"{number:06d}_{layout.camera}"
+        return FrameFiles(
+            images.get(number, image_folder / f"{name}.png"),
+            lambda: pose_from_quaternion(rows[i], f"{pose_file}, line {i + 1}"),
+            depths.get(number, depth_folder / f"{name}_{layout.depth_suffix}"),
+        )
+
+    def lens(width: int, height: int) -> Lens:
+        f = width / 2
+        return Lens(pinhole(*(config.intrinsics or (f, f, width / 2, height / 2))), width, height)
+
+    return open_frames(
+        path,
+        layout.kind,
+        [frame(number, i) for i, number in enumerate(numbers)],
+        axes=AXES,
+        lens=lens,
+        read_depth=layout.read_depth,
+        dropped=extra,
+    )

@@ -5,7 +5,12 @@ import cv2
 import numpy as np
 import pytest
 
-from flysplat.training.captures.tartanair import is_tartanair_v1, read_tartanair_v1
+from flysplat.training.captures.tartanair import (
+    is_tartanair_v1,
+    is_tartanair_v2,
+    read_tartanair_v1,
+    read_tartanair_v2,
+)
 
 
 def back_projected(frame) -> np.ndarray:
@@ -54,13 +59,13 @@ def test_intrinsics_scale_with_the_image(tmp_path, write_room):
 
 
 def test_frames_are_loaded_when_asked_for(tmp_path, write_room):
-    """Opening a capture reads no depth; an unreadable one fails when its frame is loaded."""
+    """Opening a capture decodes nothing; what is damaged since then fails when it is loaded."""
     room = write_room(tmp_path / "room")
-    bad = room / "depth_left" / "000007_left_depth.npy"
-    bad.write_bytes(b"not an array")
+    bad = room / "image_left" / "000007_left.png"
     capture = read_tartanair_v1(room)
+    bad.write_bytes(b"no image any more")
     capture.frame(6)
-    with pytest.raises(ValueError, match=r"000007_left_depth\.npy: not a readable array"):
+    with pytest.raises(ValueError, match=r"000007_left\.png: not a readable image"):
         capture.frame(7)
     with pytest.raises(IndexError, match=r"frame 12 of room: .* 0 to 11"):
         capture.frame(12)
@@ -103,65 +108,120 @@ def test_empty_image_folder(tmp_path, write_room):
         read_tartanair_v1(room)
 
 
-def test_missing_frame(tmp_path, write_room):
-    """A depth without image, or an image without depth, is named with the numbers of both."""
+def test_missing_file_of_a_frame(tmp_path, write_room):
+    """A frame that lacks its image or its depth is left out, and the others keep their poses."""
     room = write_room(tmp_path / "room")
+    whole = read_tartanair_v1(room)
     (room / "image_left" / "000003_left.png").unlink()
-    with pytest.raises(ValueError, match=r"image_left: no file for frame 000003.*11 images, 12"):
+    (room / "depth_left" / "000008_left_depth.npy").unlink()
+    capture = read_tartanair_v1(room)
+    assert len(capture) == 10 and len(capture.dropped) == 2
+    assert "000003_left.png: the file is missing" in capture.dropped[0]
+    assert "000008_left_depth.npy: the file is missing" in capture.dropped[1]
+    assert capture.frame_names[3] == "000004_left.png"
+    assert capture.X_WCs[3].IsExactlyEqualTo(whole.X_WCs[4])
+
+
+def test_extra_depth(tmp_path, write_room):
+    """A depth without image and pose is left out."""
+    room = write_room(tmp_path / "room")
+    depth = room / "depth_left" / "000012_left_depth.npy"
+    depth.write_bytes((room / "depth_left" / "000011_left_depth.npy").read_bytes())
+    capture = read_tartanair_v1(room)
+    assert len(capture) == 12 and "000012_left_depth.npy: there is no image" in capture.dropped[0]
+
+
+@pytest.mark.parametrize("change", [lambda lines: lines[:-1], lambda lines: [*lines, lines[0]]])
+def test_other_number_of_poses(tmp_path, write_room, change):
+    """With more or fewer poses than frames nobody can tell which is whose: an error with counts."""
+    room = write_room(tmp_path / "room")
+    lines = change((room / "pose_left.txt").read_text().splitlines())
+    (room / "pose_left.txt").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"pose_left\.txt: 1[13] poses for 12 images and 12 dep"):
         read_tartanair_v1(room)
-    (room / "depth_left" / "000003_left_depth.npy").unlink()
-    with pytest.raises(ValueError, match=r"pose_left\.txt: 12 poses for 11 images"):
+
+
+def spoilt_line(room, line):
+    lines = (room / "pose_left.txt").read_text().splitlines()
+    lines[4] = line
+    (room / "pose_left.txt").write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize("line", ["0 0 0 0 0 0", "a b c d e f g", ""])
+def test_line_that_is_no_pose(tmp_path, write_room, line):
+    """A line that is not seven numbers is an error that names file and line."""
+    room = write_room(tmp_path / "room")
+    spoilt_line(room, line)
+    with pytest.raises(ValueError, match=r"pose_left\.txt, line 5: .*is no pose; seven numbers"):
         read_tartanair_v1(room)
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("0 0 0 0 0 0", "is no pose; seven finite numbers"),
-        ("0 0 nan 0 0 0 1", "is no pose; seven finite numbers"),
-        ("a b c d e f g", "is no pose; seven finite numbers"),
-        ("0 0 0 0 0 0 1.1", r"length 1\.1, 1 within 0\.001"),
-        ("0 0 0 0 0 0 0", r"length 0, 1 within 0\.001"),
+        ("0 0 nan 0 0 0 1", "the pose is not finite"),
+        ("0 0 0 0 0 0 1.1", "the quaternion has the length 1.1, 1 within 0.001"),
+        ("0 0 0 0 0 0 0", "the quaternion has the length 0, 1 within 0.001"),
+        ("0 0 0 nan 0 0 1", "the quaternion has the length nan"),
+        ("3e7 0 0 0 0 0 1", "more than 1e+06 m away"),
     ],
 )
-def test_bad_pose(tmp_path, write_room, line, message):
-    """A line that is no pose is named by file and number."""
+def test_absurd_pose(tmp_path, write_room, line, message):
+    """A frame whose pose cannot be one is left out and named by line."""
     room = write_room(tmp_path / "room")
-    lines = (room / "pose_left.txt").read_text().splitlines()
-    lines[4] = line
-    (room / "pose_left.txt").write_text("\n".join(lines))
-    with pytest.raises(ValueError, match=rf"pose_left\.txt, line 5: .*{message}"):
-        read_tartanair_v1(room)
+    spoilt_line(room, line)
+    capture = read_tartanair_v1(room)
+    assert len(capture) == 11 and len(capture.dropped) == 1
+    assert "pose_left.txt, line 5: " in capture.dropped[0] and message in capture.dropped[0]
 
 
 @pytest.mark.parametrize("file", ["image_left/000002_left.png", "depth_left/000002_left_depth.npy"])
-def test_empty_file(tmp_path, write_room, file):
-    """A zero-byte file is found on opening."""
+@pytest.mark.parametrize("keep", [0, 20])
+def test_empty_or_cut_file(tmp_path, write_room, file, keep):
+    """A frame whose file is empty or cut short is left out on opening."""
     room = write_room(tmp_path / "room")
-    (room / file).write_bytes(b"")
-    with pytest.raises(ValueError, match=rf"{Path(file).name}: the file is empty"):
-        read_tartanair_v1(room)
-
-
-def test_unreadable_image(tmp_path, write_room):
-    """A file that is no image is named."""
-    room = write_room(tmp_path / "room")
-    file = room / "image_left" / "000002_left.png"
-    file.write_bytes(file.read_bytes()[:20])
-    with pytest.raises(ValueError, match=r"000002_left\.png: not a readable image"):
-        read_tartanair_v1(room).frame(2)
+    (room / file).write_bytes((room / file).read_bytes()[:keep])
+    capture = read_tartanair_v1(room)
+    assert len(capture) == 11
+    assert (
+        f"{Path(file).name}: {'not a readable' if keep else 'the file is empty'}"
+        in (capture.dropped[0])
+    )
 
 
 def test_other_size(tmp_path, write_room):
-    """An image or a depth of another size than the first image is named with both sizes."""
+    """Frames of another size than most are left out with both sizes."""
     room = write_room(tmp_path / "room")
     np.save(room / "depth_left" / "000001_left_depth.npy", np.ones((24, 32), np.float32))
-    cv2.imwrite(str(room / "image_left" / "000002_left.png"), np.zeros((24, 32, 3), np.uint8))
+    cv2.imwrite(str(room / "image_left" / "000000_left.png"), np.zeros((24, 32, 3), np.uint8))
     capture = read_tartanair_v1(room)
-    with pytest.raises(ValueError, match=r"000001_left_depth\.npy: .*\(24, 32\).*\(48, 64\)"):
-        capture.frame(1)
-    with pytest.raises(ValueError, match=r"000002_left\.png: .*\(24, 32, 3\).*\(48, 64, 3\)"):
-        capture.frame(2)
+    assert (capture.width, capture.height, len(capture)) == (64, 48, 10)
+    assert "000000_left.png: 32x24 pixels where 64x48 are expected" in capture.dropped[0]
+    assert "000001_left_depth.npy: 32x24 pixels where 64x48 are expected" in capture.dropped[1]
+
+
+def test_v2(tmp_path, write_room):
+    """A V2 sequence, its depth in the bytes of four channels, is the same capture as in V1."""
+    room = write_room(tmp_path / "room")
+    v2 = tmp_path / "P000"
+    (v2 / "image_lcam_front").mkdir(parents=True)
+    (v2 / "depth_lcam_front").mkdir()
+    (room / "pose_left.txt").rename(v2 / "pose_lcam_front.txt")
+    (v2 / "pose_left.txt").write_text((v2 / "pose_lcam_front.txt").read_text())
+    for i in range(12):
+        image = room / "image_left" / f"{i:06d}_left.png"
+        (v2 / "image_lcam_front" / f"{i:06d}_lcam_front.png").write_bytes(image.read_bytes())
+        depth = np.load(room / "depth_left" / f"{i:06d}_left_depth.npy")
+        packed = depth.astype("<f4")[..., None].view(np.uint8)
+        cv2.imwrite(str(v2 / "depth_lcam_front" / f"{i:06d}_lcam_front_depth.png"), packed)
+    (v2 / "pose_left.txt").rename(room / "pose_left.txt")
+    one, two = read_tartanair_v1(room), read_tartanair_v2(v2)
+    assert is_tartanair_v2(v2) and not is_tartanair_v1(v2) and len(two) == 12
+    for i in (0, 7):
+        np.testing.assert_array_equal(one.frame(i).image, two.frame(i).image)
+        np.testing.assert_array_equal(one.frame(i).depth, two.frame(i).depth)
+        assert one.X_WCs[i].IsExactlyEqualTo(two.X_WCs[i])
+    np.testing.assert_array_equal(one.K, two.K)
 
 
 @pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")

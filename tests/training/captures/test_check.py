@@ -1,0 +1,204 @@
+import dataclasses
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.analysis.cli import main
+from flysplat.diagrams.configuration import load_config
+from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.check import check_capture
+from flysplat.training.captures.read_capture import read_capture
+
+WIDTH, HEIGHT = 160, 120
+K = np.array([[110.0, 0, 78.0], [0, 110.0, 61.0], [0, 0, 1]])
+NED = RotationMatrix(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]))
+
+
+@pytest.fixture
+def room(room_views):
+    """The room as a capture, with the depth and images of an ideal camera."""
+    views = room_views(K, WIDTH, HEIGHT)
+
+    def room(**changes) -> Capture:
+        capture = Capture(
+            name="room",
+            source="the room",
+            K=K,
+            width=WIDTH,
+            height=HEIGHT,
+            X_WCs=[view.X_WC for view in views],
+            load_image=lambda i: views[i].image,
+            load_depth=lambda i: views[i].depth.astype(np.float32),
+            axes=FileAxes("north-east-down", RotationMatrix(np.diag([1.0, -1, -1])), NED),
+        )
+        return dataclasses.replace(capture, **changes)
+
+    return room
+
+
+def as_files(capture, change):
+    """The poses X_WC that result when the files' X_FB are not what the reader takes them for."""
+    R_WF, R_BC = RigidTransform(capture.axes.R_WF), RigidTransform(capture.axes.R_BC)
+    return [R_WF @ change(R_WF.inverse() @ X @ R_BC.inverse()) @ R_BC for X in capture.X_WCs]
+
+
+def misread_quaternion(X: RigidTransform) -> RigidTransform:
+    """What a reader of x y z w makes of a file with w x y z."""
+    x, y, z, w = X.rotation().ToQuaternion().wxyz()
+    return RigidTransform(Quaternion(np.array([w, x, y, z])), X.translation())
+
+
+def test_sound_capture_agrees(room):
+    """Exact depth agrees to a fraction of a pixel's slope, and nothing fits better by half."""
+    report = check_capture(room())
+    assert report.agrees and report.agreement.error < 0.005 and report.agreement.inside > 0.5
+    assert report.color is not None and report.color.cost < 0.1
+    assert str(report).endswith("agrees") and "as it was read" in str(report)
+
+
+FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("change", "mistake"),
+    [
+        (lambda X: X.inverse(), "poses are world to camera, read as camera to world"),
+        (lambda X: X @ RigidTransform(NED @ FLU.inverse()),
+         "poses are those of an east-north-up body .* read as a north-east-down body"),
+        (lambda X: X @ RigidTransform(NED), "poses are those of optical axes"),
+        (misread_quaternion, "quaternions are w x y z, read as x y z w"),
+        (lambda X: RigidTransform(X.rotation(), X.translation() * [1, -1, -1]),
+         "different worlds: up and down differ"),
+        (lambda X: RigidTransform(X.rotation(), 10 * X.translation()),
+         "depth is 10 times too small, or positions too large"),
+        (lambda X: RigidTransform(X.rotation(), X.translation() / 1000),
+         "depth is 1000 times too large, or positions too small"),
+    ],
+)  # fmt: skip
+def test_wrong_poses_are_named(room, change, mistake):
+    """Each usual mistake with poses is found by its name."""
+    capture = room()
+    report = check_capture(room(X_WCs=as_files(capture, change)))
+    assert not report.agrees
+    assert re.search(mistake, report.mistake), str(report)
+
+
+def scaled(factor):
+    return lambda room: {"load_depth": lambda i: (factor * room().load_depth(i)).astype(np.float32)}
+
+
+def ranged(room):
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    length = np.sqrt(1 + ((u - K[0, 2]) / K[0, 0]) ** 2 + ((v - K[1, 2]) / K[1, 1]) ** 2)
+    return {"load_depth": lambda i: (length * room().load_depth(i)).astype(np.float32)}
+
+
+def intrinsics(change):
+    return lambda room: {"K": np.array(change) * K}
+
+
+@pytest.mark.parametrize(
+    ("change", "mistake"),
+    [
+        (ranged, "distance from the camera, read as depth along its axis"),
+        (scaled(5), "depth is 5 times too large"),
+        (scaled(0.001), "depth is 1000 times too small"),
+        (intrinsics([[2], [2], [1]]), "intrinsics belong to images 2 times as large"),
+        (
+            intrinsics([[1.1, 0, 1], [0, 1.1, 1], [1, 1, 1]]),
+            "the focal length is wrong: 1(09|10|11)",
+        ),
+        (intrinsics([[1, 0, 0.8], [0, 1, 1], [1, 1, 1]]), r"principal point is wrong: \(7[789]"),
+    ],
+)
+def test_wrong_depth_and_intrinsics_are_named(room, change, mistake):
+    """Each usual mistake with depth or intrinsics is found by its name."""
+    report = check_capture(room(**change(room)))
+    assert not report.agrees
+    assert re.search(mistake, report.mistake), str(report)
+
+
+def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
+    """Depth of another camera that passes for the colour camera's is found, and its place."""
+    p_DC = np.array([0.06, 0.02, 0.0])
+    K_D = np.array([[125.0, 0, 80.0], [0, 125.0, 60.0], [0, 0, 1]])
+    K_C = np.array([[110.0, 0, 80.0], [0, 110.0, 60.0], [0, 0, 1]])
+    X_DC = RigidTransform(p_DC)
+    colors = room_views(K_C, WIDTH, HEIGHT)
+    depths = room_views(K_D, WIDTH, HEIGHT, [X_WC @ X_DC.inverse() for X_WC in room_poses])
+    capture = room(
+        K=K_D,
+        X_WCs=[view.X_WC for view in depths],
+        load_image=lambda i: colors[i].image,
+        load_depth=lambda i: depths[i].depth.astype(np.float32),
+    )
+    report = check_capture(capture)
+    assert "colour and depth are not registered" in report.mistake
+    assert report.color is not None
+    assert report.color.focal_length == pytest.approx(110, rel=0.02)
+    np.testing.assert_allclose(report.color.p_DC, p_DC[:2], atol=0.015)
+    told = room(
+        K=K_C,
+        X_WCs=[view.X_WC for view in colors],
+        load_image=capture.load_image,
+        load_depth=capture.load_depth,
+        depth_camera=DepthCamera(K_D, WIDTH, HEIGHT, X_DC.inverse()),
+    )
+    assert check_capture(told).agrees
+
+
+def test_inaccurate_poses(room):
+    """Poses off at random disagree, and no mistake is made up."""
+    rng = np.random.default_rng(0)
+    off = [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]
+    report = check_capture(room(X_WCs=off))
+    assert "no known mistake explains it" in report.mistake
+
+
+def test_nothing_to_compare(room):
+    """Without depth, or without enough of it, nothing is claimed."""
+    with pytest.raises(ValueError, match="no depth, so there is nothing to compare"):
+        check_capture(room(load_depth=no_depth))
+    with pytest.raises(ValueError, match="too few pixels have depth"):
+        check_capture(room(load_depth=lambda i: np.zeros((HEIGHT, WIDTH), np.float32)))
+
+
+def test_command(tmp_path, write_room, capsys):
+    """`flysplat capture check` prints the table and ends with 0, or with 1 and the mistake."""
+    poses = [((0.8 + 0.3 * i, 0.1 * i, -1.2), 0.1 * i - 0.3, -0.05 * i) for i in range(8)]
+    path = write_room(tmp_path / "room", width=160, height=120, poses=poses)
+    assert main(["capture", "check", str(path)]) == 0
+    assert capsys.readouterr().out.rstrip().endswith("agrees")
+    lines = [line.split() for line in (path / "pose_left.txt").read_text().splitlines()]
+    wrong = [" ".join([*line[:3], line[6], *line[3:6]]) for line in lines]
+    (path / "pose_left.txt").write_text("\n".join(wrong))
+    assert main(["capture", "check", str(path)]) == 1
+    captured = capsys.readouterr()
+    assert "quaternions are w x y z, read as x y z w" in captured.err
+    assert captured.out.rstrip().endswith("does not agree")
+    assert main(["capture", "check", str(path), "--set", "pairs=0"]) == 1
+    assert "pairs is 0" in capsys.readouterr().err
+
+
+@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+@pytest.mark.parametrize(
+    ("name", "overrides", "error", "mistake"),
+    [
+        ("tartanair/hospital", [], (0.0005, 0.001), ""),
+        ("redkitchen", [], (0.002, 0.01), ""),
+        ("redkitchen", ["intrinsics=[585, 585, 320, 240]", "p_DC=[0, 0, 0]"], (0.002, 0.01),
+         r"not registered: a colour camera of focal length 52\d px at \(\+0\.0[12]"),
+    ],
+)  # fmt: skip
+def test_real_captures(name, overrides, error, mistake):
+    """The real captures agree, and redkitchen read as registered is found out, with its numbers."""
+    config = load_config(CaptureConfig(), overrides=overrides)
+    report = check_capture(read_capture(Path(os.environ["FLYSPLAT_DATA"]) / name, config))
+    assert error[0] < report.agreement.error < error[1]
+    assert re.search(mistake, report.mistake) if mistake else report.agrees

@@ -1,0 +1,213 @@
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.training.captures.capture_config import CaptureConfig, ScaleConfig
+from flysplat.training.captures.photographs import read_photographs
+from flysplat.training.captures.read_capture import read_capture
+
+SHRINK = 0.25
+# The world of a registration: any rotation, any unit of length.
+X_MW = RigidTransform(
+    RotationMatrix.MakeXRotation(1.1) @ RotationMatrix.MakeYRotation(0.5), [3, 1, 2]
+)
+
+
+def write_model(path, K, views) -> pycolmap.Reconstruction:
+    """Writes a model in shrunken units of the room's views, with points on walls and floor."""
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=params, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    (path / "images").mkdir(parents=True)
+    for i, view in enumerate(views):
+        cv2.imwrite(str(path / f"images/{i:02d}.png"), view.image[..., ::-1])
+        X_MC = X_MW @ view.X_WC
+        X_CM = RigidTransform(X_MC.rotation(), SHRINK * X_MC.translation()).inverse()
+        columns, rows = rng.integers(0, 64, 60), rng.integers(0, 48, 60)
+        points = [pycolmap.Point2D([u + 0.5, v + 0.5]) for u, v in zip(columns, rows, strict=True)]
+        image = pycolmap.Image(name=f"{i:02d}.png", points2D=points, camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(X_CM.GetAsMatrix34()))
+        for k, (u, v) in enumerate(zip(columns, rows, strict=True)):
+            z = view.depth[v, u]
+            q = [(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z]
+            p = SHRINK * X_MW.multiply(view.X_WC.multiply(np.array(q)))
+            track = pycolmap.Track([pycolmap.TrackElement(i + 1, k)])
+            model.add_point3D(p, track, view.image[v, u])
+    return model
+
+
+@pytest.fixture
+def model(tmp_path, K, room_views):
+    """A folder with images and a sparse model of the room."""
+    path = tmp_path / "castle"
+    reconstruction = write_model(path, K, room_views(K, 64, 48))
+    (path / "sparse" / "0").mkdir(parents=True)
+    reconstruction.write(path / "sparse" / "0")
+    return path
+
+
+def lengths(capture) -> np.ndarray:
+    """Distances between successive cameras."""
+    p = np.array([X_WC.translation() for X_WC in capture.X_WCs])
+    return np.linalg.norm(np.diff(p, axis=0), axis=1)
+
+
+def true_lengths(poses) -> np.ndarray:
+    p = np.array([X_WC.translation() for X_WC in poses])
+    return np.linalg.norm(np.diff(p, axis=0), axis=1)
+
+
+def test_model(model, room_poses, shows_room):
+    """Poses, points and images are those of the room, in another world of unknown scale."""
+    capture = read_capture(model)
+    assert not capture.metric and not capture.has_depth and len(capture) == 10
+    np.testing.assert_allclose(lengths(capture), SHRINK * true_lengths(room_poses), rtol=1e-9)
+    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK)))
+    assert capture.metric
+    X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
+    shows_room(capture, X_RW, color=0.5, depth=None)
+    assert capture.points is not None
+    p_RQ = X_RW.multiply(capture.points.p_WQ.T).T
+    to_wall = np.minimum(np.abs(p_RQ - [0, -1.5, 0]), np.abs(p_RQ - [6, 1.5, 2.5])).min(axis=1)
+    assert to_wall.max() < 1e-9
+    assert 0 <= capture.points.colors.min() and capture.points.colors.max() <= 1
+
+
+@pytest.mark.parametrize("up", ["cameras", "ground"])
+def test_up(model, room_poses, up):
+    """The cameras, or the floor, say which way is up: exactly if it is the floor."""
+    capture = read_capture(model, CaptureConfig(up=up))
+    X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
+    tilt = np.rad2deg(np.arccos(X_RW.rotation().matrix()[2, 2]))
+    assert tilt < (0.1 if up == "ground" else 2)
+
+
+def test_camera_height(model, room_poses):
+    """The cameras' height above the floor gives the scale."""
+    height = np.median([X_WC.translation()[2] for X_WC in room_poses])
+    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(camera_height=float(height))))
+    np.testing.assert_allclose(lengths(capture), true_lengths(room_poses), rtol=1e-3)
+
+
+def test_distance_between_points(model, K, room_views, room_poses):
+    """The distance between the points seen at two pixels gives the scale."""
+    reconstruction = pycolmap.Reconstruction(model / "sparse/0")
+    points = [list(reconstruction.images[i].points2D)[7] for i in (1, 4)]
+    a, b = (reconstruction.points3D[point.point3D_id].xyz for point in points)
+    between = [
+        f"{name}@{point.xy[0] + 0.3:.2f},{point.xy[1]:.2f}"
+        for name, point in zip(("00.png", "03.png"), points, strict=True)
+    ]
+    distance = float(np.linalg.norm(a - b)) / SHRINK
+    scale = ScaleConfig(between=between, distance=distance)
+    capture = read_capture(model, CaptureConfig(scale=scale))
+    np.testing.assert_allclose(lengths(capture), true_lengths(room_poses), rtol=1e-9)
+
+
+def test_depth_of_some_images(model, K, room_views, room_poses):
+    """Depth of some images gives the scale, and is the depth of those frames."""
+    (model / "depth").mkdir()
+    views = room_views(K, 64, 48)
+    for i in (2, 5):
+        millimetres = np.round(1000 * views[i].depth).astype(np.uint16)
+        cv2.imwrite(str(model / f"depth/{i:02d}.png"), millimetres)
+    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
+    assert capture.metric and capture.has_depth
+    np.testing.assert_allclose(lengths(capture), true_lengths(room_poses), rtol=0.02)
+    np.testing.assert_allclose(capture.frame(5).depth, views[5].depth, atol=0.001)
+    assert capture.load_depth(0) is None and not capture.frame(0).depth.any()
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        (ScaleConfig(between=["00.png", "xx.png"], distance=1), "no registered image 'xx.png'"),
+        (ScaleConfig(between=["00.png", "00.png"], distance=1), "are the same place"),
+        (ScaleConfig(between=["00.png@900,1", "00.png"], distance=1), "no registered point within"),
+        (ScaleConfig(between=["00.png@9", "00.png"], distance=1), "does not end in a pixel"),
+        (ScaleConfig(between=["00.png", "01.png"]), "belong together"),
+        (ScaleConfig(camera_height=1, factor=1), "given 2 times, by scale.factor and scale.cam"),
+        (ScaleConfig(camera_height=-1), "camera_height is -1; more than 0"),
+        (ScaleConfig(depth_folder="nothing"), "0 points have a measured depth"),
+    ],
+)
+def test_bad_scale(model, scale, message):
+    """A scale that cannot be had is refused with the reason."""
+    with pytest.raises(ValueError, match=message):
+        read_capture(model, CaptureConfig(scale=scale))
+
+
+def test_distorted_model(model, K, shows_room, room_poses, trace_rays):
+    """Images of a distorted camera are undistorted."""
+    reconstruction = pycolmap.Reconstruction(model / "sparse/0")
+    camera = reconstruction.cameras[1]
+    camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    camera.params = [50.0, 31.0, 25.0, -0.12]
+    reconstruction.write(model / "sparse/0")
+    v, u = np.mgrid[0:48, 0:64] + 0.5
+    K = np.array([[50.0, 0, 31], [0, 50, 25], [0, 0, 1]])
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-12)
+    rays = cv2.undistortPoints(pixels, K, np.array([-0.12, 0, 0, 0]), criteria=criteria)
+    for i, X_WC in enumerate(room_poses):
+        view = trace_rays(X_WC, rays.reshape(48, 64, 2))
+        cv2.imwrite(str(model / f"images/{i:02d}.png"), view.image[..., ::-1])
+    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK)))
+    shows_room(capture, room_poses[0] @ capture.X_WCs[0].inverse(), color=3.0, depth=None)
+
+
+def test_missing_parts(model):
+    """No images, or a damaged model, are named."""
+    (model / "images").rename(model / "elsewhere")
+    with pytest.raises(FileNotFoundError, match="none of the model's images"):
+        read_capture(model)
+    (model / "sparse/0/images.bin").write_bytes(b"1234")
+    with pytest.raises(ValueError, match="not a readable COLMAP model"):
+        read_capture(model)
+
+
+def test_registered_photographs_are_not_registered_again(tmp_path, K, room_views):
+    """Photographs whose registration lies in the cache open as its model, and those that it lacks
+    are left out by name."""
+    path = tmp_path / "photos"
+    write_model(path, K, room_views(K, 64, 48)).write(_made(tmp_path / "cache/model"))
+    cv2.imwrite(str(path / "images/blank.png"), np.zeros((48, 64, 3), np.uint8))
+    (path / "images/empty.jpg").write_bytes(b"")
+    capture = read_photographs(path, CaptureConfig(cache=str(tmp_path / "cache")))
+    assert len(capture) == 10 and not capture.metric
+    assert "empty.jpg: the file is empty" in capture.dropped[0]
+    assert "blank.png: not registered" in capture.dropped[1]
+
+
+def test_photographs_that_show_nothing(tmp_path):
+    """Photographs without anything to match end in an error, and leave nothing behind."""
+    path = _made(tmp_path / "photos")
+    for i in range(3):
+        cv2.imwrite(str(path / f"{i}.png"), np.full((48, 64, 3), 100, np.uint8))
+    with pytest.raises(ValueError, match="3 photographs could not be registered"):
+        read_capture(path, CaptureConfig(cache=str(tmp_path / "cache")))
+    assert not list((tmp_path / "cache").iterdir())
+
+
+def _made(path):
+    path.mkdir(parents=True)
+    return path
+
+
+def test_images_can_be_written_after_pycolmap_is_loaded(tmp_path):
+    """Reading captures does not break OpenCV's PNG files, which libraries of pycolmap could."""
+    code = (
+        "import flysplat.training.captures.read_capture, cv2, numpy as np, sys\n"
+        "image = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)\n"
+        "cv2.imwrite(sys.argv[1], image)\n"
+        "sys.exit(int((cv2.imread(sys.argv[1]) != image).any()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], timeout=60)
+    assert done.returncode == 0

@@ -1,0 +1,160 @@
+import os
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.read_capture import read_capture
+
+P_DC = [0.2, -0.1, 0.0]
+K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
+
+
+@pytest.fixture
+def write(tmp_path, K, room_views, room_poses):
+    """Writes the room as two cameras see it, colour at P_DC in the depth camera."""
+
+    def write() -> Path:
+        X_DC = RigidTransform(np.array(P_DC))
+        colors = room_views(K, 64, 48)
+        depths = room_views(K_D, 64, 48, [X_WC @ X_DC.inverse() for X_WC in room_poses])
+        for i, (color, depth) in enumerate(zip(colors, depths, strict=True)):
+            stem = str(tmp_path / f"frame-{10 * i:06d}")
+            cv2.imwrite(f"{stem}.color.png", color.image[..., ::-1])
+            millimetres = np.round(1000 * depth.depth).astype(np.uint16)
+            millimetres[0, 0], millimetres[0, 1] = 0, 65535
+            cv2.imwrite(f"{stem}.depth.png", millimetres)
+            np.savetxt(f"{stem}.pose.txt", depth.X_WC.GetAsMatrix4())
+        return tmp_path
+
+    return write
+
+
+@pytest.fixture
+def config(K):
+    def config(**changes) -> CaptureConfig:
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        intrinsics = {"intrinsics": [fx, fy, cx, cy], "depth_intrinsics": [55.0, 55.0, 32.0, 24.0]}
+        return CaptureConfig(**({"p_DC": P_DC, "up": "z"} | intrinsics | changes))
+
+    return config
+
+
+def test_two_cameras(write, config, shows_room):
+    """Poses are the depth camera's, images the colour camera's, and depth is carried over."""
+    capture = read_capture(write(), config())
+    assert capture.depth_camera is not None and len(capture) == 10 and not capture.dropped
+    shows_room(capture, color=0.5, depth=0.01)
+
+
+def test_invalid_depth(write, config):
+    """0 and 65535 are unknown; the rest is in metres."""
+    depth = read_capture(write(), config()).load_depth(0)
+    assert depth is not None
+    np.testing.assert_array_equal(depth[0, :2], 0)
+    assert (depth[1:] > 0).all() and depth.max() < 10
+
+
+def test_depth_unit(write, config):
+    """Another unit of depth scales it."""
+    path = write()
+    one, two = (read_capture(path, config(depth_unit=unit)).load_depth(3) for unit in (1000, 500))
+    assert one is not None
+    np.testing.assert_allclose(two, 2 * one)
+
+
+def test_config_file_in_the_folder(write, config):
+    """`capture.yaml` gives what the caller leaves open, and the caller wins."""
+    path = write()
+    (path / "capture.yaml").write_text("intrinsics: [40, 41, 30, 20]\nup: z\n")
+    np.testing.assert_array_equal(read_capture(path).K, [[40, 0, 30], [0, 41, 20], [0, 0, 1]])
+    np.testing.assert_array_equal(read_capture(path, config()).K[0], [50, 0, 31])
+    (path / "capture.yaml").write_text("intrinsic: [1]\n")
+    with pytest.raises(ValueError, match=r"capture\.yaml.*intrinsic"):
+        read_capture(path)
+
+
+def test_up_of_level_cameras(write, config):
+    """Without an up direction given, level cameras give it: z is up to a degree or two."""
+    path = write()
+    R = RotationMatrix.MakeXRotation(1.0) @ RotationMatrix.MakeYRotation(0.4)
+    for file in path.glob("*.pose.txt"):
+        np.savetxt(file, RigidTransform(R, [0, 0, 0]).GetAsMatrix4() @ np.loadtxt(file))
+    capture = read_capture(path, config(up=""))
+    right = np.array([X_WC.rotation().matrix()[:, 0] for X_WC in capture.X_WCs])
+    assert np.abs(right[:, 2]).max() < 0.03
+    assert all(X_WC.rotation().matrix()[2, 1] < 0 for X_WC in capture.X_WCs)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda p: (p / "frame-000040.pose.txt").write_text("nan " * 4 + "\n" + "0 0 0 1\n" * 3),
+         "000040.pose.txt: the pose is not finite"),
+        (lambda p: (p / "frame-000040.pose.txt").unlink(), "000040.pose.txt: the file is missing"),
+        (lambda p: (p / "frame-000040.pose.txt").write_text("1 0 0\n"),
+         "000040.pose.txt, line 1: '1 0 0' is no row"),
+        (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([2, 1, 1, 1])),
+         "000040.pose.txt: no rotation"),
+        (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([1, 1, -1, 1])),
+         "000040.pose.txt: no rotation .*the determinant is -1"),
+        (lambda p: np.savetxt(p / "frame-000040.pose.txt",
+                              RigidTransform([900, 0, 0]).GetAsMatrix4()),
+         "000040.color.png: its position .* is far from all others"),
+        (lambda p: (p / "frame-000040.depth.png").write_bytes(b""),
+         "000040.depth.png: the file is empty"),
+        (lambda p: (p / "frame-000040.depth.png").unlink(),
+         "000040.depth.png: the file is missing"),
+        (lambda p: (p / "frame-000040.color.png").write_bytes(b"no image"),
+         "000040.color.png: not a readable image"),
+        (lambda p: (f := p / "frame-000040.color.png").write_bytes(f.read_bytes()[:-500]),
+         "000040.color.png: not a readable image .*cut short"),
+        (lambda p: cv2.imwrite(str(p / "frame-000040.color.png"), np.zeros((24, 32, 3), np.uint8)),
+         "000040.color.png: 32x24 pixels where 64x48 are expected"),
+        (lambda p: cv2.imwrite(str(p / "frame-000040.depth.png"), np.zeros((24, 32), np.uint16)),
+         "000040.depth.png: 32x24 pixels where 64x48 are expected"),
+    ],
+)  # fmt: skip
+def test_one_bad_frame_is_left_out(write, config, spoil, message):
+    """A frame that cannot be used is left out and named, and the others stay what they were."""
+    path = write()
+    whole = read_capture(path, config())
+    spoil(path)
+    capture = read_capture(path, config())
+    assert len(capture.dropped) == 1 and len(capture) == 9
+    assert re.search(message, capture.dropped[0])
+    assert "frame-000040.color.png" not in capture.frame_names
+    np.testing.assert_array_equal(capture.frame(4).image, whole.frame(5).image)
+    assert capture.X_WCs[4].IsNearlyEqualTo(whole.X_WCs[5], 0)
+
+
+def test_too_many_bad_frames(write, config):
+    """More than a fifth of bad frames is an error that counts them and names the first."""
+    path = write()
+    for i in (0, 3, 5):
+        (path / f"frame-{10 * i:06d}.depth.png").unlink()
+    with pytest.raises(ValueError, match=r"7 of 10 frames .* 80%.*000000\.depth\.png: the file is"):
+        read_capture(path, config())
+
+
+def test_eight_bit_depth(write, config):
+    """A picture of depth is no depth."""
+    path = write()
+    cv2.imwrite(str(path / "frame-000010.depth.png"), np.zeros((48, 64), np.uint8))
+    with pytest.raises(ValueError, match=r"000010\.depth\.png: a uint8 array .* is no depth"):
+        read_capture(path, config()).frame(1)
+
+
+@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+def test_redkitchen():
+    """The real capture opens whole, and most colour pixels have depth, but not those at its rim."""
+    capture = read_capture(Path(os.environ["FLYSPLAT_DATA"]) / "redkitchen")
+    assert len(capture) == 200 and not capture.dropped
+    depth = capture.registered_depth(0)
+    assert depth.shape == (480, 640)
+    assert (depth[60:-60, 80:-80] > 0).mean() > 0.8
+    assert not depth[:15].any()

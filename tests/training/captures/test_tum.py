@@ -1,0 +1,76 @@
+import cv2
+import numpy as np
+import pytest
+
+from flysplat.training.captures.read_capture import read_capture
+
+FX, CX = 525.0, 320.0
+
+
+@pytest.fixture
+def write(tmp_path, room_views, room_poses):
+    """Writes the room as TUM does, at 80x60: depth 10 ms and poses 5 ms off the colour images."""
+    K = np.array([[FX, 0, CX], [0, FX, 240.0], [0, 0, 1]]) * [[1 / 8], [1 / 8], [1]]
+    (tmp_path / "rgb").mkdir()
+    (tmp_path / "depth").mkdir()
+    lists = {"rgb": ["# color images"], "depth": ["# depth maps"], "groundtruth": ["# t pose"]}
+    for i, view in enumerate(room_views(K, 80, 60)):
+        time = 100.0 + i / 30
+        cv2.imwrite(str(tmp_path / f"rgb/{time:.6f}.png"), view.image[..., ::-1])
+        cv2.imwrite(
+            str(tmp_path / f"depth/{time:.6f}.png"), np.round(5000 * view.depth).astype(np.uint16)
+        )
+        lists["rgb"].append(f"{time:.6f} rgb/{time:.6f}.png")
+        lists["depth"].append(f"{time + 0.01:.6f} depth/{time:.6f}.png")
+        w, x, y, z = view.X_WC.rotation().ToQuaternion().wxyz()
+        p = view.X_WC.translation()
+        for offset in (-0.005, 0.005):
+            # The camera passes the frame's place half-way between the two stamps.
+            row = (time + offset, *(p + np.array([100 * offset, 0, 0])), x, y, z, w)
+            lists["groundtruth"].append(" ".join(f"{value:.6f}" for value in row))
+    for name, lines in lists.items():
+        (tmp_path / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def test_room(write, shows_room):
+    """Depth is 5000 a metre, poses are interpolated in time, the driver's intrinsics are used."""
+    capture = read_capture(write)
+    assert len(capture) == 10 and not capture.dropped
+    shows_room(capture, color=0.5, depth=0.001)
+
+
+def test_images_without_depth_or_pose_are_left_out(write):
+    """Colour images with nothing near in time are left out, and counted."""
+    for name in ("depth.txt", "groundtruth.txt"):
+        lines = (write / name).read_text().splitlines()
+        (write / name).write_text(
+            "\n".join(lines[:-2] if name == "depth.txt" else lines[:1] + lines[3:])
+        )
+    capture = read_capture(write)
+    assert len(capture) == 7
+    assert "3 of 10 colour images have no depth within 0.02 s" in capture.dropped[0]
+
+
+def test_known_camera_is_undistorted(write, tmp_path):
+    """The folder's name tells the camera, whose distortion is taken out."""
+    named = write.rename(tmp_path.with_name("rgbd_dataset_freiburg1_room"))
+    capture = read_capture(named)
+    assert capture.K[0, 0] >= 517.3 / 8
+    assert np.abs(capture.K[:2, 2] - np.array([319.1, 255.8]) / 8).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("depth.txt", "# nothing\n", r"depth\.txt: lists no file"),
+        ("rgb.txt", "100.0\n", r"rgb\.txt, line 1: '100\.0' is not a time and a file name"),
+        ("groundtruth.txt", "1 2 3\n", r"groundtruth\.txt, line 1: '1 2 3' is no pose"),
+        ("groundtruth.txt", "1 0 0 0 0 0 0 1\n", r"groundtruth\.txt: 1 finite poses"),
+    ],
+)
+def test_bad_lists(write, name, text, message):
+    """A list that is not as it should be is named."""
+    (write / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_capture(write)

@@ -1,0 +1,117 @@
+"""What a capture's files leave open."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from flysplat.diagrams.configuration import load_config
+
+CONFIG_FILE = "capture.yaml"
+"""Name of the file in a capture's folder that may hold its `CaptureConfig`."""
+
+UP_AXES = {sign + axis for sign in ("", "-") for axis in "xyz"}
+
+
+@dataclass(kw_only=True)
+class ScaleConfig:
+    """Where metres come from when a capture has been registered from images alone; at most one."""
+
+    factor: float = 0.0
+    """[m] that one unit of length in the files is; 1 says that they are in metres."""
+    between: list[str] = field(default_factory=list)
+    """Two things `distance` apart: each an image, standing for its camera ("a.jpg"), or a pixel of
+    an image, standing for the point seen there ("a.jpg@812,344")."""
+    distance: float = 0.0
+    """[m] between them."""
+    camera_height: float = 0.0
+    """[m], median height of the cameras above the ground, a plane fitted to the points."""
+    depth_folder: str = ""
+    """Folder, inside the capture or absolute, with the depth of some images: `a.npy` [m] or `a.png`
+    (16 bits, `depth_unit` a metre) for `a.jpg`, in the same pixels."""
+
+    def validate(self) -> None:
+        """Raises ValueError for values that make no sense or more than one source of scale."""
+        if bool(self.between) != (self.distance != 0):
+            raise ValueError(
+                "scale.between and scale.distance belong together: two images or pixels and the "
+                "metres between them"
+            )
+        if self.between and len(self.between) != 2:
+            raise ValueError(f"scale.between names {len(self.between)} things, 2 are needed")
+        for name in ("factor", "distance", "camera_height"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(
+                    f"scale.{name} is {getattr(self, name)}; more than 0 and finite is needed"
+                )
+        if len(given := self.given()) > 1:
+            raise ValueError(
+                f"scale is given {len(given)} times, by {' and '.join(given)}; keep one of them"
+            )
+
+    def given(self) -> list[str]:
+        """The names of the fields that give a scale."""
+        names = ("factor", "distance", "camera_height", "depth_folder")
+        return [f"scale.{name}" for name in names if getattr(self, name)]
+
+
+@dataclass(kw_only=True)
+class CaptureConfig:
+    """What a capture's files leave open; empty and zero fields take what its kind usually has."""
+
+    kind: str = ""
+    """One of `flysplat.training.captures.read_capture.KINDS`; empty: told from the files."""
+    intrinsics: list[float] = field(default_factory=list)
+    """fx, fy, cx, cy [px] of the colour camera."""
+    depth_intrinsics: list[float] = field(default_factory=list)
+    """fx, fy, cx, cy [px] of a depth camera that is not the colour camera."""
+    p_DC: list[float] = field(default_factory=list)
+    """[m], position of the colour camera in the depth camera's axes, which are parallel."""
+    depth_unit: float = 0.0
+    """How many units of the stored depth make a metre: 1000 for millimetres."""
+    up: str = ""
+    """Which way is up: x, y, z, -x, -y or -z of the files' world; `cameras`: where the cameras'
+    images are level on average; `ground`: across the largest plane below the cameras."""
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
+    """Where metres come from when images alone were registered."""
+    cache: str = ""
+    """Folder that keeps the registration of photographs, which takes minutes; empty: a folder
+    of their own in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`."""
+
+    def validate(self) -> None:
+        """Raises ValueError for values that make no sense."""
+        for name, size in (("intrinsics", 4), ("depth_intrinsics", 4), ("p_DC", 3)):
+            values = getattr(self, name)
+            if values and (len(values) != size or not np.isfinite(values).all()):
+                raise ValueError(f"capture.{name} is {values}; {size} finite numbers are needed")
+            if size == 4 and values and min(values[:2]) <= 0:
+                raise ValueError(f"capture.{name} is {values}; focal lengths must be positive")
+        if not 0 <= self.depth_unit < np.inf:
+            raise ValueError(
+                f"capture.depth_unit is {self.depth_unit}; units a metre, more than 0, are needed"
+            )
+        if self.up and self.up not in UP_AXES | {"cameras", "ground"}:
+            raise ValueError(
+                f"capture.up is {self.up!r}; known are x, y, z, -x, -y, -z, cameras and ground"
+            )
+        self.scale.validate()
+
+
+def completed_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
+    """Returns `config` with what it leaves open taken from the capture's own `capture.yaml`.
+
+    Raises:
+        ValueError: if either makes no sense.
+    """
+    file = path / CONFIG_FILE
+    completed = load_config(CaptureConfig(), file if file.is_file() else None)
+    for other, default, merged in (
+        (config, CaptureConfig(), completed),
+        (config and config.scale, ScaleConfig(), completed.scale),
+    ):
+        for name in (each.name for each in dataclasses.fields(default)):
+            if other and name != "scale" and getattr(other, name) != getattr(default, name):
+                setattr(merged, name, getattr(other, name))
+    completed.validate()
+    return completed

@@ -1,0 +1,141 @@
+"""COLMAP models: images and a sparse model, read by pycolmap, undistorted, with their points.
+
+The world of a model is that of its registration: where up is and how long a metre is comes from the
+configuration. COLMAP's image coordinates count as ours, from the corner of the first pixel.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.training.captures.capture import Capture, FileAxes, SfmPoints
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.frame_files import FrameFiles, open_frames
+from flysplat.training.captures.image_files import read_depth
+from flysplat.training.captures.lens import Lens, pinhole
+from flysplat.training.captures.metric_scale import made_metric
+from flysplat.training.captures.poses import pose_from_matrix
+from flysplat.training.captures.upright import raised
+
+_MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
+_IMAGE_FOLDERS = ("images", "../images", "../../images", "")
+_NEAREST = 20.0
+"""[px], how far a point that is meant by a pixel may be from it."""
+
+
+def model_folder(path: Path) -> Path | None:
+    """Returns the folder in a capture that holds a COLMAP model, None if none does."""
+    for name in _MODEL_FOLDERS:
+        for suffix in (".bin", ".txt"):
+            if all((path / name / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
+                return path / name
+    return None
+
+
+def read_colmap(path: Path, config: CaptureConfig) -> Capture:
+    """Opens a COLMAP model with its images.
+
+    Raises:
+        FileNotFoundError: if there is no model or no folder of images.
+        ValueError: if the model cannot be read, too many frames cannot be used, or the scale cannot
+            be had as `config` asks.
+    """
+    model = model_folder(path)
+    if model is None:
+        raise FileNotFoundError(f"{path}: no COLMAP model (cameras, images, points3D) in it")
+    try:
+        reconstruction = pycolmap.Reconstruction(model)
+    except Exception as error:  # pycolmap raises what its C++ raises
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{model}: not a readable COLMAP model ({reason})") from None
+    names = [image.name for image in reconstruction.images.values()]
+    if not names:
+        raise ValueError(f"{model}: the COLMAP model has no images")
+    for folder in _IMAGE_FOLDERS:
+        if any((path / folder / name).is_file() for name in names):
+            return capture_of_model(path, "COLMAP model", reconstruction, path / folder, config)
+    raise FileNotFoundError(
+        f"{path}: none of the model's images, such as {names[0]}, is in {path / 'images'} or here"
+    )
+
+
+def capture_of_model(
+    path: Path,
+    kind: str,
+    reconstruction: pycolmap.Reconstruction,
+    images: Path,
+    config: CaptureConfig,
+    dropped: tuple[str, ...] = (),
+) -> Capture:
+    """Returns the capture of a registered model, upright and, if `config` says how, metric."""
+    lenses = {number: _lens(camera, config) for number, camera in reconstruction.cameras.items()}
+    depths = path / config.scale.depth_folder if config.scale.depth_folder else None
+
+    def frame(image: pycolmap.Image) -> FrameFiles:
+        world_to_camera = image.cam_from_world().inverse().matrix()
+
+        def X_FC() -> RigidTransform:
+            return pose_from_matrix(world_to_camera, f"{path}, image {image.name}")
+
+        return FrameFiles(
+            images / image.name,
+            X_FC,
+            _depth_file(depths, image.name) if depths is not None else None,
+            lenses[image.camera_id],
+        )
+
+    registered = [image for image in reconstruction.images.values() if image.has_pose]
+    capture = open_frames(
+        path,
+        kind,
+        [frame(image) for image in sorted(registered, key=lambda image: image.name)],
+        axes=FileAxes("optical: x right, y down, z forward", RotationMatrix(), RotationMatrix()),
+        read_depth=lambda file: read_depth(file, config.depth_unit or 1000.0),
+        dropped=dropped,
+    )
+    by_name = {image.name: image for image in registered}
+
+    def locate(name: str, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
+        image = by_name[name]
+        seen = [point for point in image.points2D if point.has_point3D()]
+        distance = [float(np.linalg.norm(point.xy - pixel)) for point in seen]
+        if not seen or min(distance) > _NEAREST:
+            nearest = f"the nearest is {min(distance):.0f} px away" if seen else "there is none"
+            raise ValueError(
+                f"scale.between: no registered point within {_NEAREST:g} px of {name}@"
+                f"{pixel[0]:g},{pixel[1]:g} ({nearest}); choose a more distinct place"
+            )
+        return reconstruction.points3D[seen[int(np.argmin(distance))].point3D_id].xyz
+
+    points = list(reconstruction.points3D.values())
+    if points:
+        capture = dataclasses.replace(
+            capture,
+            points=SfmPoints(
+                np.array([point.xyz for point in points]),
+                np.array([point.color for point in points]) / 255,
+            ),
+        )
+    return raised(made_metric(capture, config.scale, locate), config.up or "cameras")
+
+
+def _lens(camera: pycolmap.Camera, config: CaptureConfig) -> Lens:
+    K = pinhole(*config.intrinsics) if config.intrinsics else camera.calibration_matrix()
+    if config.intrinsics or camera.is_undistorted():
+        return Lens(K, camera.width, camera.height)
+
+    def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+
+    return Lens(K, camera.width, camera.height, project)
+
+
+def _depth_file(folder: Path, name: str) -> Path | None:
+    stem = folder / Path(name).stem
+    files = (stem.with_name(stem.name + suffix) for suffix in (".npy", ".png"))
+    return next((file for file in files if file.is_file()), None)

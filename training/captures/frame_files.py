@@ -1,0 +1,182 @@
+"""From lists of files and poses to a `Capture`; every format that keeps frames in files ends here.
+
+What is wrong with single frames leaves those out, with a message each in `Capture.dropped`: files
+that are missing, empty, unreadable or of another size, poses that are not finite, no rotation or
+far from all others. It is an error if more than a fifth of the frames are left out, because then it
+is the capture that is read wrongly.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
+from flysplat.training.captures.image_files import depth_size, image_size, read_image
+from flysplat.training.captures.lens import Lens, common_pinhole, resampling_maps
+from flysplat.training.captures.poses import stray_frames
+
+MAX_DROPPED = 0.2
+"""The fraction of frames that may be left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFiles:
+    """One frame of a capture, not yet looked at."""
+
+    image: Path
+    X_FB: Callable[[], RigidTransform]
+    """Returns the pose as the file gives it, or raises ValueError that names the file: that of a
+    body B, the camera with the file's axes, in the file's world F."""
+    depth: Path | None = None
+    lens: Lens | None = None
+    """The camera of this frame; None takes that of the capture."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """A frame whose files look whole."""
+
+    image: Path
+    size: tuple[int, int]  # width and height [px]
+    depth: Path | None
+    depth_size: tuple[int, int] | None
+    lens: Lens | None
+    X_FB: RigidTransform
+
+
+def open_frames(
+    path: Path,
+    kind: str,
+    frames: Sequence[FrameFiles],
+    *,
+    axes: FileAxes,
+    lens: Callable[[int, int], Lens] = lambda width, height: _no_lens(),
+    read_depth: Callable[[Path], NDArray[np.float32]] | None = None,
+    depth_camera: Callable[[int, int], DepthCamera] | None = None,
+    dropped: Sequence[str] = (),
+) -> Capture:
+    """Opens the frames; images and depths are read when asked for.
+
+    Args:
+        path: the capture's folder or file.
+        kind: what it is called in `Capture.source`.
+        axes: the axes of the files' poses.
+        lens: gives the camera of images of a width and height [px], for frames that bring none.
+        read_depth: reads the depth [m] in a file; None if there is none.
+        depth_camera: gives the camera of depth images of a width and height [px]; None if depth has
+            the pixels of the images before they are undistorted.
+        dropped: messages about frames that were left out already, which do not count further.
+
+    Raises:
+        ValueError: if fewer than two frames, or less than four fifths of them, can be used.
+    """
+    messages = list(dropped)
+    sound: list[_Frame] = []
+    for frame in frames:
+        try:
+            sound.append(_looked_at(frame))
+        except (ValueError, OSError) as error:
+            messages.append(str(error))
+    sound = _of_usual_size(sound, messages, registered=depth_camera is None)
+    if sound:
+        stray = set(stray_frames(np.array([frame.X_FB.translation() for frame in sound])).tolist())
+        for i in sorted(stray):
+            p = sound[i].X_FB.translation().round(1)
+            messages.append(f"{sound[i].image}: its position {p} is far from all others")
+        sound = [frame for i, frame in enumerate(sound) if i not in stray]
+    if len(sound) < max(2, (1 - MAX_DROPPED) * len(frames)):
+        first = f"; the first that cannot: {messages[0]}" if messages else ""
+        raise ValueError(
+            f"{path}: {len(sound)} of {len(frames)} frames can be used, at least 2 and "
+            f"{1 - MAX_DROPPED:.0%} are needed{first}"
+        )
+
+    shared = None if all(frame.lens for frame in sound) else lens(*sound[0].size)
+    lenses = [frame.lens or shared for frame in sound]
+    distinct = [each for each in dict.fromkeys(lenses) if each is not None]
+    camera = common_pinhole(distinct)
+    maps = {each: resampling_maps(each, camera) for each in distinct}
+    has_depth = read_depth is not None and any(frame.depth for frame in sound)
+
+    def load_image(i: int) -> NDArray[np.uint8]:
+        image = read_image(sound[i].image)
+        return _resampled(_sized(image, sound[i].image, sound[i].size), i, cv2.INTER_LINEAR)
+
+    def load_depth(i: int) -> NDArray[np.float32] | None:
+        file, size = sound[i].depth, sound[i].depth_size
+        if file is None or size is None or read_depth is None:
+            return None
+        depth = _sized(read_depth(file), file, size)
+        # Between surfaces an average would be a place where nothing is.
+        return depth if depth_camera else _resampled(depth, i, cv2.INTER_NEAREST)
+
+    def _resampled(image: NDArray, i: int, interpolation: int) -> NDArray:
+        lens = lenses[i]
+        if lens is None or (found := maps[lens]) is None:
+            return image
+        return cv2.remap(image, *found, interpolation)
+
+    R_WF, R_BC = RigidTransform(axes.R_WF), RigidTransform(axes.R_BC)
+    depth_sizes = [frame.depth_size for frame in sound if frame.depth_size]
+    return Capture(
+        name=path.resolve().name,
+        source=f"{kind} {path.resolve()}",
+        K=camera.K,
+        width=camera.width,
+        height=camera.height,
+        X_WCs=[R_WF @ frame.X_FB @ R_BC for frame in sound],
+        load_image=load_image,
+        load_depth=load_depth if has_depth else no_depth,
+        depth_camera=depth_camera(*depth_sizes[0]) if depth_camera and has_depth else None,
+        frame_names=[frame.image.name for frame in sound],
+        dropped=messages,
+        axes=axes,
+    )
+
+
+def _no_lens() -> Lens:
+    raise ValueError("the intrinsics are unknown; set capture.intrinsics to [fx, fy, cx, cy]")
+
+
+def _looked_at(frame: FrameFiles) -> _Frame:
+    size = image_size(frame.image)
+    if frame.lens is not None and size != (frame.lens.width, frame.lens.height):
+        raise ValueError(_size_message(frame.image, size, (frame.lens.width, frame.lens.height)))
+    found = depth_size(frame.depth) if frame.depth is not None else None
+    return _Frame(frame.image, size, frame.depth, found, frame.lens, frame.X_FB())
+
+
+def _of_usual_size(frames: Sequence[_Frame], messages: list[str], registered: bool) -> list[_Frame]:
+    """Leaves out frames of another size than most, or whose depth is."""
+    sizes = [frame.size for frame in frames if frame.lens is None]
+    usual = max(sizes, key=sizes.count, default=None)
+    depth_sizes = [frame.depth_size for frame in frames if frame.depth_size]
+    usual_depth = max(depth_sizes, key=depth_sizes.count, default=None)
+    kept = []
+    for frame in frames:
+        wanted = frame.size if registered else usual_depth
+        if frame.lens is None and usual is not None and frame.size != usual:
+            messages.append(_size_message(frame.image, frame.size, usual))
+        elif frame.depth and frame.depth_size and wanted and frame.depth_size != wanted:
+            messages.append(_size_message(frame.depth, frame.depth_size, wanted))
+        else:
+            kept.append(frame)
+    return kept
+
+
+def _size_message(file: Path, size: tuple[int, int], wanted: tuple[int, int]) -> str:
+    return (
+        f"{file}: {size[0]}x{size[1]} pixels where {wanted[0]}x{wanted[1]} are expected; all "
+        "images of a camera, and all depths, must have one size"
+    )
+
+
+def _sized(array: NDArray, file: Path, size: tuple[int, int]) -> NDArray:
+    if array.shape[1::-1] != size:
+        raise ValueError(_size_message(file, array.shape[1::-1], size))
+    return array

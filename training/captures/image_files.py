@@ -1,0 +1,149 @@
+"""Reading the images and depths of captures, and telling early which cannot be read."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
+
+_ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
+
+
+def image_size(file: Path) -> tuple[int, int]:
+    """Returns width and height [px] of an image without decoding it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is empty, no image or cut short.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: the file is missing")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{file}: the file is empty; copy it again")
+    try:
+        with Image.open(file) as image:
+            size, kind = image.size, image.format
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(
+            f"{file}: not a readable image ({_reason(error)}); copy it again"
+        ) from None
+    with file.open("rb") as stream:
+        # Cameras append previews and padding to JPEGs, so the end is looked for, not asked for.
+        stream.seek(max(0, file.stat().st_size - 65536))
+        if _ENDS.get(kind or "", b"") not in stream.read():
+            raise ValueError(f"{file}: not a readable image (it is cut short); copy it again")
+    return size
+
+
+def array_shape(file: Path) -> tuple[int, ...]:
+    """Returns the shape of an array in a `.npy` file without reading it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is empty, no array or cut short.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: the file is missing")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{file}: the file is empty; copy it again")
+    try:
+        return np.load(file, mmap_mode="r", allow_pickle=False).shape
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(
+            f"{file}: not a readable array ({_reason(error)}); copy it again"
+        ) from None
+
+
+def depth_size(file: Path) -> tuple[int, int]:
+    """Returns width and height [px] of a depth image or array; raises as the two above."""
+    if file.suffix != ".npy":
+        return image_size(file)
+    shape = array_shape(file)
+    if len(shape) != 2:
+        raise ValueError(f"{file}: an array of shape {shape}; depth has rows and columns alone")
+    return shape[1], shape[0]
+
+
+def read_image(file: Path) -> NDArray[np.uint8]:
+    """Returns an image as (H, W, 3) red, green, blue; raises ValueError if it is unreadable."""
+    # The pixels as they are stored: poses and intrinsics belong to them, not to the turned picture.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    return cv2.cvtColor(_decoded(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
+
+
+def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
+    """Returns depth (H, W) [m] from `.npy`, or from an image of integers or floats.
+
+    Args:
+        unit: how many units of the file make a metre.
+
+    What is no number or not in front of the camera, and the largest 16-bit number, which sensors
+    write where they see nothing, become 0, unknown.
+    """
+    if file.suffix == ".npy":
+        try:
+            raw = np.load(file, allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            reason = _reason(error)
+            raise ValueError(f"{file}: not a readable array ({reason}); copy it again") from None
+    else:
+        raw = _decoded(file, cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or raw.dtype == np.uint8:
+        raise ValueError(
+            f"{file}: a {raw.dtype} array of shape {raw.shape} is no depth; rows and columns of "
+            "more than 8 bits are needed"
+        )
+    depth = raw.astype(np.float32) / np.float32(unit)
+    if raw.dtype == np.uint16:
+        depth[raw == 65535] = 0
+    return _cleaned(depth)
+
+
+def read_packed_depth(file: Path) -> NDArray[np.float32]:
+    """Returns depth (H, W) [m] from a PNG whose four channels hold the bytes of a float32."""
+    raw = _decoded(file, cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 3 or raw.shape[2] != 4 or raw.dtype != np.uint8:
+        raise ValueError(
+            f"{file}: a {raw.dtype} array of shape {raw.shape}; four channels of 8 bits, the bytes "
+            "of 32-bit depth, are needed"
+        )
+    return _cleaned(np.ascontiguousarray(raw).view("<f4")[..., 0].copy())
+
+
+def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
+    """Returns the files of `folder` by the number in their name, in its order.
+
+    Args:
+        pattern: regular expression of the whole name, whose group is the number.
+
+    Raises:
+        FileNotFoundError: if no name is like that.
+    """
+    files = {}
+    for file in folder.iterdir():
+        if match := re.fullmatch(pattern, file.name):
+            files[int(match[1])] = file
+    if not files:
+        raise FileNotFoundError(f"{folder}: holds no file named like {pattern}")
+    return dict(sorted(files.items()))
+
+
+def _cleaned(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    depth[np.isnan(depth) | (depth < 0)] = 0
+    return depth
+
+
+def _decoded(file: Path, flags: int) -> NDArray:
+    raw = np.fromfile(file, dtype=np.uint8)
+    image = cv2.imdecode(raw, flags) if len(raw) else None
+    if image is None:
+        raise ValueError(f"{file}: not a readable image; copy it again")
+    return image
+
+
+def _reason(error: Exception) -> str:
+    return str(error).partition("\n")[0].partition(" '")[0]

@@ -1,0 +1,184 @@
+"""Captures in nerfstudio's `transforms.json`.
+
+As nerfstudio documents it: `transform_matrix` takes camera axes of OpenGL (x right, y up, z back)
+to a world with z up; intrinsics and distortion stand once or with each frame; a `depth_file_path`
+holds planar depth in units of `depth_unit_scale_factor` (0.001); `ply_file_path` holds points.
+Whether lengths are metres the file does not say: they are taken to be if there is depth.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyParseError
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes, SfmPoints
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.frame_files import FrameFiles, open_frames
+from flysplat.training.captures.image_files import depth_size, image_size, read_depth
+from flysplat.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
+from flysplat.training.captures.metric_scale import made_metric
+from flysplat.training.captures.poses import pose_from_matrix
+from flysplat.training.captures.upright import raised
+
+TRANSFORMS = "transforms.json"
+
+_AXES = FileAxes(
+    "OpenGL: x right, y up, z back", RotationMatrix(), RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+)
+_DISTORTION = {
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+}
+
+
+def is_nerfstudio(path: Path) -> bool:
+    """Tells whether the folder holds a `transforms.json`."""
+    return (path / TRANSFORMS).exists()
+
+
+def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
+    """Opens a capture in nerfstudio's format.
+
+    Raises:
+        FileNotFoundError: if there is no `transforms.json`.
+        ValueError: if it is not as it should be, too many frames cannot be used, or the scale
+            cannot be had as `config` asks.
+    """
+    file = path / TRANSFORMS
+    try:
+        content = json.loads(file.read_text())
+        entries = list(content["frames"])
+        named = [(entry["file_path"], entry["transform_matrix"], entry) for entry in entries]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{file}: not nerfstudio's format ({error}); `frames` with `file_path` and "
+            "`transform_matrix` is needed"
+        ) from None
+    lenses: dict[tuple, Lens] = {}  # Equal cameras share one, and one resampling.
+    frames = []
+    for i, (name, matrix, entry) in enumerate(named):
+        image = _image_file(path, str(name))
+        depth = entry.get("depth_file_path")
+        frames.append(
+            FrameFiles(
+                image,
+                _pose(matrix, f"{file}, frame {i} ({name})"),
+                path / depth if depth else None,
+                _lens(file, {**content, **entry}, image, config, lenses),
+            )
+        )
+    unit = config.depth_unit or 1 / float(content.get("depth_unit_scale_factor", 1e-3))
+    capture = open_frames(
+        path,
+        "nerfstudio capture",
+        frames,
+        axes=_AXES,
+        read_depth=lambda file: read_depth(file, unit),
+        depth_camera=_smaller_depth_camera(frames),
+    )
+    if points := content.get("ply_file_path"):
+        capture = dataclasses.replace(capture, points=_read_points(path / points))
+    if config.scale.given() or not capture.has_depth:
+        capture = made_metric(capture, config.scale)
+    return raised(capture, config.up or "z")
+
+
+def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:
+    def X_FB() -> RigidTransform:
+        try:
+            array = np.array(matrix, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.zeros(0)
+        if array.shape not in ((4, 4), (3, 4)):
+            raise ValueError(f"{source}: transform_matrix is no 4x4 matrix of numbers")
+        return pose_from_matrix(array, source)
+
+    return X_FB
+
+
+def _image_file(path: Path, name: str) -> Path:
+    """Returns the file of an image, whose name may lack its suffix."""
+    file = path / name
+    if file.is_file() or file.suffix:
+        return file
+    return next((f for f in sorted(file.parent.glob(file.name + ".*")) if f.is_file()), file)
+
+
+def _lens(
+    file: Path,
+    values: dict[str, Any],
+    image: Path,
+    config: CaptureConfig,
+    lenses: dict[tuple, Lens],
+) -> Lens | None:
+    """Returns the camera that `values` describe, None if the image's size is needed and unknown."""
+    model = str(values.get("camera_model", "OPENCV"))
+    if model not in _DISTORTION:
+        raise ValueError(
+            f"{file}: camera_model is {model}; known are {', '.join(sorted(_DISTORTION))}"
+        )
+    try:
+        if "w" in values and "h" in values:
+            width, height = int(values["w"]), int(values["h"])
+        else:
+            width, height = image_size(image)
+        if config.intrinsics:
+            fx, fy, cx, cy = config.intrinsics
+        else:
+            if "fl_x" in values:
+                fx = float(values["fl_x"])
+            else:
+                fx = width / 2 / np.tan(float(values["camera_angle_x"]) / 2)
+            fy = float(values.get("fl_y", fx))
+            cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
+        distortion = tuple(float(values.get(name, 0.0)) for name in _DISTORTION[model])
+    except OSError:
+        return None
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{file}: the camera of {image.name} is not described ({error}); w, h, fl_x, fl_y, cx "
+            "and cy, or camera_angle_x, are needed"
+        ) from None
+    key = (model, width, height, fx, fy, cx, cy, distortion)
+    if key not in lenses:
+        make = fisheye_lens if model == "OPENCV_FISHEYE" else opencv_lens
+        lenses[key] = make(pinhole(fx, fy, cx, cy), width, height, distortion)
+    return lenses[key]
+
+
+def _smaller_depth_camera(
+    frames: Sequence[FrameFiles],
+) -> Callable[[int, int], DepthCamera] | None:
+    """Returns the camera of depth of another resolution than the images; None if it is the same."""
+    for frame in frames:
+        lens = frame.lens
+        if frame.depth is None or lens is None or not frame.depth.is_file():
+            continue
+        if depth_size(frame.depth) == (lens.width, lens.height):
+            return None
+        if lens.project is not None:
+            raise ValueError(
+                f"{frame.depth}: depth of another resolution than images that are distorted; "
+                "resample it to the images' size, or undistort both"
+            )
+        return lambda width, height: DepthCamera(
+            lens.scaled(width, height).K, width, height, RigidTransform()
+        )
+    return None
+
+
+def _read_points(file: Path) -> SfmPoints:
+    try:
+        vertices = PlyData.read(str(file))["vertex"]
+        p_WQ = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
+        colors = np.column_stack([vertices[name] for name in ("red", "green", "blue")])
+    except (OSError, PlyParseError, KeyError, ValueError) as error:
+        raise ValueError(f"{file}: not a PLY of coloured points ({error})") from None
+    return SfmPoints(p_WQ, colors.astype(np.float64) / 255)

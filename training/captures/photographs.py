@@ -1,0 +1,181 @@
+"""Photographs alone, registered with pycolmap: SIFT, exhaustive matching, incremental mapping.
+
+The registration is kept in a cache under a name made from the photographs, so that it happens once.
+"""
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
+import pycolmap
+from PIL import Image
+from tqdm import tqdm
+
+from flysplat.training.captures.capture import Capture
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.colmap import capture_of_model
+from flysplat.training.captures.image_files import IMAGE_SUFFIXES, image_size
+
+_MAX_SIZE = 1600
+"""[px], longer side of the images in which features are sought."""
+_SMALL = 1200
+"""[px], longer side below which photographs are enlarged for it."""
+_SEED = 0
+_EXIF_MODEL, _EXIF_IFD, _EXIF_FOCAL_LENGTH = 0x0110, 0x8769, 0x920A
+
+
+def photographs_in(path: Path) -> list[Path]:
+    """Returns the images that lie in a folder, or in its folder `images`, by name."""
+    for folder in (path, path / "images"):
+        if folder.is_dir():
+            files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+            if files:
+                return sorted(files)
+    return []
+
+
+def read_photographs(path: Path, config: CaptureConfig) -> Capture:
+    """Opens photographs without poses, which are registered first unless that has been done.
+
+    Photographs that cannot be read or registered are left out.
+
+    Raises:
+        ValueError: if fewer than half of the photographs, or fewer than three, can be registered,
+            or the scale cannot be had as `config` asks.
+        OSError: if the cache cannot be written.
+    """
+    files, dropped = [], []
+    for file in photographs_in(path):
+        try:
+            image_size(file)
+            files.append(file)
+        except (ValueError, OSError) as error:
+            dropped.append(str(error))
+    total = len(files) + len(dropped)
+    if len(files) < 3:
+        raise ValueError(f"{path}: {len(files)} readable photographs, at least 3 are needed")
+    folder = files[0].parent
+    names = [file.name for file in files]
+    model = _cache(files, config) / "model"
+    if not model.is_dir():
+        _register(folder, names, _one_camera(files), model)
+    reconstruction = pycolmap.Reconstruction(model)
+    registered = {image.name for image in reconstruction.images.values() if image.has_pose}
+    dropped += [
+        f"{folder / name}: not registered, it shares too little with the other photographs"
+        for name in names
+        if name not in registered
+    ]
+    if len(registered) < max(3, total / 2):
+        raise ValueError(
+            f"{path}: {len(registered)} of {total} photographs could be registered, at least 3 and "
+            "half of them are needed; take more of them, each sharing most of its view with others"
+        )
+    return capture_of_model(
+        path, "photographs", reconstruction, folder, config, dropped=tuple(dropped)
+    )
+
+
+def _cache(files: list[Path], config: CaptureConfig) -> Path:
+    if config.cache:
+        return Path(config.cache)
+    key = hashlib.sha256(f"{pycolmap.__version__} {_MAX_SIZE} {_SEED}".encode())
+    for file in files:
+        status = file.stat()
+        key.update(f"{file.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "flysplat" / "photographs" / key.hexdigest()[:16]
+
+
+def _one_camera(files: list[Path]) -> bool:
+    """Tells whether size, camera model and focal length are the same in all photographs."""
+    kinds = set()
+    for file in files:
+        with Image.open(file) as image:
+            exif = image.getexif()
+            focal_length = exif.get_ifd(_EXIF_IFD).get(_EXIF_FOCAL_LENGTH)
+            kinds.add((image.size, exif.get(_EXIF_MODEL), focal_length))
+    return len(kinds) == 1
+
+
+def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> None:
+    """Registers photographs and writes the largest model that results, whole or not at all.
+
+    Seeds are fixed and images get their numbers in order, so that the result does not depend on
+    which thread is first.
+    """
+    try:
+        model.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(
+            f"{model.parent}: cannot be written ({error.strerror}); set capture.cache to a folder "
+            "that can"
+        ) from None
+    work = model.with_name(f".{os.getpid()}.partial")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    pycolmap.set_random_seed(_SEED)
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 2
+    try:
+        database = work / "database.db"
+        mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
+        pycolmap.Database.open(database).close()
+        pycolmap.import_images(database, folder, mode, names)
+        extraction = pycolmap.FeatureExtractionOptions(max_image_size=_MAX_SIZE, use_gpu=False)
+        # Enlarging the image first finds more in small ones and takes four times as long.
+        small = max(max(image_size(folder / name)) for name in names) < _SMALL
+        extraction.sift.first_octave = -1 if small else 0
+        threads = os.cpu_count() or 1
+        with tqdm(total=len(names), desc="features", unit="photo") as progress:
+            for start in range(0, len(names), threads):
+                some = names[start : start + threads]
+                pycolmap.extract_features(database, folder, some, extraction_options=extraction)
+                progress.update(len(some))
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = _SEED
+        pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+        block = max(1, len(pairs) // 20)
+        with tqdm(total=len(pairs), desc="matching", unit="pair") as progress:
+            for start in range(0, len(pairs), block):
+                some = pairs[start : start + block]
+                listed = work / "pairs.txt"
+                listed.write_text("".join(f"{a} {b}\n" for a, b in some))
+                pycolmap.match_image_pairs(
+                    database,
+                    matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
+                    pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+                    verification_options=verification,
+                )
+                progress.update(len(some))
+        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, num_threads=1)
+        options.mapper.random_seed = options.triangulation.random_seed = _SEED
+        options.mapper.num_threads = 1
+        options.min_model_size = min(options.min_model_size, len(names))
+        with tqdm(total=len(names), desc="registering", unit="photo") as progress:
+            models = pycolmap.incremental_mapping(
+                database,
+                folder,
+                work,
+                options,
+                initial_image_pair_callback=lambda: _advance(progress, 2),
+                next_image_callback=lambda: _advance(progress, 1),
+            )
+        if not models:
+            raise ValueError(
+                f"{folder}: the {len(names)} photographs could not be registered; take them closer "
+                "together, of a place with texture, moving between them"
+            )
+        largest = max(models.values(), key=lambda each: each.num_reg_images())
+        written = work / "written"
+        written.mkdir()
+        largest.write(written)
+        os.replace(written, model)
+    finally:
+        pycolmap.logging.minloglevel = level
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _advance(progress: tqdm, count: int) -> None:
+    progress.update(count)

@@ -1,0 +1,88 @@
+"""Reading the poses of captures."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+_LARGEST = 1e6
+"""[m], beyond which a position is no place of any capture."""
+
+
+def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
+    """Returns the rows of numbers of a text file, each (columns,); NaN is read as such.
+
+    Lines that start with # and empty lines at the end are left out.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if a line does not hold `columns` numbers, which `what` describes.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: the file is missing")
+    rows = []
+    for number, line in enumerate(file.read_text(errors="replace").rstrip().splitlines(), start=1):
+        if line.startswith("#"):
+            continue
+        try:
+            row = np.array(line.split(), dtype=np.float64)
+        except ValueError:
+            row = np.array([])
+        if row.shape != (columns,):
+            raise ValueError(f"{file}, line {number}: {line[:80]!r} is no {what}")
+        rows.append(row)
+    return rows
+
+
+def pose_from_quaternion(row: NDArray[np.float64], source: str) -> RigidTransform:
+    """Returns the pose of a row tx ty tz qx qy qz qw.
+
+    Raises:
+        ValueError: if it is no pose; the message starts with `source`.
+    """
+    _require_position(row[:3], source)
+    norm = np.linalg.norm(row[3:])
+    if not abs(norm - 1) < 1e-3:
+        raise ValueError(
+            f"{source}: the quaternion has the length {norm:.6g}, 1 within 0.001 is needed; the "
+            "order should be tx ty tz qx qy qz qw"
+        )
+    x, y, z, w = row[3:]
+    return RigidTransform(Quaternion(np.array([w, x, y, z]) / norm), row[:3])
+
+
+def pose_from_matrix(matrix: NDArray[np.float64], source: str) -> RigidTransform:
+    """Returns the pose of a matrix (4, 4) whose rotation may be off by rounding.
+
+    Raises:
+        ValueError: if it is no pose; the message starts with `source`.
+    """
+    R, p = matrix[:3, :3], matrix[:3, 3]
+    _require_position(p, source)
+    if not np.isfinite(R).all():
+        raise ValueError(f"{source}: the pose is not finite (tracking was lost?)")
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    if error > 0.01 or np.linalg.det(R) < 0:
+        raise ValueError(
+            f"{source}: no rotation (R R^T is off by {error:.2g}, the determinant is "
+            f"{np.linalg.det(R):.3g}); a rigid transform is needed"
+        )
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
+
+
+def _require_position(p: NDArray[np.float64], source: str) -> None:
+    if not np.isfinite(p).all():
+        raise ValueError(f"{source}: the pose is not finite (tracking was lost?)")
+    if np.abs(p).max() > _LARGEST:
+        raise ValueError(f"{source}: the position {p} is more than {_LARGEST:g} m away")
+
+
+def stray_frames(positions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Returns the numbers of positions (N, 3) so far from the others that they must be mistakes.
+
+    Those are farther from the median position than 20 times what four in five are, and than 10 m.
+    """
+    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    return np.flatnonzero(distance > max(10.0, 20 * np.quantile(distance, 0.8)))

@@ -1,0 +1,126 @@
+"""RGB-D sequences of the TUM kind: `rgb.txt`, `depth.txt`, `groundtruth.txt` with time stamps.
+
+Layout, intrinsics and the 5000 units a metre as published with the data set (Sturm et al., "A
+Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012). Depth is registered to colour;
+poses `tx ty tz qx qy qz qw` are those of the optical axes in a world with z up. A colour image is
+paired with the depth nearest in time, and its pose is interpolated between two measured ones.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.training.captures.capture import Capture, FileAxes
+from flysplat.training.captures.capture_config import CaptureConfig
+from flysplat.training.captures.frame_files import FrameFiles, open_frames
+from flysplat.training.captures.image_files import read_depth
+from flysplat.training.captures.lens import Lens, opencv_lens, pinhole
+from flysplat.training.captures.poses import pose_from_quaternion, read_rows
+from flysplat.training.captures.upright import raised
+
+_MAX_APART = 0.02
+"""[s] between a colour image and its depth, as the data set's own tools have it."""
+_MAX_GAP = 0.1
+"""[s] between two poses that one is interpolated from."""
+
+# fx, fy, cx, cy [px], counted from the first pixel's centre, and distortion k1 k2 p1 p2 k3, of the
+# three cameras that the sequences' names tell apart; of any other, the driver's default.
+_CAMERAS = {
+    "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": ((535.4, 539.2, 320.1, 247.6), (0.0, 0.0, 0.0, 0.0, 0.0)),
+}
+_DEFAULT = ((525.0, 525.0, 319.5, 239.5), (0.0, 0.0, 0.0, 0.0, 0.0))
+
+
+def is_tum(path: Path) -> bool:
+    """Tells whether the folder looks like a TUM RGB-D sequence, whole or not."""
+    return (path / "rgb.txt").exists() and (path / "groundtruth.txt").exists()
+
+
+def read_tum(path: Path, config: CaptureConfig) -> Capture:
+    """Opens a TUM RGB-D sequence. Colour images without depth or pose in time are left out.
+
+    Raises:
+        FileNotFoundError: if a list is missing.
+        ValueError: if a list is not as it should be, or too many frames cannot be used.
+    """
+    color_times, colors = _read_list(path / "rgb.txt")
+    depth_times, depths = _read_list(path / "depth.txt")
+    pose_file = path / "groundtruth.txt"
+    rows = read_rows(pose_file, 8, "pose; eight numbers t tx ty tz qx qy qz qw are needed")
+    rows = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 8)
+    if len(rows) < 2:
+        raise ValueError(f"{pose_file}: {len(rows)} finite poses, at least 2 are needed")
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+
+    frames = []
+    for time, color in zip(color_times, colors, strict=True):
+        nearest = int(np.argmin(np.abs(depth_times - time)))
+        after = int(np.searchsorted(rows[:, 0], time))
+        if (
+            abs(depth_times[nearest] - time) <= _MAX_APART
+            and 0 < after < len(rows)
+            and rows[after, 0] - rows[after - 1, 0] <= _MAX_GAP
+        ):
+            frames.append(_frame(path, color, depths[nearest], rows[after - 1 : after + 1], time))
+    alone = len(colors) - len(frames)
+    dropped = [
+        f"{path / 'rgb.txt'}: {alone} of {len(colors)} colour images have no depth within "
+        f"{_MAX_APART} s or no two poses within {_MAX_GAP} s around them"
+    ]
+    unit = config.depth_unit or 5000.0
+
+    def lens(width: int, height: int) -> Lens:
+        if config.intrinsics:
+            return Lens(pinhole(*config.intrinsics), width, height)
+        name = next((name for name in _CAMERAS if name in path.resolve().name), "")
+        (fx, fy, cx, cy), distortion = _CAMERAS.get(name, _DEFAULT)
+        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
+        return opencv_lens(K, 640, 480, distortion).scaled(width, height)
+
+    capture = open_frames(
+        path,
+        "TUM RGB-D sequence",
+        frames,
+        axes=FileAxes("optical: x right, y down, z forward", RotationMatrix(), RotationMatrix()),
+        lens=lens,
+        read_depth=lambda file: read_depth(file, unit),
+        dropped=dropped if alone else (),
+    )
+    return raised(capture, config.up or "z")
+
+
+def _frame(
+    path: Path, color: str, depth: str, rows: NDArray[np.float64], time: float
+) -> FrameFiles:
+    def X_FC() -> RigidTransform:
+        a, b = (pose_from_quaternion(r[1:], f"{path / 'groundtruth.txt'}, {r[0]} s") for r in rows)
+        s = (time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
+        q = a.rotation().ToQuaternion().slerp(s, b.rotation().ToQuaternion())
+        return RigidTransform(q, (1 - s) * a.translation() + s * b.translation())
+
+    return FrameFiles(path / color, X_FC, path / depth)
+
+
+def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
+    """Returns the times [s] and file names of a list."""
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: the file is missing; a TUM sequence needs it")
+    times, names = [], []
+    for number, line in enumerate(file.read_text(errors="replace").splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            time, name = line.split()
+            times.append(float(time))
+        except ValueError:
+            raise ValueError(
+                f"{file}, line {number}: {line[:80]!r} is not a time and a file name"
+            ) from None
+        names.append(name)
+    if not names:
+        raise ValueError(f"{file}: lists no file")
+    return np.array(times), names
