@@ -55,22 +55,31 @@ def hall(lower: NDArray, upper: NDArray, materials: list[str], rng: np.random.Ge
     ]
 
 
-def signs_on(
-    wall: Solid, face: int, number: int, heights: tuple[float, float], rng: np.random.Generator
-) -> list[Solid]:
-    """Screws up to `number` signs, 2 cm thick, to one upright side of an upright box: face 0 is -x,
-    1 +x, 2 -y, 3 +y. `heights` [m] of their lower edges."""
+def roof(lower: NDArray, upper: NDArray) -> Solid:
+    """A ceiling whose lower face is the top of the volume."""
+    low, high = (
+        np.array([*lower[:2] - WALL, upper[2]]),
+        np.array([*upper[:2] + WALL, upper[2] + 0.2]),
+    )
+    return box(low, high, "ceiling", 0)
+
+
+def signs_on(wall: Solid, face: int, number: int, rng: np.random.Generator) -> list[Solid]:
+    """Screws up to `number` signs, 2 cm thick, at heights of 1 to 3.4 m to one upright side of an
+    upright box: face 0 is -x, 1 +x, 2 -y, 3 +y."""
     assert isinstance(wall.shape, Box)
     half, p = np.asarray(wall.shape.size) / 2, wall.shape.X_WS.translation()
     k, sign = face // 2, 2 * (face % 2) - 1
     along = 1 - k
     room = half[along] - SIGN[0] / 2 - 0.1
-    if room <= 0:
+    bottom, top = p[2] - half[2], p[2] + half[2]
+    lowest, highest = max(bottom + 0.2, 1.0), min(top - 0.2, 4.0) - SIGN[1]
+    if room <= 0 or highest < lowest:
         return []
     places = (np.arange(number) + rng.uniform(0.2, 0.8, number)) / number * 2 * room - room
     signs = []
     for place in places:
-        low = rng.uniform(*heights)
+        low = rng.uniform(lowest, highest)
         center, size = p.copy(), np.full(3, 0.02)
         center[k] += sign * (half[k] + 0.01)
         center[along] += place
@@ -142,3 +151,23 @@ def check_positive(config: object, *names: str) -> None:
         value = getattr(config, name)
         if not 0 < value <= 200:
             raise ValueError(f"{name} = {value} must be more than 0, at most 200")
+
+
+def check_count(config: object, *names: str) -> None:
+    """
+    Raises:
+        ValueError: for a field of `config` that is not 0 to 1000.
+    """
+    for name in names:
+        if not 0 <= getattr(config, name) <= 1000:
+            raise ValueError(f"{name} = {getattr(config, name)} must be 0 to 1000")
+
+
+def check_range(config: object, low: str, high: str) -> None:
+    """
+    Raises:
+        ValueError: if the fields are not positive, at most 100, or `low` is above `high`.
+    """
+    least, most = getattr(config, low), getattr(config, high)
+    if not 0 < least <= most <= 100:
+        raise ValueError(f"{low} = {least} and {high} = {most} m must be positive and in order")

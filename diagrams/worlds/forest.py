@@ -15,6 +15,7 @@ from flysplat.diagrams.worlds.light import Daylight, Sunlit
 from flysplat.diagrams.worlds.surfaces import merged
 from flysplat.diagrams.worlds.textures import smoothstep
 from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.collision.esdf_build import esdf_from_distance_field
 from flysplat.systems.splats.gaussian_scene import GaussianScene
 
@@ -36,18 +37,7 @@ def make_forest(config: ForestConfig, seed: int = 0) -> World:
     Raises:
         ValueError: for values with which no forest can be grown, or a negative seed.
     """
-    forest = Forest(config, seed)
-    blueprint = forest.blueprint()
-    field, haze = blueprint.distance_field, forest.light.haze
-    return World(
-        name="forest",
-        gaussians=forest.gaussians(),
-        distance_field=field,
-        esdf=esdf_from_distance_field(field, config.voxel_size),
-        background=(float(haze[0]), float(haze[1]), float(haze[2])),
-        p_WS=blueprint.p_WS,
-        p_WG=blueprint.p_WG,
-    )
+    return Forest(config, seed).world()
 
 
 class Forest:
@@ -97,8 +87,8 @@ class Forest:
             voxel_size=self.config.voxel_size,
         )
 
-    def gaussians(self) -> GaussianScene:
-        """What cameras see."""
+    def gaussians(self, esdf: Esdf) -> GaussianScene:
+        """What cameras see; `esdf` is the grid of the distances."""
         layout, light, rngs = self.layout, self.light, self._streams()
         crowns, *around = self._surroundings(rngs)
         return merged(
@@ -110,6 +100,21 @@ class Forest:
                 *forest_ground.rocks_and_logs(layout, light, self.sunlit, rngs[4]),
                 *around,
             ]
+        )
+
+    def world(self) -> World:
+        """Builds all of it; see `make_forest`."""
+        blueprint = self.blueprint()
+        field, haze = blueprint.distance_field, self.light.haze
+        esdf = esdf_from_distance_field(field, self.config.voxel_size)
+        return World(
+            name=blueprint.name,
+            gaussians=self.gaussians(esdf),
+            distance_field=field,
+            esdf=esdf,
+            background=(float(haze[0]), float(haze[1]), float(haze[2])),
+            p_WS=blueprint.p_WS,
+            p_WG=blueprint.p_WG,
         )
 
     def _streams(self) -> Sequence[np.random.Generator]:

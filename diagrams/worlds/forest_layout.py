@@ -20,7 +20,7 @@ BURIED = 1.0
 """[m], how deep trunks reach into the ground."""
 
 
-_BARK = {OAK: "oak", PINE: "pine", BIRCH: "birch"}
+BARK = {OAK: "oak", PINE: "pine", BIRCH: "birch"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class ForestLayout(Plot):
         near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
         foot, top = trees.at(-BURIED), trees.at(ceiling + 2)
         trunks = [
-            Solid(Capsule(p_A, p_B, float(r)), _BARK[species], k)
+            Solid(Capsule(p_A, p_B, float(r)), BARK[species], k)
             for k, (p_A, p_B, r, species) in enumerate(
                 zip(foot, top, trees.radius, trees.species, strict=True)
             )

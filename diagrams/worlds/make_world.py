@@ -1,34 +1,34 @@
 """From a scenario's `world` field to the world."""
 
-from dataclasses import dataclass
-
 from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.forest import Forest, ForestConfig, make_forest
-from flysplat.diagrams.worlds.scene_folder import read_scene
+from flysplat.diagrams.worlds.branches import Branches, BranchesConfig
+from flysplat.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
+from flysplat.diagrams.worlds.forest import Forest, ForestConfig
+from flysplat.diagrams.worlds.inserted import InsertedConfig, inserted_world
+from flysplat.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
+from flysplat.diagrams.worlds.over_under import OverUnderConfig, over_under_blueprint
+from flysplat.diagrams.worlds.room import RoomConfig, room_blueprint
+from flysplat.diagrams.worlds.scene import SceneConfig, read_scene_world
 from flysplat.diagrams.worlds.solid_surfels import draw
+from flysplat.diagrams.worlds.surfaces import merged
 from flysplat.diagrams.worlds.walls import WallsConfig, walls_blueprint
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.esdf_build import esdf_from_distance_field
 
-
-@dataclass
-class SceneConfig:
-    """A scene on disk."""
-
-    # A scene folder, or a PLY file of Gaussians.
-    path: str = ""
-
-    def validate(self) -> None:
-        """
-        Raises:
-            ValueError: if no path is given.
-        """
-        if not self.path:
-            raise ValueError("world.path is empty; name a scene folder or a PLY file")
-
-
-ProceduralConfig = ForestConfig | WallsConfig
-WorldConfig = ForestConfig | WallsConfig | SceneConfig
+ProceduralConfig = (
+    ForestConfig | BranchesConfig | ClutterConfig | WallsConfig | RoomConfig | OverUnderConfig
+)
+WorldConfig = (
+    ForestConfig
+    | BranchesConfig
+    | ClutterConfig
+    | WallsConfig
+    | RoomConfig
+    | OverUnderConfig
+    | SceneConfig
+    | InsertedConfig
+    | OctomapConfig
+)
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
@@ -37,17 +37,24 @@ def make_world(config: WorldConfig, seed: int) -> World:
 
     Args:
         config: which kind of world, and its parameters.
-        seed: of what is random in a generated world; nothing is random in a scene on disk.
+        seed: of what is random: generated worlds, what is put into scenes, and start and goal where
+            they are drawn.
 
     Raises:
         ValueError: for parameters no world can be made of, and for damaged scenes.
         FileNotFoundError: for a scene that is not there.
     """
     match config:
-        case ForestConfig():
-            return make_forest(config, seed)
+        case InsertedConfig():
+            return inserted_world(config, seed)
+        case OctomapConfig():
+            return octomap_world(config, seed)
         case SceneConfig():
-            return read_scene(config.path)
+            return read_scene_world(config, seed)
+        case BranchesConfig():
+            return Branches(config, seed).world()
+        case ForestConfig():
+            return Forest(config, seed).world()
         case _:
             return build(make_blueprint(config, seed))
 
@@ -61,10 +68,18 @@ def make_blueprint(config: ProceduralConfig, seed: int) -> Blueprint:
         ValueError: for parameters no world can be made of.
     """
     match config:
+        case BranchesConfig():
+            return Branches(config, seed).blueprint()
         case ForestConfig():
             return Forest(config, seed).blueprint()
+        case ClutterConfig():
+            return clutter_blueprint(config, seed)
         case WallsConfig():
             return walls_blueprint(config, seed)
+        case RoomConfig():
+            return room_blueprint(config, seed)
+        case OverUnderConfig():
+            return over_under_blueprint(config, seed)
 
 
 def build(blueprint: Blueprint) -> World:
@@ -72,9 +87,10 @@ def build(blueprint: Blueprint) -> World:
     field = blueprint.distance_field
     esdf = esdf_from_distance_field(field, blueprint.voxel_size)
     light = blueprint.light(esdf)
+    drawn = [draw(blueprint, blueprint.solids, light), *blueprint.surroundings()]
     return World(
         name=blueprint.name,
-        gaussians=draw(blueprint, light),
+        gaussians=merged(drawn),
         distance_field=field,
         esdf=esdf,
         background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),

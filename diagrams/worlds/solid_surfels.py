@@ -7,7 +7,7 @@ from flysplat.diagrams.worlds.blueprint import Blueprint
 from flysplat.diagrams.worlds.illumination import Illumination, shade
 from flysplat.diagrams.worlds.materials import MATERIALS, Marks
 from flysplat.diagrams.worlds.solid import Face, Solid, faces_of
-from flysplat.diagrams.worlds.surfaces import COVERAGE, Surfels, colored, merged, rectangle
+from flysplat.diagrams.worlds.surfaces import COVERAGE, Surfels, colored, rectangle
 from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.shapes import HalfSpace
 from flysplat.systems.splats.gaussian_scene import GaussianScene
@@ -25,11 +25,11 @@ _BURIED = 0.05
 """[m], depth inside another solid at which a patch cannot be seen any more."""
 
 
-def draw(blueprint: Blueprint, light: Illumination) -> GaussianScene:
-    """Covers every solid of the blueprint, and what surrounds the volume, with Gaussians."""
+def draw(blueprint: Blueprint, solids: list[Solid], light: Illumination) -> GaussianScene:
+    """Covers `solids`, all or some of the blueprint's, with Gaussians."""
     rng = np.random.default_rng([blueprint.seed, 99])
     scenes = []
-    for solid in blueprint.solids:
+    for solid in solids:
         patches, albedo, opacity = _patches(solid, blueprint, rng)
         scenes.append((patches, albedo, opacity, solid))
     surfels = Surfels.joined([patches for patches, *_ in scenes])
@@ -39,7 +39,7 @@ def draw(blueprint: Blueprint, light: Illumination) -> GaussianScene:
     surfels, albedo, opacity = surfels[seen], albedo[seen], opacity[seen]
     irradiance = light.irradiance(surfels.p, surfels.n)
     colors = shade(albedo, irradiance, light.haze, blueprint.plot.outside(surfels.p))
-    return merged([colored(surfels, colors, opacity), *blueprint.surroundings()])
+    return colored(surfels, colors, opacity)
 
 
 def _patches(

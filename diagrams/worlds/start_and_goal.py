@@ -1,5 +1,7 @@
 """Where to fly from and to in a place of which only the free space is known."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
@@ -24,6 +26,48 @@ def choose_start_and_goal(
     Raises:
         ValueError: if no free space holds a sphere of `radius`.
     """
+    for graph, p_WN in _free_graphs(esdf, radius, margin):
+        _, label = connected_components(graph, directed=False)
+        inner = int(np.argmax(label == np.bincount(label).argmax()))
+        start, _ = _farthest(graph, inner)
+        goal, length = _farthest(graph, start, longest)
+        if length > 0:
+            return p_WN[start], p_WN[goal], length
+    raise _no_room(esdf, radius)
+
+
+def draw_start_and_goal(
+    esdf: Esdf, radius: float, seed: int, margin: float = 0.2, longest: float = 40.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
+
+    As `choose_start_and_goal`, but anywhere: the start is drawn from the largest connected part of
+    free space, the goal from those nodes whose shortest path from it is at least 60 % of the
+    longest there is, up to `longest` [m]. The same seed gives the same bits.
+
+    Raises:
+        ValueError: if no free space holds a sphere of `radius`.
+    """
+    rng = np.random.default_rng(seed)
+    for graph, p_WN in _free_graphs(esdf, radius, margin):
+        _, label = connected_components(graph, directed=False)
+        part = np.flatnonzero(label == np.bincount(label).argmax())
+        _, reach = _farthest(graph, _farthest(graph, int(part[0]))[0])
+        for _ in range(20):
+            start = int(rng.choice(part))
+            lengths = dijkstra(graph, directed=False, indices=start, limit=longest)
+            far = np.flatnonzero(np.isfinite(lengths) & (lengths >= 0.6 * min(reach, longest)))
+            if len(far) and reach > 0:
+                goal = int(rng.choice(far))
+                return p_WN[start], p_WN[goal], float(lengths[goal])
+    raise _no_room(esdf, radius)
+
+
+def _free_graphs(
+    esdf: Esdf, radius: float, margin: float
+) -> Iterator[tuple[csr_array, NDArray[np.float64]]]:
+    """Graphs of the space free for a sphere of `radius` [m], and their nodes (N, 3) [m], with ever
+    less margin: all, half and none of `margin` [m]."""
     field = esdf.conservative()
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
@@ -34,20 +78,16 @@ def choose_start_and_goal(
     p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
     clearance = field.distance(p_WN) - radius  # [m]
     for need in (margin, margin / 2, 0.0):
-        if np.count_nonzero(clearance > need) < 2:
-            continue
-        graph, nodes = _grid_graph(clearance > need, spacing)
-        p_WF = p_WN.reshape(-1, 3)[nodes]
-        _, label = connected_components(graph, directed=False)
-        inner = int(np.argmax(label == np.bincount(label).argmax()))
-        start, _ = _farthest(graph, inner)
-        goal, length = _farthest(graph, start, longest)
-        if length > 0:
-            return p_WF[start], p_WF[goal], length
-    raise ValueError(
+        if np.count_nonzero(clearance > need) >= 2:
+            graph, nodes = _grid_graph(clearance > need, spacing)
+            yield graph, p_WN.reshape(-1, 3)[nodes]
+
+
+def _no_room(esdf: Esdf, radius: float) -> ValueError:
+    largest = float(esdf.conservative().distances.max())
+    return ValueError(
         f"no free space for a vehicle of radius {radius} m: the largest clearance is "
-        f"{np.max(clearance) + radius:.2f} m, and unknown space counts as occupied; capture more "
-        "of the place"
+        f"{largest:.2f} m, and unknown space counts as occupied; capture more of the place"
     )
 
 

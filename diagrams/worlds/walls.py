@@ -98,10 +98,10 @@ def walls_blueprint(config: WallsConfig, seed: int) -> Blueprint:
         signs = [
             sign
             for wall, face in zip(sides, (3, 2, 1, 0), strict=True)
-            for sign in signs_on(wall, face, 3 if face > 1 else 1, (1.0, 3.4), rng)
+            for sign in signs_on(wall, face, 3 if face > 1 else 1, rng)
         ]
         for wall in obstacles:
-            signs += signs_on(wall, 0, 1, (1.0, 3.4), rng)
+            signs += signs_on(wall, 0, 1, rng)
         hour, light = daylight(rng)
         floor = ("paving", "grass", "concrete")[rng.integers(3)]
         return Blueprint(

@@ -1,0 +1,178 @@
+"""Reconstructed scenes with obstacles put in: what is seen and what is hit, composed together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+from scipy.ndimage import label
+
+from flysplat.diagrams.worlds.blueprint import Blueprint
+from flysplat.diagrams.worlds.feasibility import TRIES
+from flysplat.diagrams.worlds.fittings import check_range
+from flysplat.diagrams.worlds.illumination import Lamplight
+from flysplat.diagrams.worlds.scene import SceneConfig, read_scene_world
+from flysplat.diagrams.worlds.solid import Solid, faces_of
+from flysplat.diagrams.worlds.solid_surfels import draw
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.distance_field import FieldState
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.collision.shapes import Box, Capsule, Shape, Sphere
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+GAP = 1.3 * 2 * VEHICLE_RADIUS
+"""[m], least width of a gap."""
+
+_OPEN = 0.9
+"""[m], least distance of what is put in from start and goal."""
+
+_MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
+
+
+@dataclass
+class InsertedConfig(SceneConfig):
+    """A scene on disk with 3 to 5 solids, hanging or standing in its free space."""
+
+    least: int = 3  # [-] solids
+    most: int = 5  # [-]
+    half_min: float = 0.10  # [m] smallest half width of a solid
+    half_max: float = 0.25  # [m] largest
+    gap: float = GAP  # [m] least width of every gap on the way, and between two solids
+
+    def validate(self) -> None:
+        """Raises ValueError for the first value with which nothing can be put in."""
+        super().validate()
+        check_range(self, "half_min", "half_max")
+        check_range(self, "least", "most")
+        if not 2 * VEHICLE_RADIUS <= self.gap <= 10:
+            raise ValueError(f"gap = {self.gap} m must be {2 * VEHICLE_RADIUS:.3f} to 10 m")
+
+
+def inserted_world(config: InsertedConfig, seed: int) -> World:
+    """Reads the scene and puts solids into it.
+
+    They are drawn from the seed, in the way: each comes within 0.5 m of the straight line from
+    start to goal or of space at the same height. Any two are at least `gap` apart, start and goal
+    keep 0.9 m, and a way from start to goal is left that is `gap` wide everywhere. Draws without
+    such a way are dropped, and redrawn from the seed; start and goal too, if they are drawn.
+
+    Raises:
+        FileNotFoundError, ValueError: see `read_scene_world`; or if no draw leaves such a way.
+    """
+    config.validate()
+    for attempt in range(TRIES):
+        rng = np.random.default_rng([seed, attempt])
+        world = read_scene_world(config, seed if attempt == 0 else int(rng.integers(2**31)))
+        solids = _drawn(config, world, rng)
+        if len(solids) < config.least:
+            continue
+        esdf = _composed(world.esdf, solids)
+        if _leaves_way(esdf, world.p_WS, world.p_WG, config.gap):
+            return _with(world, solids, esdf, seed)
+    raise ValueError(
+        f"{config.path}: none of {TRIES} draws of {config.least} to {config.most} solids leaves a "
+        f"way of {config.gap:.2f} m width from start to goal; use a smaller gap or fewer solids"
+    )
+
+
+def _drawn(config: InsertedConfig, world: World, rng: np.random.Generator) -> list[Solid]:
+    """Solids that keep their distances from start, goal and each other."""
+    number = int(rng.integers(config.least, config.most + 1))
+    way = world.p_WG - world.p_WS
+    solids: list[Solid] = []
+    for _ in range(40 * number):
+        if len(solids) == number:
+            break
+        p = world.p_WS + rng.uniform(0.15, 0.85) * way + rng.uniform(-0.8, 0.8, 3)
+        sample = world.esdf.query(p)
+        if sample.state != FieldState.FREE or sample.distance < config.half_min:
+            continue
+        shape = _shape(config, p, rng)
+        ends = np.stack([world.p_WS, world.p_WG])
+        if _distances(shape, ends).min() < _OPEN:
+            continue
+        surface = _surface(shape)
+        if any(_distances(other.shape, surface).min() < config.gap for other in solids):
+            continue
+        material = _MATERIALS[rng.integers(len(_MATERIALS))]
+        solids.append(Solid(shape, material, int(rng.integers(1000))))
+    return solids
+
+
+def _shape(config: InsertedConfig, p: NDArray, rng: np.random.Generator) -> Shape:
+    half = rng.uniform(config.half_min, config.half_max, 3)
+    kind = rng.integers(3)
+    if kind == 0:
+        return Sphere(p, float(half[0]))
+    if kind == 1:
+        return Box(RigidTransform(RollPitchYaw(*rng.uniform(-0.3, 0.3, 3)), p), 2 * half)
+    up = np.array([0.0, 0.0, rng.uniform(0.2, 0.6)])
+    return Capsule(p - up, p + up, float(half.min()))
+
+
+def _distances(shape: Shape, p_W: NDArray) -> NDArray:
+    return type(shape).distances(p_W, *shape.parameters())
+
+
+def _surface(shape: Shape) -> NDArray:
+    """Points (N, 3) all over a shape."""
+    s = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 9)]), axis=-1).reshape(-1, 2)
+    zero = np.zeros(3)
+    return np.concatenate([face.at(s * face.size)[0] for face in faces_of(shape, zero, zero)])
+
+
+def _composed(esdf: Esdf, solids: list[Solid]) -> Esdf:
+    """The union of a scene and solids: the nearer of both, exact at voxel centres for solids.
+    Solids are known, also where the scene is not."""
+    field = AnalyticDistanceField(
+        [solid.shape for solid in solids], esdf.lower_W, esdf.upper_W + esdf.voxel_size
+    )
+    centers = np.stack(np.meshgrid(*esdf.voxel_centers(), indexing="ij"), axis=-1)
+    distances, states = esdf.distances.copy(), esdf.states.copy()
+    for i in range(len(distances)):
+        nearest = field.distance(centers[i])
+        distances[i] = np.minimum(distances[i], nearest)
+        states[i][nearest < 0] = FieldState.OCCUPIED
+    return Esdf(distances, states, esdf.lower_W, esdf.voxel_size)
+
+
+def _leaves_way(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
+    """Whether a way `gap` [m] wide joins start and goal, through space known to be free."""
+    free = esdf.conservative().distances > gap / 2
+    part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
+    parts = []
+    for p in (p_WS, p_WG):
+        # The ends themselves may be narrower: the way starts within a radius of them.
+        cell = ((p - esdf.lower_W) / esdf.voxel_size).astype(int)
+        reach = int(VEHICLE_RADIUS / esdf.voxel_size)
+        box = tuple(slice(max(c - reach, 0), c + reach + 1) for c in cell)
+        parts.append(set(np.unique(part[box])) - {0})
+    return bool(parts[0] & parts[1])
+
+
+def _with(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
+    """The world with solids in it, lit from above."""
+    lower, upper = esdf.lower_W, esdf.upper_W
+    middle = (world.p_WS + world.p_WG) / 2
+    lamps = np.stack([world.p_WS, middle, world.p_WG]) + np.array([0, 0, 1.5])
+    light = Lamplight(lamps, np.ones(3), esdf)
+    blueprint = Blueprint(
+        name=f"{world.name}_inserted",
+        lower_W=lower,
+        upper_W=upper,
+        solids=solids,
+        p_WS=world.p_WS,
+        p_WG=world.p_WG,
+        light=lambda _: light,
+        seed=seed,
+    )
+    return World(
+        name=blueprint.name,
+        gaussians=world.gaussians.merged_with(draw(blueprint, solids, light)),
+        distance_field=esdf,
+        esdf=esdf,
+        background=world.background,
+        p_WS=world.p_WS,
+        p_WG=world.p_WG,
+    )

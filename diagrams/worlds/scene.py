@@ -1,0 +1,67 @@
+"""Scenes on disk as worlds: found by name, with start and goal drawn from the seed if wanted."""
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from flysplat.diagrams.worlds.scene_folder import read_scene
+from flysplat.diagrams.worlds.start_and_goal import draw_start_and_goal
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+SCENES = "FLYSPLAT_SCENES"
+"""Environment variable that names the folder of scenes."""
+
+
+@dataclass
+class SceneConfig:
+    """A scene on disk."""
+
+    # A scene folder, or a PLY file of Gaussians; one that is not there is looked for in the folder
+    # that the environment variable FLYSPLAT_SCENES names, or in `scenes`.
+    path: str = ""
+    # How to get the scene: what the error says if it is not there.
+    source: str = ""
+    # Whether start and goal are drawn from the seed; otherwise they are the scene's own.
+    draw_ends: bool = False
+
+    def validate(self) -> None:
+        """
+        Raises:
+            ValueError: if no path is given.
+        """
+        if not self.path:
+            raise ValueError("world.path is empty; name a scene folder or a PLY file")
+
+
+def find_scene(config: SceneConfig) -> Path:
+    """The place of a scene.
+
+    Raises:
+        FileNotFoundError: if it is in none of the places where scenes are looked for; the message
+            says how to get it.
+    """
+    config.validate()
+    folder = Path(os.environ.get(SCENES, "scenes"))
+    for path in (Path(config.path), folder / config.path):
+        if path.exists():
+            return path
+    raise FileNotFoundError(
+        f"{config.path}: there is no such scene, neither here nor in {folder} (the environment "
+        f"variable {SCENES} names that folder); "
+        + (config.source or "reconstruct one with `flysplat reconstruct`").strip()
+    )
+
+
+def read_scene_world(config: SceneConfig, seed: int) -> World:
+    """Reads the scene of `config`.
+
+    Raises:
+        FileNotFoundError, ValueError: see `find_scene` and `read_scene`; or if no free space is
+            large enough.
+    """
+    world = read_scene(find_scene(config))
+    if not config.draw_ends:
+        return world
+    p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed)
+    return replace(world, p_WS=p_WS, p_WG=p_WG)
