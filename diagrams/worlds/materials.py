@@ -261,7 +261,8 @@ def _crate(uv: Array, p: Array, seed: int) -> Array:
 def _bark(species: int, uv: Array, p: Array, seed: int) -> Array:
     plates = textures.bark(species, p)
     cracks = value_noise(p * (34, 34, 6), seed=15) + 0.5 * value_noise(p * (60, 60, 14), seed=16)
-    rough = mix(textures.fissure(species, p), plates, smoothstep(-0.6, 0.2, cracks))
+    dark = plates * (0.80 if species == BIRCH else 0.52)
+    rough = mix(dark, plates, smoothstep(-0.6, 0.2, cracks))
     if species == BIRCH:
         lines = smoothstep(0.52, 0.62, value_noise(np.stack([uv[:, 0] * 5, uv[:, 1] * 36], -1), 17))
         rough = mix(rough, (0.20, 0.18, 0.17), 0.85 * lines)
@@ -280,7 +281,7 @@ def _joints(width: float, height: float, line: float, bond: bool = False) -> tup
     return beds, Marks(two, size, (1.0, 0.25)), Marks(two, size, (0.5, 0.75))
 
 
-_PLATES = (Marks((0.06, 0.17), (0.42, 0.42), jitter=0.35),)
+_PLATES = (Marks((0.07, 0.18), (0.42, 0.42), jitter=0.35),)
 _LEAVES = (Marks((0.12, 0.12), (0.36, 0.20), jitter=0.45),)
 
 MATERIALS: dict[str, Material] = {
@@ -294,8 +295,8 @@ MATERIALS: dict[str, Material] = {
     "tiles": Material(_tiles, 0.10, _joints(0.5, 0.5, 0.007)),
     "ceiling": Material(_ceiling, 0.12, _joints(1.2, 0.6, 0.010)),
     "foliage": Material(_foliage, 0.13, _LEAVES),
-    "grass": Material(_grass, 0.15),
-    "paving": Material(_paving, 0.16),
+    "grass": Material(_grass, 0.16, (Marks((0.17, 0.17), (0.30, 0.13), jitter=0.45),)),
+    "paving": Material(_paving, 0.16, _joints(0.8, 0.8, 0.012, bond=True)),
     "forest_floor": Material(_floor, 0.15),
     "stone": Material(_stone, 0.08),
     "cable": Material(_cable, 0.06),

@@ -47,39 +47,52 @@ def _patches(
 ) -> tuple[Surfels, Array, Array]:
     """Surfels of one solid with their albedo (N, 3) and opacity (N,)."""
     material = MATERIALS[solid.material]
-    parts, albedo, opacity = [], [], []
+    is_ground = isinstance(solid.shape, HalfSpace)
+    layers = []  # of patches, opacity, and the points at which the pattern is asked
     for face in faces_of(solid.shape, blueprint.lower_W, blueprint.upper_W):
-        if isinstance(solid.shape, HalfSpace):
+        if is_ground:
             uv, extent = _ground(face, material.spacing, blueprint, rng)
         elif face.round:
             uv, extent = _spiral(face, material.spacing, rng)
         else:
             uv, extent = _closed(face, material.spacing, rng)
-        p, n, t = face.at(uv)
-        if isinstance(solid.shape, HalfSpace):
-            p = p - SOIL * n
-        parts.append(Surfels(p, n, t, extent))
-        albedo.append(_mean_albedo(solid, face, uv, extent) * rng.uniform(0.95, 1.05, (len(p), 1)))
-        opacity.append(np.full(len(p), 0.99))
-        if face.round or isinstance(solid.shape, HalfSpace):
+        facing = _faces(blueprint, *face.at(uv)[:2])
+        if not facing.any():
             continue
-        for marks in material.marks:
-            uv, extent = _marked(face, marks, rng)
+        uv, extent = uv[facing], extent[facing]
+        p, n, t = face.at(uv)
+        depth = SOIL if is_ground else 0.0
+        # Means of the pattern at two places: thin lines tint all the patches they cross instead of
+        # dotting some.
+        near = [uv + corner * extent for corner in _CORNERS]
+        layers.append((Surfels(p - depth * n, n, t, extent), 0.99, face, near))
+        for marks in () if face.round else material.marks:
+            low, high = np.zeros(2), np.array(face.size)
+            if is_ground:
+                low, high = np.full(2, 27.5), high - 27.5
+            uv, extent = _marked(marks, low, high, rng)
             p, n, t = face.at(uv)
-            parts.append(Surfels(p + RAISED * n, n, t, extent))
-            albedo.append(solid.albedo(uv, p))
-            opacity.append(np.full(len(p), 0.93))
-    return Surfels.joined(parts), np.concatenate(albedo), np.concatenate(opacity)
+            raised = Surfels(p + (RAISED - depth / 2) * n, n, t, extent)
+            layers.append((raised, 0.93, face, [uv]))
+    if not layers:
+        zero = np.zeros((0, 3))
+        return Surfels(zero, zero, zero, zero[:, :2]), zero, zero[:, 0]
+    uv = np.concatenate([q for *_, samples in layers for q in samples])
+    p = np.concatenate([face.at(q)[0] for *_, face, samples in layers for q in samples])
+    colors = solid.albedo(uv, p)  # all at once: patterns cost more by the call than by the point
+    albedo, start = [], 0
+    for patches, _, _, samples in layers:
+        stop = start + len(patches) * len(samples)
+        albedo.append(colors[start:stop].reshape(len(samples), len(patches), 3).mean(axis=0))
+        start = stop
+    tinted = np.concatenate(albedo)
+    tinted = tinted * rng.uniform(0.95, 1.05, (len(tinted), 1))
+    opacity = np.concatenate([np.full(len(patches), o) for patches, o, *_ in layers])
+    return Surfels.joined([patches for patches, *_ in layers]), tinted, opacity
 
 
-def _mean_albedo(solid: Solid, face: Face, uv: Array, extent: Array) -> Array:
-    """Colours (N, 3) of patches about uv (N, 2): means of the pattern at four places, so that thin
-    lines tint all the patches they cross instead of dotting some."""
-    total = np.zeros((len(uv), 3))
-    for corner in ((0.4, 0.8), (0.8, -0.4), (-0.4, -0.8), (-0.8, 0.4)):
-        near = uv + corner * extent
-        total += 0.25 * solid.albedo(near, face.at(near)[0])
-    return total
+_CORNERS = ((0.4, 0.7), (-0.4, -0.7))
+"""Places about the middle of a patch, in standard deviations."""
 
 
 def _closed(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -96,19 +109,19 @@ def _closed(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
     return uv, np.tile(COVERAGE * step, (len(uv), 1))
 
 
-def _marked(face: Face, marks: Marks, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Coordinates uv (N, 2) [m] of the marks that lie on the face, and their standard deviations
-    (N, 2) [m]; they stand where the pattern has them."""
+def _marked(marks: Marks, low: Array, high: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Coordinates uv (N, 2) [m] of the marks between the corners `low` and `high` (2,) of a face,
+    and their standard deviations (N, 2) [m]; they stand where the pattern has them."""
     cell = np.array(marks.cell)
-    n = np.ceil(np.array(face.size) / cell).astype(int)
-    i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
-    places = np.stack([i, j], axis=-1).reshape(-1, 2) + marks.first
+    first, last = np.floor(low / cell).astype(int), np.ceil(high / cell).astype(int)
+    i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
+    places = np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1).reshape(-1, 2) + marks.first
     extent = np.tile(cell * marks.fill, (len(places), 1))
     if marks.jitter:
         places = places + rng.uniform(-marks.jitter, marks.jitter, places.shape)
         extent = extent * rng.uniform(0.6, 1.25, extent.shape)
     uv = places * cell
-    on_it = ((uv > 0.5 * extent) & (uv < np.array(face.size) - 0.5 * extent)).all(axis=1)
+    on_it = ((uv > low + 0.5 * extent) & (uv < high - 0.5 * extent)).all(axis=1)
     return uv[on_it], extent[on_it]
 
 
@@ -117,7 +130,7 @@ def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
     spiral of golden angles: equal steps in area from the rim to the pole."""
     radius, (around, height) = face.curved[0], face.size
     flat = not np.isfinite(face.curved[1])
-    whole = height > 0.6 * around  # a full sphere, not half
+    whole = height > 0.4 * around  # a full sphere, not half
     area = np.pi * radius**2 * (1 if flat else 4 if whole else 2)
     N = max(6, round(area / spacing**2))
     part = (np.arange(N) + 0.5) / N
@@ -149,10 +162,15 @@ def _ground(
     return np.concatenate(uv), np.concatenate(extent)
 
 
+def _faces(blueprint: Blueprint, p_W: Array, n_W: Array) -> NDArray[np.bool_]:
+    """Whether surfaces at p_W (N, 3) [m] with normals n_W (N, 3) face any point of the volume."""
+    corner = np.where(n_W > 0, blueprint.upper_W, blueprint.lower_W)
+    return np.einsum("nk,nk->n", n_W, corner - p_W) > 1e-9
+
+
 def _seen(blueprint: Blueprint, surfels: Surfels) -> NDArray[np.bool_]:
     """Whether a patch faces the volume and lies in no other solid."""
-    corner = np.where(surfels.n > 0, blueprint.upper_W, blueprint.lower_W)
-    faces = np.einsum("nk,nk->n", surfels.n, corner - surfels.p) > 0
+    faces = _faces(blueprint, surfels.p, surfels.n)
     field = AnalyticDistanceField(
         [solid.shape for solid in blueprint.solids],
         blueprint.lower_W - 40.0,
