@@ -42,14 +42,14 @@ def drawn(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Bluepr
 
 def is_feasible(blueprint: Blueprint) -> bool:
     """Whether start and goal are clear and a way between them is proven: on a coarse grid, which
-    shows most ways, or else on a fine one, which shows ways through gaps of 0.9 m."""
+    shows most ways, or else on finer ones, the last of which shows ways through gaps of 1 m."""
     field = blueprint.distance_field
     ends = np.stack([blueprint.p_WS, blueprint.p_WG])
     if not (conservative_distance(field, ends) >= CLEARANCE).all():
         return False
     return any(
         connects(field, blueprint.p_WS, blueprint.p_WG, VEHICLE_RADIUS, spacing)
-        for spacing in (0.3, 0.12)
+        for spacing in (0.3, 0.15, 0.12)
     )
 
 

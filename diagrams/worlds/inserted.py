@@ -1,6 +1,6 @@
 """Reconstructed scenes with obstacles put in: what is seen and what is hit, composed together."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from flysplat.diagrams.worlds.illumination import Lamplight
 from flysplat.diagrams.worlds.scene import SceneConfig, read_scene_world
 from flysplat.diagrams.worlds.solid import Solid, faces_of
 from flysplat.diagrams.worlds.solid_surfels import draw
+from flysplat.diagrams.worlds.start_and_goal import draw_start_and_goal
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.distance_field import FieldState
@@ -61,9 +62,15 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         FileNotFoundError, ValueError: see `read_scene_world`; or if no draw leaves such a way.
     """
     config.validate()
+    scene = read_scene_world(config, seed)
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, attempt])
-        world = read_scene_world(config, seed if attempt == 0 else int(rng.integers(2**31)))
+        world = scene
+        if config.draw_ends and attempt % 10 == 9:
+            p_WS, p_WG, _ = draw_start_and_goal(
+                scene.esdf, VEHICLE_RADIUS, int(rng.integers(2**31))
+            )
+            scene = world = replace(scene, p_WS=p_WS, p_WG=p_WG)
         solids = _drawn(config, world, rng)
         if len(solids) < config.least:
             continue

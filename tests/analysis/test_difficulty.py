@@ -1,0 +1,135 @@
+"""Difficulty measures where they are known in closed form."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from flysplat.analysis.difficulty import (
+    SPACING,
+    angle_over_length,
+    bottleneck,
+    difficulty,
+    march,
+    path_length,
+    relative_gap_size,
+    resampled,
+    run,
+    scenario_file,
+    shortest_path,
+    traversability,
+    traversability_obstacle,
+    view_obstacle,
+)
+from flysplat.diagrams.worlds.feasibility import grid_distances
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.shapes import Box, Capsule
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
+
+LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
+EMPTY = AnalyticDistanceField([], LOWER, UPPER)
+START, GOAL = np.array([1.5, 0.1, 2.0]), np.array([10.5, 0.1, 2.0])
+
+
+def wall(low: float, high: float) -> Box:
+    """Across the volume at x = 6, from y = low to high, thin."""
+    return Box(RigidTransform([6.0, (low + high) / 2, 2.0]), [0.2, high - low, 8.0])
+
+
+def test_a_straight_way_is_easy():
+    """In an empty volume the way is straight, has no bends and shows nothing."""
+    measured = difficulty(EMPTY, START, GOAL)
+    assert measured.detour_ratio == pytest.approx(1.0, abs=1e-9)
+    assert measured.angle_over_length == 0.0
+    assert measured.view_obstacle == 0.0
+    assert np.isnan(measured.relative_gap_size)
+    # Nothing is further from the bounds than half the height; the ends are 1.5 m from theirs.
+    assert measured.bottleneck_m == pytest.approx(1.5 - R, abs=0.15)
+
+
+def test_detour_and_bend_around_a_wall_are_those_of_the_triangle():
+    """A wall with one open side: the path bends once about its edge, at the vehicle's radius."""
+    field = AnalyticDistanceField([wall(-4.0, 1.0)], LOWER, UPPER)
+    path = shortest_path(field, grid_distances(field, SPACING), START, GOAL)
+    assert (field.distance(resampled(path, 0.02)) > R - 1e-3).all()
+    side = np.hypot(4.5, 0.9 + R)
+    assert path_length(path) == pytest.approx(2 * side, rel=0.03)
+    assert angle_over_length(np.array([START, [6, 1.0 + R, 2], GOAL])) == pytest.approx(
+        np.expm1(2 / np.pi * 2 * np.arctan2(0.9 + R, 4.5)) / (2 * side)
+    )
+
+
+@pytest.mark.parametrize("gap", [1.2, 2.0])
+def test_bottleneck_is_half_the_gap(gap):
+    """A slit of a given width leaves half of it, less the radius, to within half a cell."""
+    field = AnalyticDistanceField([wall(-4.0, -gap / 2), wall(gap / 2, 4.0)], LOWER, UPPER)
+    found = bottleneck(field, grid_distances(field, SPACING), START, GOAL)
+    assert gap / 2 - R - SPACING / 2 - 0.02 < found <= gap / 2 - R
+
+
+def test_no_way_is_an_error():
+    """A closed wall leaves none."""
+    field = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
+    with pytest.raises(ValueError, match="no way"):
+        shortest_path(field, grid_distances(field, SPACING), START, GOAL)
+
+
+def test_march_stops_at_walls_and_bounds():
+    """A ball stops at its radius before a wall; a point at the bounds; nothing flies on longer."""
+    field = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
+    x = np.array([[1.0, 0.0, 0.0]])
+    start = np.array([[1.0, 0.0, 2.0]])
+    assert march(field, start, x, R, 99.0) == pytest.approx([4.9 - R], abs=0.011)
+    assert march(field, start, -x, 0.0, 99.0) == pytest.approx([1.0], abs=6.0)
+    assert march(field, start, x, R, 2.0) == [2.0]
+
+
+def test_traversability_falls_with_obstacles_and_scales():
+    """Posts make the mean free way shorter."""
+    rng = np.random.default_rng(5)
+    feet = rng.uniform(LOWER, UPPER, (12, 3)) * (1, 1, 0)
+    posts = [Capsule(foot - [0, 0, 1], foot + [0, 0, 5], 0.2) for foot in feet]
+    crowded = AnalyticDistanceField(posts, LOWER, UPPER)
+    walls = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
+    free, halved, narrow = (
+        traversability(field, np.random.default_rng(1)) for field in (EMPTY, walls, crowded)
+    )
+    assert free > halved > narrow > 2.0
+
+
+def test_relative_gap_size_is_that_between_posts():
+    """Posts in a row, 2 m axis to axis, radius 0.3: gaps of 1.4 m over a diameter of 0.708 m."""
+    posts = [Capsule([x, 0.05, -1], [x, 0.05, 5], 0.3) for x in (2.05, 4.05, 6.05, 8.05)]
+    field = AnalyticDistanceField(posts, LOWER, UPPER)
+    assert relative_gap_size(field, 2.0) == pytest.approx(1.4 / (2 * R), abs=0.12 / (2 * R))
+
+
+def test_traversability_obstacle_is_range_over_diameter_in_a_tunnel():
+    """In a square tunnel all balls have one radius, at best, so TO = R / (2 r)."""
+    lower, upper = np.array([0.0, -1, 0]), np.array([20.0, 1, 2])
+    tunnel = AnalyticDistanceField([], lower, upper)
+    path = np.array([[2.0, 0, 1], [18.0, 0, 1]])
+    assert traversability_obstacle(tunnel, path) == pytest.approx(4.0 / (2 * (1 - R)), rel=1e-6)
+
+
+def test_view_obstacle_of_a_wall_ahead():
+    """Flying at a wall from 3 m, the weights sum to one over the distances along the rings' rays."""
+    field = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
+    path = np.array([[2.9, 0.0, 2.0], [3.3, 0.0, 2.0]])
+    middles = np.pi * np.array([(1 / 5 + 1 / 6) / 2, (1 / 6 + 1 / 8) / 2, (1 / 8 + 1 / 12) / 2])
+    rays = 3.0 / np.array([*np.cos(middles), 1.0])
+    expected = np.sum(np.array([0.05, 0.1, 0.3, 0.55]) * 4.0 / rays)
+    assert view_obstacle(field, path) == pytest.approx(expected, rel=0.01)
+
+
+def test_table_says_what_was_not_run(tmp_path, monkeypatch, capsys):
+    """A generated scenario is measured; a scene that is not there is reported as not run."""
+    monkeypatch.setenv("FLYSPLAT_SCENES", str(tmp_path))
+    lines = run(scenarios=["P10", "R13"], seeds=1)
+    assert "1/1" in lines[1]
+    assert "not run" in lines[2] and "TartanAir" in lines[2] and str(tmp_path) in lines[2]
+
+
+def test_unknown_scenario_lists_those_there_are():
+    """An id that does not exist is an error with the ids that do."""
+    with pytest.raises(FileNotFoundError, match=r"P99: .*P01, P02"):
+        scenario_file("P99")

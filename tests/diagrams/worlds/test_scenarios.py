@@ -1,0 +1,239 @@
+"""The benchmark's scenarios: feasible, repeatable, seen where hit, and clear about what is wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.diagrams.configuration import load_config
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds import feasibility
+from flysplat.diagrams.worlds.blueprint import Blueprint
+from flysplat.diagrams.worlds.clutter import ClutterConfig
+from flysplat.diagrams.worlds.feasibility import CLEARANCE, connects, is_feasible
+from flysplat.diagrams.worlds.inserted import GAP, InsertedConfig
+from flysplat.diagrams.worlds.make_world import make_blueprint, make_world
+from flysplat.diagrams.worlds.octomap_world import OctomapConfig
+from flysplat.diagrams.worlds.over_under import OverUnderConfig
+from flysplat.diagrams.worlds.room import RoomConfig
+from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
+from flysplat.diagrams.worlds.scene_folder import write_scene_folder
+from flysplat.diagrams.worlds.walls import WallsConfig
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.esdf_build import esdf_from_distance_field
+from flysplat.systems.collision.shapes import Box, Capsule, HalfSpace
+from flysplat.systems.splats.baked_scene import BakedScene
+from flysplat.systems.splats.gaussian_scene import GaussianScene
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+FILES = sorted((Path(__file__).parents[3] / "diagrams" / "scenarios").glob("*.yaml"))
+GENERATED = [file for file in FILES if file.stem.startswith("P")]
+
+
+def _config(name: str):
+    return load_config(Scenario(), next(f for f in FILES if f.stem == name)).world
+
+
+def test_there_are_seventeen_and_all_are_valid():
+    """P01 to P12 and R13 to R17 load and pass their checks."""
+    assert [file.stem for file in FILES] == [
+        *(f"P{k:02d}" for k in range(1, 13)),
+        *(f"R{k}" for k in range(13, 18)),
+    ]
+    for file in FILES:
+        load_config(Scenario(), file).validate()
+
+
+@pytest.mark.parametrize("file", GENERATED, ids=lambda file: file.stem)
+def test_instances_are_feasible_and_repeatable(file):
+    """Start and goal are clear, a way is proven, the same seed gives the same place and another
+    seed another."""
+    config = load_config(Scenario(), file).world
+    one, again, other = (make_blueprint(config, seed) for seed in (3, 3, 4))
+    assert is_feasible(one)
+    p = np.random.default_rng(0).uniform(one.lower_W, one.upper_W, (500, 3))
+    fields = [blueprint.distance_field for blueprint in (one, again, other)]
+    np.testing.assert_array_equal(fields[0].distance(p), fields[1].distance(p))
+    assert np.abs(fields[0].distance(p) - fields[2].distance(p)).max() > 0.05
+    assert fields[0].distance(np.stack([one.p_WS, one.p_WG])).min() >= CLEARANCE
+
+
+def test_walls_have_the_sizes_asked_for():
+    """P06's wall is 14 m and full height, P08's slits are 1.4 to 1.0 m, P09's ways are 3.6 m."""
+
+    def free_widths(blueprint: Blueprint) -> list[float]:
+        """Widths in y of the free stretches in the planes through the middles of walls across."""
+        widths = []
+        walls = {
+            round(float(s.shape.X_WS.translation()[0]), 6)
+            for s in blueprint.solids
+            if isinstance(s.shape, Box) and s.shape.size[0] == 0.3 and s.material != "signage"
+        }
+        y = np.arange(blueprint.lower_W[1], blueprint.upper_W[1], 0.005)
+        for x in sorted(w for w in walls if 0 < w < blueprint.upper_W[0]):
+            p = np.column_stack([np.full_like(y, x), y, np.full_like(y, 5.9)])
+            free = blueprint.distance_field.distance(p) > 0
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], free, [0]])))
+            widths += [0.005 * (b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        return widths
+
+    slits = free_widths(make_blueprint(_config("P08"), 1))
+    np.testing.assert_allclose(slits, [1.4, 1.25, 1.1, 1.0], atol=0.012)
+    np.testing.assert_allclose(
+        free_widths(make_blueprint(_config("P09"), 1)), [3.6] * 4, atol=0.012
+    )
+    sides = free_widths(make_blueprint(_config("P06"), 1))
+    assert sum(sides) == pytest.approx(2.0, abs=0.02) and max(sides) > 2 * VEHICLE_RADIUS + 0.5
+
+
+def test_thin_things_are_thin_and_hit():
+    """P11's limbs and wires are 2 to 4 cm thick, and the distance on their axes is minus that."""
+    blueprint = make_blueprint(_config("P11"), 2)
+    thin = [
+        s.shape for s in blueprint.solids if isinstance(s.shape, Capsule) and s.shape.radius < 0.05
+    ]
+    assert len(thin) > 60
+    assert all(0.02 <= 2 * shape.radius <= 0.04 for shape in thin)
+    middles = np.array([(np.asarray(s.p_WA) + np.asarray(s.p_WB)) / 2 for s in thin])
+    distance = blueprint.distance_field.distance(middles)
+    assert (distance[np.isfinite(distance)] <= -0.0099).all()
+
+
+def test_a_wire_between_grid_points_closes_the_way():
+    """A net of wires of 2 cm, finer than the vehicle, is seen by the search on a coarse grid."""
+    lower, upper = np.array([0.0, -1.5, 0]), np.array([8.0, 1.5, 3])
+    ends = np.array([1.5, 0, 1.5]), np.array([6.5, 0, 1.5])
+    net = [Capsule([4.0, y, -1], [4.0, y, 4], 0.01) for y in np.arange(-1.3, 1.5, 0.52)]
+    assert connects(AnalyticDistanceField([], lower, upper), *ends, VEHICLE_RADIUS, 0.15)
+    assert not connects(AnalyticDistanceField(net, lower, upper), *ends, VEHICLE_RADIUS, 0.15)
+
+
+def test_what_is_drawn_is_where_it_is_hit():
+    """In a furnished room Gaussians lie on the surfaces, and rendered depth agrees with them."""
+    world = make_world(_config("P10"), 1)
+    p = world.gaussians.means.astype(float)
+    lower, upper = world.distance_field.lower_W, world.distance_field.upper_W
+    inside = ((p >= lower) & (p <= upper)).all(axis=1)
+    distance = np.abs(world.distance_field.distance(p[inside]))
+    assert inside.sum() > 20_000 and distance.max() < 0.07
+    forward = (world.p_WG - world.p_WS) * (1, 1, 0)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    axes = np.column_stack([right, np.cross(forward, right), forward])
+    X_WC = RigidTransform(RotationMatrix(axes), world.p_WS)
+    K = np.array([[60.0, 0, 60], [0, 60, 45], [0, 0, 1]])
+    view = BakedScene(world.gaussians).render(K, 120, 90, X_WC, near=0.05)
+    v, u = np.mgrid[:90, :120] + 0.5
+    rays = np.stack([(u - 60) / 60, (v - 45) / 60, np.ones_like(u)], axis=-1)
+    q = X_WC.multiply((rays * view.depth[..., None]).reshape(-1, 3).T).T
+    off = np.abs(world.distance_field.distance(np.clip(q, lower, upper)))
+    assert view.alpha.min() > 0.97  # a closed room has no holes
+    assert np.median(off) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (WallsConfig(pattern="maze"), "pattern = 'maze' must be one of big_wall"),
+        (WallsConfig(wall=13.8), "wall = 13.8 m must be at most width"),
+        (WallsConfig(pattern="slits", slits=[0.7]), r"slits = \[0.7\] m: each must be 0.81 m"),
+        (WallsConfig(length=8.0), "length = 8.0 m must be at least"),
+        (ClutterConfig(spheres=-1), "spheres = -1 must be 0 to 1000"),
+        (ClutterConfig(half_min=2.0), "half_min = 2.0 and half_max = 0.9 m"),
+        (RoomConfig(height=1.0), "a room of 12 x 10 x 1 m is too small"),
+        (OverUnderConfig(over=5.5), "over = 5.5 m must be at most height"),
+        (OverUnderConfig(barriers=30), "barriers = 30 must be 1 to 50 and need a length"),
+        (InsertedConfig(), "world.path is empty"),
+        (OctomapConfig(path="x", lower=[0.0, 0, 0]), "lower and upper must be given both"),
+    ],
+)
+def test_what_cannot_be_built_is_refused(config, message):
+    """Values without a world are refused by field, value and limit."""
+    with pytest.raises(ValueError, match=message):
+        config.validate()
+
+
+def test_infeasible_draws_are_redrawn_and_given_up(monkeypatch):
+    """A field so full that nothing flies through is an error after some draws, not a hang."""
+    monkeypatch.setattr(feasibility, "TRIES", 2)
+    full = ClutterConfig(
+        length=8, width=4, height=3, spheres=0, boxes=200, half_min=0.5, half_max=0.7, floating=True
+    )
+    with pytest.raises(ValueError, match="none of 2 instances .* seed 0 leaves a vehicle"):
+        make_blueprint(full, 0)
+    with pytest.raises(ValueError, match="seed = -1"):
+        make_blueprint(RoomConfig(), -1)
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory) -> Path:
+    """A folder of scenes with one in it: an empty room of 9 x 5 x 4 m on a grid."""
+    field = AnalyticDistanceField(
+        [HalfSpace([0.0, 0, 1], 0.0)], np.array([0.0, 0, -0.2]), np.array([9.0, 5, 4])
+    )
+    esdf = esdf_from_distance_field(field, 0.1)
+    gaussians = GaussianScene.from_colors(
+        np.zeros((1, 3)), [[1, 0, 0, 0]], np.full((1, 3), 0.1), [0.5], np.full((1, 3), 0.5)
+    )
+    ends = np.array([1.0, 2.5, 2.0]), np.array([8.0, 2.5, 2.0])
+    world = World("hall", gaussians, esdf, esdf, (0.0, 0.0, 0.0), *ends)
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scene_folder(folder / "hall", world, provenance="test")
+    return folder
+
+
+def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
+    """A scene is looked for in FLYSPLAT_SCENES; one that is not there says how to get it."""
+    monkeypatch.setenv("FLYSPLAT_SCENES", str(hall))
+    assert find_scene(SceneConfig(path="hall")) == hall / "hall"
+    monkeypatch.setenv("FLYSPLAT_SCENES", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"hall: .*FLYSPLAT_SCENES.*; ask Ann"):
+        make_world(SceneConfig(path="hall", source="ask Ann"), 0)
+
+
+def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
+    """Drawn ends are free, far apart, the same for the same seed and others for another."""
+    monkeypatch.setenv("FLYSPLAT_SCENES", str(hall))
+    config = SceneConfig(path="hall", draw_ends=True)
+    worlds = [make_world(config, seed) for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(worlds[0].p_WS, worlds[1].p_WS)
+    assert not np.allclose(worlds[0].p_WS, worlds[2].p_WS)
+    for world in worlds:
+        ends = np.stack([world.p_WS, world.p_WG])
+        assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
+        assert np.linalg.norm(world.p_WS - world.p_WG) > 3
+
+
+def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
+    """Three to five solids are put into the scene; what is seen of them is where the distance is
+    zero, start and goal stay free and a way 1.3 vehicles wide is left."""
+    monkeypatch.setenv("FLYSPLAT_SCENES", str(hall))
+    before = make_world(SceneConfig(path="hall"), 0)
+    world = make_world(InsertedConfig(path="hall"), 0)
+    new = world.gaussians.means[len(before.gaussians) :].astype(float)
+    assert len(new) > 100
+    assert np.abs(world.esdf.distance(new)).max() < 0.08
+    changed = world.esdf.distances < before.esdf.distances - 1e-6
+    assert changed.any() and (world.esdf.distances <= before.esdf.distances + 1e-6).all()
+    ends = np.stack([world.p_WS, world.p_WG])
+    assert world.esdf.distance(ends).min() > 0.8
+    field = world.esdf.conservative()
+    assert connects(field, *ends, GAP / 2 - 0.05, 0.1)
+    again = make_world(InsertedConfig(path="hall"), 0)
+    np.testing.assert_array_equal(world.gaussians.means, again.gaussians.means)
+
+
+def test_octomap_is_seen_where_it_is_occupied(tmp_path):
+    """Gaussians stand for the occupied voxels beside free ones, and flights start in free space."""
+    from flysplat.diagrams.worlds.light import Daylight
+    from flysplat.diagrams.worlds.octomap_world import voxel_gaussians
+    from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+
+    occupied = np.zeros((12, 12, 12), bool)
+    occupied[4:8, 4:8, :] = True
+    esdf = esdf_from_occupancy(occupied, np.zeros_like(occupied), np.zeros(3), 0.5)
+    scene = voxel_gaussians(esdf, Daylight.sampled(np.random.default_rng(0)))
+    assert len(scene) == 12 * (16 - 4)  # the column's outer voxels
+    assert (np.abs(esdf.distance(scene.means.astype(float))) <= 0.5).all()
