@@ -117,9 +117,9 @@ def traversability_obstacle(field: DistanceField, path: NDArray) -> float:
     """FlightBench's TO: (R / 2N) sum of 1 / r_i over the N narrower half of the balls of a corridor
     along the path (K, 3) [m]; R is the sensing range. High is hard.
 
-    A ball's radius is the clearance at its centre, 5 cm to R. Each is about the place where the path
-    leaves the ball before. FlightBench draws 40 centres about it at random and takes the best; here
-    they are the 52 at 0.25 and 0.5 m from it in fixed directions, so that a path has one value.
+    A ball's radius is the clearance at its centre, 5 cm to R. Each is about the place where the
+    path leaves the ball before. FlightBench draws 40 centres about it at random and takes the best;
+    here they are the 52 at 0.25 and 0.5 m from it in fixed directions: a path has one value.
     """
     points = resampled(path, 0.05)
     directions = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1.0

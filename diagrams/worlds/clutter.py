@@ -112,7 +112,7 @@ def _box(config: ClutterConfig, lower, upper, rng: np.random.Generator) -> Solid
     half = rng.uniform(config.half_min, config.half_max, 3)
     p = rng.uniform(lower, upper)
     if config.floating:
-        turn = RotationMatrix(Rotation.random(random_state=rng).as_matrix())
+        turn = RotationMatrix(Rotation.random(rng=rng).as_matrix())
     else:
         lean = np.deg2rad(config.lean_max) * np.sqrt(rng.uniform())
         way = rng.uniform(0, 2 * np.pi)

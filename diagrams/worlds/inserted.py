@@ -67,9 +67,8 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         rng = np.random.default_rng([seed, attempt])
         world = scene
         if config.draw_ends and attempt % 10 == 9:
-            p_WS, p_WG, _ = draw_start_and_goal(
-                scene.esdf, VEHICLE_RADIUS, int(rng.integers(2**31))
-            )
+            again = int(rng.integers(2**31))
+            p_WS, p_WG, _ = draw_start_and_goal(scene.esdf, VEHICLE_RADIUS, again)
             scene = world = replace(scene, p_WS=p_WS, p_WG=p_WG)
         solids = _drawn(config, world, rng)
         if len(solids) < config.least:

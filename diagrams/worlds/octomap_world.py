@@ -74,7 +74,7 @@ def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:
     index = np.argwhere(shell)
     if not len(index):
         raise ValueError("the map has no occupied voxel beside a free one: there is nothing to see")
-    p = esdf.lower_W + (index + 0.5) * esdf.voxel_size
+    p = np.asarray(esdf.lower_W + (index + 0.5) * esdf.voxel_size, dtype=np.float64)
     free = gaussian_filter((~occupied).astype(np.float32), 1.0)
     n = np.stack([map_coordinates(g, index.T, order=0) for g in np.gradient(free)], axis=-1)
     length = np.linalg.norm(n, axis=1, keepdims=True)

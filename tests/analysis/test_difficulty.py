@@ -27,6 +27,7 @@ from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
 
 LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
 EMPTY = AnalyticDistanceField([], LOWER, UPPER)
+UP = np.array([0.0, 0, 1])
 START, GOAL = np.array([1.5, 0.1, 2.0]), np.array([10.5, 0.1, 2.0])
 
 
@@ -87,7 +88,7 @@ def test_traversability_falls_with_obstacles_and_scales():
     """Posts make the mean free way shorter."""
     rng = np.random.default_rng(5)
     feet = rng.uniform(LOWER, UPPER, (12, 3)) * (1, 1, 0)
-    posts = [Capsule(foot - [0, 0, 1], foot + [0, 0, 5], 0.2) for foot in feet]
+    posts = [Capsule(foot - UP, foot + 5 * UP, 0.2) for foot in feet]
     crowded = AnalyticDistanceField(posts, LOWER, UPPER)
     walls = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
     free, halved, narrow = (
@@ -112,7 +113,7 @@ def test_traversability_obstacle_is_range_over_diameter_in_a_tunnel():
 
 
 def test_view_obstacle_of_a_wall_ahead():
-    """Flying at a wall from 3 m, the weights sum to one over the distances along the rings' rays."""
+    """Flying at a wall 3 m ahead, each ring's weight counts over the distance along its rays."""
     field = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
     path = np.array([[2.9, 0.0, 2.0], [3.3, 0.0, 2.0]])
     middles = np.pi * np.array([(1 / 5 + 1 / 6) / 2, (1 / 6 + 1 / 8) / 2, (1 / 8 + 1 / 12) / 2])
