@@ -36,7 +36,7 @@ def choose_start_and_goal(
     for need in (margin, margin / 2, 0.0):
         if np.count_nonzero(clearance > need) < 2:
             continue
-        graph, nodes = _grid_graph(clearance > need, spacing)
+        graph, nodes = grid_graph(clearance > need, spacing)
         p_WF = p_WN.reshape(-1, 3)[nodes]
         _, label = connected_components(graph, directed=False)
         inner = int(np.argmax(label == np.bincount(label).argmax()))
@@ -51,7 +51,7 @@ def choose_start_and_goal(
     )
 
 
-def _grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
+def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
     """Returns the graph that joins each free node to its free neighbours among the 26 around it,
     weighted by distance [m], and the flat index of each of its nodes."""
     nodes = np.flatnonzero(free)
