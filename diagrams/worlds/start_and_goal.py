@@ -79,7 +79,7 @@ def _free_graphs(
     clearance = field.distance(p_WN) - radius  # [m]
     for need in (margin, margin / 2, 0.0):
         if np.count_nonzero(clearance > need) >= 2:
-            graph, nodes = _grid_graph(clearance > need, spacing)
+            graph, nodes = grid_graph(clearance > need, spacing)
             yield graph, p_WN.reshape(-1, 3)[nodes]
 
 
@@ -91,7 +91,7 @@ def _no_room(esdf: Esdf, radius: float) -> ValueError:
     )
 
 
-def _grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
+def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
     """Returns the graph that joins each free node to its free neighbours among the 26 around it,
     weighted by distance [m], and the flat index of each of its nodes."""
     nodes = np.flatnonzero(free)

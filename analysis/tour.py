@@ -1,0 +1,51 @@
+"""From a mesh to a flight: render a capture, reconstruct it, fly in what came of it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flysplat.diagrams import fly
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.make_world import SceneConfig
+from flysplat.diagrams.worlds.scene_folder import read_scene_metadata
+from flysplat.training import reconstruct
+from flysplat.training.captures import render_capture
+from flysplat.training.captures.render_capture import RenderConfig
+from flysplat.training.reconstruct import ReconstructConfig
+
+
+@dataclass
+class TourConfig:
+    """How each stage of a tour is done."""
+
+    render: RenderConfig = field(default_factory=RenderConfig)
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    flight: Scenario = field(default_factory=Scenario)  # its world is the reconstruction
+
+
+def run(
+    *, world: Path, out: Path, scene: Path | None, config: TourConfig, seed: int = 0
+) -> dict[str, float | str]:
+    """Renders `world` to `out/capture`, reconstructs that as `scene` (`out/scene` if None), flies
+    in it, leaving `out/flight`, and returns the summary of the flight.
+
+    What is there from a run before is used again: an interrupted tour goes on.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: see `render_capture.run`, `reconstruct.run` and
+            `fly.run`; or if `scene` was made of another capture.
+    """
+    capture = out / "capture"
+    scene = out / "scene" if scene is None else scene
+    render_capture.run(world=world, out=capture, config=config.render, seed=seed)
+    if (scene / "scene.yaml").is_file():
+        made_of = read_scene_metadata(scene).capture
+        if Path(made_of) != capture.absolute():
+            raise ValueError(
+                f"{scene}: was made of {made_of or 'another capture'}, not of {capture}; name "
+                "another folder with --scene"
+            )
+        print(f"{scene}: is reconstructed already")
+    else:
+        reconstruct.run(capture=capture, out=scene, config=config.reconstruct)
+    config.flight.world = SceneConfig(path=str(scene.absolute()))
+    return fly.run(scenario=config.flight, out=out / "flight")

@@ -1,0 +1,133 @@
+"""Where a camera goes to see a place: through it everywhere, looking ahead and to the sides."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.ndimage import gaussian_filter1d
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from flysplat.diagrams.worlds.start_and_goal import grid_graph
+from flysplat.systems.collision.esdf import Esdf
+
+_STEP = 0.05  # [m], of a path while it is smoothed
+_ROUNDING = 0.4  # [m], standard deviation of the smoothing of corners
+
+
+def visiting_path(
+    esdf: Esdf,
+    lower_W: NDArray[np.float64],
+    upper_W: NDArray[np.float64],
+    clearance: float,
+    apart: float,
+) -> NDArray[np.float64]:
+    """Returns a path (N, 3) [m] that visits all the free space of a box.
+
+    In the largest connected part of the space with `clearance` [m], places are chosen each farthest
+    from those before, as paths go, until none is farther than `apart` [m] from one. From the first,
+    an end of the space, the path goes on to the nearest place not visited yet, by shortest paths.
+
+    Raises:
+        ValueError: if no space has that much clearance.
+    """
+    spacing = max(esdf.voxel_size, 0.2)
+    axes = [
+        low + spacing * (np.arange(max(int((high - low) / spacing), 1)) + 0.5)
+        for low, high in zip(lower_W, upper_W, strict=True)
+    ]
+    p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
+    found = esdf.conservative().distance(p_WN)
+    if np.count_nonzero(found > clearance) < 2:
+        raise ValueError(
+            f"no camera path: the largest clearance from {np.round(lower_W, 1).tolist()} to "
+            f"{np.round(upper_W, 1).tolist()} is {found.max():.2f} m, {clearance} m is asked for; "
+            "ask for less clearance, or allow other heights"
+        )
+    graph, nodes = grid_graph(found > clearance, spacing)
+    p_WF = p_WN.reshape(-1, 3)[nodes]
+    _, label = connected_components(graph, directed=False)
+    part = label == np.bincount(label).argmax()
+
+    def lengths_from(node: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        lengths, before = dijkstra(graph, directed=False, indices=node, return_predecessors=True)
+        lengths[~part] = -1
+        return lengths, before
+
+    places = [int(np.argmax(lengths_from(int(np.argmax(part)))[0]))]
+    tables = [lengths_from(places[0])]
+    nearest = tables[0][0].copy()
+    while nearest.max() > apart:
+        places.append(int(np.argmax(nearest)))
+        tables.append(lengths_from(places[-1]))
+        np.minimum(nearest, tables[-1][0], out=nearest)
+
+    path, here, left = [places[0]], 0, set(range(1, len(places)))
+    while left:
+        lengths, before = tables[here]
+        here = min(left, key=lambda k: (lengths[places[k]], k))
+        leg = [places[here]]
+        while leg[-1] != path[-1]:
+            leg.append(int(before[leg[-1]]))
+        path += leg[-2::-1]
+        left.remove(here)
+    return p_WF[path]
+
+
+def poses_along(
+    path: NDArray[np.float64], spacing: float, yaws: Sequence[float], pitch: float
+) -> list[RigidTransform]:
+    """Returns the poses X_WC of a camera that stops on a path and turns.
+
+    The path's corners are rounded. A stop lies every `spacing` [m] along it, has one pose for each
+    of `yaws` [deg], measured from the direction of travel to the left, all looking up by `pitch`
+    [deg].
+
+    Args:
+        path: (N, 3) [m], N >= 1; a path of one point is one stop that travels along x.
+
+    Raises:
+        ValueError: if `path` is no list of finite points.
+    """
+    path = np.asarray(path, dtype=np.float64)
+    if path.ndim != 2 or path.shape[1] != 3 or not len(path) or not np.isfinite(path).all():
+        raise ValueError(f"the path has shape {path.shape}; finite points x, y, z are needed")
+    p_WP = _resampled(path, _STEP)
+    if len(p_WP) > 1:
+        p_WP = gaussian_filter1d(p_WP, _ROUNDING / _STEP, axis=0, mode="nearest")
+    p_WP = _resampled(p_WP, spacing)
+    way = np.gradient(p_WP, axis=0) if len(p_WP) > 1 else np.array([[1.0, 0, 0]])
+    # Where the way is up or down, the heading stays what it was.
+    level = np.linalg.norm(way[:, :2], axis=1) > 0.1 * np.linalg.norm(way, axis=1)
+    last = np.maximum.accumulate(np.where(level, np.arange(len(way)), 0))
+    headings = np.arctan2(way[last, 1], way[last, 0])
+    return [
+        looking(p, heading + np.deg2rad(yaw), np.deg2rad(pitch))
+        for p, heading in zip(p_WP, headings, strict=True)
+        for yaw in yaws
+    ]
+
+
+def looking(p_WC: NDArray[np.float64], yaw: float, pitch: float) -> RigidTransform:
+    """Returns the pose X_WC of an upright camera that looks along yaw and up by pitch [rad]."""
+    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    return RigidTransform(
+        RotationMatrix(np.column_stack([right, np.cross(ahead, right), ahead])), p_WC
+    )
+
+
+def beside(X_WC: RigidTransform, offset: float) -> RigidTransform:
+    """Returns the pose moved by `offset` [m] to the camera's left, looking where it looked."""
+    return RigidTransform(
+        X_WC.rotation(), X_WC.translation() - offset * X_WC.rotation().matrix()[:, 0]
+    )
+
+
+def _resampled(path: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Returns points of a polyline, evenly spaced by about `spacing` [m], ends included."""
+    lengths = np.append(0.0, np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum())
+    wanted = np.linspace(0, lengths[-1], max(round(lengths[-1] / spacing), 1) + 1)
+    if lengths[-1] == 0:
+        return path[:1]
+    return np.stack([np.interp(wanted, lengths, column) for column in path.T], axis=1)

@@ -1,0 +1,278 @@
+"""Captures rendered of meshes: images, exact depth and poses anywhere, as TartanAir V1 has them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from tqdm import tqdm
+
+from flysplat.diagrams.configuration import dump_config, load_config
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.gltf import write_gltf
+from flysplat.diagrams.worlds.make_world import make_blueprint
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+from flysplat.systems.files import require_writable_folder, written_atomically
+from flysplat.training.captures.camera_path import beside, poses_along, visiting_path
+from flysplat.training.captures.capture import CaptureFrame
+from flysplat.training.captures.mesh_renderer import MeshRenderer, check_mesh
+from flysplat.training.captures.tartanair import AXES
+
+RECIPE = "world.yaml"
+_SAMPLES_PER_VOXEL_FACE = 8
+
+
+@dataclass(kw_only=True)
+class RenderConfig:
+    """How a world is captured."""
+
+    width: int = 640  # [px]
+    height: int = 480  # [px]
+    # [m] Points x, y, z that the camera goes through; left out, it visits all the free space
+    # between the heights, no two visited places being closer than `apart` on the way.
+    path: list[list[float]] = field(default_factory=list)
+    lowest: float = 1.0  # [m] of the path where it is not given
+    highest: float = 2.2  # [m] of the path where it is not given
+    apart: float = 3.0  # [m]
+    clearance: float = 0.5  # [m] that the camera keeps from surfaces
+    spacing: float = 0.6  # [m] between stops on the path
+    # [deg] Directions in which the camera looks at each stop, from that of travel to the left.
+    yaws: list[float] = field(default_factory=lambda: [0.0, 90.0, -90.0])
+    pitch: float = -5.0  # [deg] upwards
+    # [m] to the camera's left, negative to its right: for each, a second capture `offset_...` from
+    # there, of the poses that have room for the camera.
+    offsets: list[float] = field(default_factory=list)
+    up: str = "y"  # axis of the file's coordinates that points up: y, as glTF says, or z
+    # Colour where there is no mesh; red, green, blue in 0 to 1.
+    background: list[float] = field(default_factory=lambda: [0.6, 0.75, 0.9])
+    voxel_size: float = 0.1  # [m] of the grid in which the path is found
+
+    def validate(self) -> None:
+        """Raises ValueError for values that make no sense."""
+        for name in ("width", "height"):
+            if not 8 <= getattr(self, name) <= 4096:
+                raise ValueError(f"{name} is {getattr(self, name)} px, 8 to 4096 is needed")
+        for name in ("apart", "spacing", "voxel_size"):
+            if not 0.01 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)} m, at least 0.01 is needed")
+        if not 0 <= self.clearance < np.inf:
+            raise ValueError(f"clearance is {self.clearance} m, it must not be negative")
+        if not self.lowest < self.highest:
+            raise ValueError(
+                f"lowest is {self.lowest} m and highest {self.highest} m: nothing lies between"
+            )
+        if not self.yaws or not np.isfinite([*self.yaws, self.pitch]).all():
+            raise ValueError(f"yaws are {self.yaws}, pitch {self.pitch}: finite angles are needed")
+        if abs(self.pitch) >= 90:
+            raise ValueError(f"pitch is {self.pitch} deg, between -90 and 90 is needed")
+        if not all(np.isfinite(offset) and offset for offset in self.offsets):
+            raise ValueError(f"offsets are {self.offsets} m; finite ones other than 0 are needed")
+        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
+            raise ValueError(f"background is {self.background}, three numbers 0 to 1 are needed")
+
+
+@dataclass
+class RenderedWorld:
+    """The content of `world.yaml`: what a capture shows, so that more of it can be rendered."""
+
+    # The mesh, absolute or relative to the capture.
+    mesh: str = ""
+    # What it was made from.
+    origin: str = ""
+    # How the capture was rendered.
+    config: RenderConfig = field(default_factory=RenderConfig)
+
+
+def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
+    """Renders a capture of a world to the folder `out`.
+
+    Frames are kept in `.NAME.partial` beside `out` until all are there; run again after an
+    interruption, it goes on from there. A capture that is there already is left as it is.
+
+    Args:
+        world: a mesh (.gltf or .obj), or a scenario (.yaml) whose world is procedural: that world
+            is exported, with what `seed` draws, as `world.gltf` into the capture.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: for a world or settings that cannot be rendered, a
+            path through walls, something else in `out`, or a full disk.
+    """
+    config.validate()
+    out, world = Path(out).absolute(), Path(world).absolute()
+    partial = out.with_name(f".{out.name}.partial")
+    if world.suffix in (".yaml", ".yml"):
+        scenario = load_config(Scenario(), world)
+        blueprint = make_blueprint(scenario.world, seed)  # pyright: ignore[reportArgumentType]
+        recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config)
+    else:
+        check_mesh(world, config.up)
+        blueprint = None
+        recipe = RenderedWorld(str(world), world.name, config)
+    text = dump_config(recipe)
+    if _is_same(out, text):
+        print(f"{out}: is rendered already")
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ValueError(
+            f"{out}: holds something other than this capture; choose another folder, or remove it"
+        )
+    if partial.exists() and not _is_same(partial, text):
+        raise ValueError(
+            f"{partial}: holds a part of another capture; remove it, or repeat what was begun"
+        )
+    require_writable_folder(partial)
+    mesh = partial / recipe.mesh
+    if blueprint is not None and not mesh.is_file():
+        write_gltf(blueprint, mesh)
+    renderer = _renderer(mesh, config)
+    bounds = None if blueprint is None else (blueprint.lower_W, blueprint.upper_W)
+    esdf = mesh_distance(mesh, config.up, config.voxel_size)
+    X_WCs = _poses(esdf, bounds, config)
+    with written_atomically(partial / RECIPE) as file:
+        file.write_text(text)
+    K = intrinsics(config.width, config.height)
+
+    def view(X_WC: RigidTransform) -> CaptureFrame:
+        return renderer.frame(X_WC, K, config.width, config.height)
+
+    _write_frames(partial, "rendering", X_WCs, view)
+    for offset in config.offsets:
+        moved = [beside(X_WC, offset) for X_WC in X_WCs]
+        room = [X_WC for X_WC in moved if _has_room(esdf, [X_WC.translation()], config.clearance)]
+        _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", room, view)
+    if out.exists():
+        out.rmdir()
+    partial.rename(out)
+    length = np.linalg.norm(np.diff([X.translation() for X in X_WCs], axis=0), axis=1).sum()
+    print(f"{out}: {len(X_WCs)} frames of {config.width}x{config.height} along {length:.1f} m")
+
+
+def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | None:
+    """Returns what renders the truth at any pose X_WC of the world that a capture was rendered of,
+    in the camera of the capture; None if the capture was not rendered.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: if its world is gone, damaged or cannot be rendered.
+    """
+    file = capture / RECIPE
+    if not file.is_file():
+        return None
+    recipe = load_config(RenderedWorld(), file)
+    config = recipe.config
+    config.validate()
+    renderer = _renderer(capture / recipe.mesh, config)
+    K = intrinsics(config.width, config.height)
+    return lambda X_WC: renderer.frame(X_WC, K, config.width, config.height)
+
+
+def intrinsics(width: int, height: int) -> NDArray[np.float64]:
+    """Returns K (3, 3) [px] of a camera as TartanAir's: 90 degrees wide, centred."""
+    return np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
+
+
+def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
+    """Returns the distance to the surface of a mesh, from points sampled on it.
+
+    Raises:
+        ValueError: if the file cannot be read or holds no surface.
+    """
+    try:
+        surface = trimesh.load(mesh, force="mesh")
+    except Exception as error:  # whatever its reader meets in a damaged file
+        raise ValueError(f"{mesh}: not a readable mesh ({error}); export it again") from error
+    if not isinstance(surface, trimesh.Trimesh) or not surface.area > 0:
+        raise ValueError(f"{mesh}: holds no surface; export it again")
+    count = int(_SAMPLES_PER_VOXEL_FACE * surface.area / voxel_size**2) + 1
+    points, _ = trimesh.sample.sample_surface(surface, count, seed=0)
+    p_WQ = np.asarray(points, dtype=np.float64)
+    if up == "y":
+        p_WQ = p_WQ @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    lower_W = p_WQ.min(axis=0) - voxel_size
+    shape = np.ceil((p_WQ.max(axis=0) + voxel_size - lower_W) / voxel_size).astype(int)
+    occupied = np.zeros(shape, dtype=bool)
+    occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
+    return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
+
+
+def _is_same(folder: Path, text: str) -> bool:
+    file = folder / RECIPE
+    return file.is_file() and file.read_text() == text
+
+
+def _renderer(mesh: Path, config: RenderConfig) -> MeshRenderer:
+    red, green, blue = config.background
+    return MeshRenderer(mesh, config.up, (red, green, blue))
+
+
+def _poses(
+    esdf: Esdf, bounds: tuple[NDArray, NDArray] | None, config: RenderConfig
+) -> list[RigidTransform]:
+    """Returns the camera poses of the path, given or found.
+
+    Raises:
+        ValueError: if the path touches something, or none can be found.
+    """
+    if config.path:
+        X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
+        for X_WC in X_WCs:
+            p_WC = X_WC.translation()
+            if not _has_room(esdf, [p_WC], min(config.clearance, esdf.voxel_size)):
+                raise ValueError(
+                    f"the path touches something at {np.round(p_WC, 2).tolist()} m; lead it around"
+                )
+        return X_WCs
+    lower_W, upper_W = (esdf.lower_W, esdf.upper_W) if bounds is None else bounds
+    path = visiting_path(
+        esdf,
+        np.append(lower_W[:2], config.lowest),
+        np.append(upper_W[:2], config.highest),
+        config.clearance,
+        config.apart,
+    )
+    return poses_along(path, config.spacing, config.yaws, config.pitch)
+
+
+def _has_room(esdf: Esdf, p_WQ: Sequence[NDArray], clearance: float) -> bool:
+    # Outside the grid there is nothing, so that NaN is room enough.
+    return not (esdf.distance(np.array(p_WQ)) < clearance).any()
+
+
+def _write_frames(
+    folder: Path,
+    what: str,
+    X_WCs: Sequence[RigidTransform],
+    view: Callable[[RigidTransform], CaptureFrame],
+) -> None:
+    """Writes the frames that are not there yet, as a TartanAir V1 sequence."""
+    images, depths = folder / "image_left", folder / "depth_left"
+    for part in (images, depths):
+        part.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for i, X_WC in enumerate(tqdm(X_WCs, what, unit="frame")):
+        rows.append(_row(X_WC))
+        image = images / f"{i:06d}_left.png"
+        depth = depths / f"{i:06d}_left_depth.npy"
+        if image.is_file() and depth.is_file():
+            continue
+        frame = view(X_WC)
+        with written_atomically(depth) as file:
+            np.save(file, frame.depth)
+        with written_atomically(image) as file:
+            _, content = cv2.imencode(".png", np.ascontiguousarray(frame.image[..., ::-1]))
+            file.write_bytes(content.tobytes())
+    with written_atomically(folder / "pose_left.txt") as file:
+        file.write_text("".join(rows))
+
+
+def _row(X_WC: RigidTransform) -> str:
+    """The pose as a line tx ty tz qx qy qz qw in the axes of TartanAir's files."""
+    R_FW = AXES.R_WF.inverse()
+    R_FB = R_FW @ X_WC.rotation() @ AXES.R_BC.inverse()
+    w, x, y, z = R_FB.ToQuaternion().wxyz()
+    numbers = (*R_FW.multiply(X_WC.translation()), x, y, z, w)
+    return " ".join(f"{number:.17g}" for number in numbers) + "\n"
