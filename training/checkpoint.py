@@ -1,7 +1,6 @@
 """Checkpoints of an optimisation: whole files that say what they belong to."""
 
 import hashlib
-import pickle
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -69,8 +68,8 @@ class Checkpoint:
             return None
         try:
             content = torch.load(self.file, weights_only=True)
-        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-            reason = str(error).splitlines()[0]
+        except Exception as error:  # of a damaged file, the unpickler may raise anything
+            reason = (str(error) or type(error).__name__).splitlines()[0]
             raise ValueError(
                 f"{self.file}: not a readable checkpoint ({reason}); {_REMEDY}"
             ) from None

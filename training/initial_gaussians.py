@@ -16,6 +16,8 @@ from flysplat.training.photometry import Photometry
 
 # Where what is beyond range is put [m]: at this distance of the camera that saw it.
 SHELL = 150.0
+# One in so many frames is tried first.
+_SOME = 4
 # Opacity and size, in distances to the third neighbour, of Gaussians about points.
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5
 
@@ -74,11 +76,19 @@ def gaussians_from_depth(
     # Fewer, coarser cells until the Gaussians fit: first where texture asks for fine ones, then
     # everywhere.
     contrast, max_cell, max_extent = detail.contrast, detail.max_cell, detail.max_extent
+    some = range(0, len(frames), _SOME)
+    progress = tqdm(desc="Gaussians", unit="frame")
     while True:
-        progress = tqdm(frames, f"Gaussians, contrast {contrast:.2f}", len(frames), unit="frame")
-        parts = [gaussians_of(k, with_shell(frame)) for k, frame in enumerate(progress)]
-        if sum(len(p_WQ) for p_WQ, _, _ in parts) <= detail.max_gaussians:
-            break
+        # Some of the frames tell when it is far too many.
+        parts = {k: gaussians_of(k, with_shell(frames[k])) for k in some}
+        progress.update(len(parts))
+        estimate = sum(len(p_WQ) for p_WQ, _, _ in parts.values()) * len(frames) / len(some)
+        if estimate <= 1.1 * detail.max_gaussians:
+            for k in set(range(len(frames))).difference(some):
+                parts[k] = gaussians_of(k, with_shell(frames[k]))
+                progress.update()
+            if sum(len(p_WQ) for p_WQ, _, _ in parts.values()) <= detail.max_gaussians:
+                break
         if contrast < 1:
             contrast *= 1.3
         elif max_cell < 64:
@@ -88,7 +98,9 @@ def gaussians_from_depth(
                 f"{detail.max_gaussians} Gaussians are too few for {len(frames)} frames, even with "
                 f"cells of {max_cell} pixels; allow more, or use fewer frames"
             )
-    p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*parts, strict=True))
+    progress.close()
+    in_order = [parts[k] for k in range(len(frames))]
+    p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*in_order, strict=True))
     quats, scales = principal_axes(covariances)
     opacities = np.full(len(p_WQ), detail.opacity)
     red, green, blue = np.clip(colors.mean(axis=0), 0, 1)

@@ -101,8 +101,8 @@ class FieldDifference:
     mean: float  # [m], positive: surfaces seem farther than they are
     median_absolute: float  # [m]
     p95_absolute: float  # [m]
-    blocked: float  # fraction of truly free voxels that count as occupied
-    opened: float  # fraction of truly occupied voxels that count as free
+    blocked: float  # fraction of space that is free by a voxel or more, but counts as occupied
+    opened: float  # fraction of space that is occupied, but counts as free by a voxel or more
 
     def __str__(self) -> str:
         return (
@@ -116,7 +116,8 @@ def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
     """Compares two fields on the same grid."""
     d, d_true = field.distances, truth.distances
     known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
-    free, occupied = (known & (truth.states == s) for s in (FieldState.FREE, FieldState.OCCUPIED))
+    free = known & (d_true > truth.voxel_size)
+    occupied = known & (truth.states == FieldState.OCCUPIED)
     near = known & (np.abs(d_true) < _NEAR)
     error = (d - d_true)[near]
     return FieldDifference(
@@ -124,5 +125,5 @@ def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
         median_absolute=float(np.median(np.abs(error))),
         p95_absolute=float(np.percentile(np.abs(error), 95)),
         blocked=float((field.states == FieldState.OCCUPIED)[free].mean()),
-        opened=float((field.states == FieldState.FREE)[occupied].mean()),
+        opened=float((d[occupied] > field.voxel_size).mean()),
     )
