@@ -22,6 +22,8 @@ from flysplat.training.splat_rendering import Rendering, render
 
 # The learning rate of the means falls to this fraction.
 _LAST_RATE = 0.01
+# Unknown gains are fitted after these parts of all steps.
+_GAIN_FITS = (0.1, 0.2, 0.4)
 # Terms of 2D Gaussian splatting begin after these parts of all steps, as in its publication.
 _DISTORTION_START, _NORMAL_START = 0.1, 7 / 30
 
@@ -37,6 +39,7 @@ class Optimization:
         initial: makes the Gaussians to start from; not called if there is a checkpoint.
         checkpoint: where to keep what was done.
         perceptual: LPIPS of two images (H, W, 3), or None.
+        fit_gains: whether the gains of `views` are unknown, and to be found on the way.
     """
 
     def __init__(
@@ -48,9 +51,11 @@ class Optimization:
         initial: Callable[[], GaussianScene],
         checkpoint: Checkpoint,
         perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
+        fit_gains: bool = False,
     ):
         self._config, self._views, self._held_out = config, views, held_out
         self._checkpoint, self._perceptual = checkpoint, perceptual
+        self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
         self._background = torch.tensor([background], device=config.device)  # (1, 3)
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
@@ -72,6 +77,7 @@ class Optimization:
         else:
             self.step = kept["step"]
             self.splats = SplatParameters(**kept["splats"], rates=rates)
+            views.gains = kept["gains"]
         self._strategy = self._make_strategy()
         if kept is not None and self._strategy is not None:
             self._strategy.restore(kept["strategy"])
@@ -110,7 +116,7 @@ class Optimization:
         flat = config.representation == "2dgs"
         rendering = render(
             config.representation,
-            (splats["means"], splats["quats"], splats.scales, splats.opacities, splats.sh),
+            self._gaussians(),
             viewmat,
             self._K,
             self._views.width,
@@ -129,24 +135,40 @@ class Optimization:
             self._strategy.observe(rendering, splats, viewmat, self._K)
         splats.step()
         self.step += 1
+        if self.step in self._gain_steps:
+            self._fit_gains()
         if self._strategy is not None:
             self._strategy.refine(self.step, splats)
 
+    @torch.no_grad()
     def measure(self) -> HeldOutFigures | None:
         """Measures the Gaussians as they are on the withheld frames, if there are any."""
         if self._held_out is None:
             return None
-        config, splats = self._config, self.splats
-        with torch.no_grad():
-            gaussians = (splats["means"], splats["quats"], splats.scales, splats.opacities,
-                         splats.sh)  # fmt: skip
-            return measure_held_out(
-                config.representation,
-                gaussians,
-                self._held_out,
-                self._background,
-                config.renderer_threads,
-            )
+        return measure_held_out(
+            self._config.representation,
+            self._gaussians(),
+            self._held_out,
+            self._background,
+            self._config.renderer_threads,
+        )
+
+    def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        splats = self.splats
+        return splats["means"], splats["quats"], splats.scales, splats.opacities, splats.sh
+
+    @torch.no_grad()
+    def _fit_gains(self) -> None:
+        """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
+        gains = measure_held_out(
+            self._config.representation,
+            self._gaussians(),
+            self._views,
+            self._background,
+            self._config.renderer_threads,
+        ).gains
+        log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
+        self._views.gains = torch.exp(log_gains - log_gains.mean())
 
     def _loss(self, rendering: Rendering, k: int, part: float) -> Tensor:
         config, device = self._config, self._config.device
@@ -192,7 +214,14 @@ class Optimization:
     def _save(self) -> None:
         strategy = {} if self._strategy is None else self._strategy.state()
         state = self.splats.state()
-        self._checkpoint.save({"step": self.step, "splats": state, "strategy": strategy})
+        self._checkpoint.save(
+            {
+                "step": self.step,
+                "splats": state,
+                "strategy": strategy,
+                "gains": self._views.gains,
+            }
+        )
 
 
 def extent_of_cameras(views: ReconstructionViews) -> tuple[np.ndarray, float]:

@@ -134,10 +134,10 @@ def reconstruct(
         config.seed,
     )
     gains = np.ones(len(capture))
-    gains[fitted] = photometry.gains
     checkpoint = None
     figures = None
     if config.iterations == 0:
+        gains[fitted] = photometry.gains
         gaussians, background = gaussians_from_depth(frames, photometry, _detail(config))
         how = "depth back-projected"
     else:
@@ -158,8 +158,10 @@ def reconstruct(
             lambda: _initial(capture, frames, photometry, views, config),
             checkpoint,
             _perceptual(config),
+            fit_gains=not capture.has_depth,
         )
         optimization.run()
+        gains[fitted] = views.gains
         gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
         with one_torch_thread():
             figures = optimization.measure()
@@ -188,7 +190,7 @@ def reconstruct(
         frames=len(capture),
         gaussians=len(gaussians),
         vignetting=photometry.vignetting,
-        gain_range=(float(photometry.gains.min()), float(photometry.gains.max())),
+        gain_range=(float(gains[fitted].min()), float(gains[fitted].max())),
         lower_W=field.lower_W,
         upper_W=field.upper_W,
         observed_free_volume=field.volume(FieldState.FREE),

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flysplat.diagrams.worlds.scene_folder import read_scene_metadata
+from flysplat.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
 from flysplat.systems.splats.gaussian_ply import read_ply
-from flysplat.training.reconstruct import run
+from flysplat.training.captures.capture import SfmPoints, no_depth
+from flysplat.training.captures.read_capture import read_capture
+from flysplat.training.reconstruct import reconstruct, run
 from flysplat.training.reconstruct_config import ReconstructConfig
 
 CONFIG = ReconstructConfig(iterations=60, image_width=0, hold_out=6, voxel_size=0.1, threads=1)
@@ -60,3 +62,43 @@ def test_metric_depth_is_what_places_surfaces(tmp_path, room):
         assert summary.held_out is not None
         errors.append(summary.held_out.depth_mae_m)
     assert 0 < errors[1] < 0.5 * errors[0]
+
+
+def test_without_depth_from_points(tmp_path, write_room):
+    """A capture without depth is reconstructed from points: withheld images come out, and the gains
+    of all images are found."""
+    factors = np.where(np.arange(12) % 3 == 1, 0.8, 1.0)
+    dim = write_room(
+        tmp_path / "dim", poses=POSES, brightness=lambda i, rho: np.full(1, factors[i])
+    )
+    capture = read_capture(dim)
+    rows, columns = np.mgrid[2:48:4, 2:64:4]
+    p_WQ, colors = [], []
+    for frame in capture.frames():
+        p_CQ = frame.back_project(columns + 0.5, rows + 0.5, frame.depth[rows, columns])
+        p_WQ.append(frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T)
+        colors.append(frame.image[rows, columns].reshape(-1, 3) / 255)
+    points = SfmPoints(np.concatenate(p_WQ), np.concatenate(colors))
+    capture = replace(capture, load_depth=no_depth, points=points)
+    summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=250))
+    assert summary.held_out is not None
+    assert summary.held_out.psnr_db > 32
+    assert np.isnan(summary.held_out.depth_mae_m)
+    gains = np.array(read_scene_metadata(tmp_path / "scene").gains)
+    np.testing.assert_allclose(gains / gains[0], factors / factors[0], rtol=0.03)
+
+
+def test_unknown_scale_is_never_flown_in(tmp_path, room):
+    """A capture of unknown scale becomes a scene that says so and that `read_scene` refuses."""
+    capture = replace(read_capture(room), metric=False)
+    summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=5))
+    assert "cannot be flown in: its scale is unknown" in str(summary)
+    with pytest.raises(ValueError, match=r"scene\.yaml: the scale of this scene is unknown"):
+        read_scene(tmp_path / "scene")
+
+
+def test_what_a_capture_lacks_is_said(tmp_path, room):
+    """Asked to start from points that are not there, it says what there is."""
+    with pytest.raises(ValueError, match="initialization is 'points', but room has none; choose"):
+        run(capture=room, out=tmp_path / "scene", config=replace(CONFIG, initialization="points"))
+    assert not (tmp_path / "scene").exists()
