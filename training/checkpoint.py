@@ -14,8 +14,15 @@ from flysplat.training.reconstruction_views import ReconstructionViews
 
 VERSION = 1
 # What may differ when an interrupted run goes on, for it changes nothing that is computed.
-_INDIFFERENT = ("threads", "checkpoint_every", "measure_every", "voxel_size", "max_range",
-                "distance_field")  # fmt: skip
+_INDIFFERENT = (
+    "threads",
+    "checkpoint_every",
+    "measure_every",
+    "tensorboard",
+    "voxel_size",
+    "max_range",
+    "distance_field",
+)
 
 
 class Checkpoint:

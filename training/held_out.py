@@ -17,6 +17,10 @@ class HeldOutFigures:
     depth_mae_m: float  # NaN without depth
     gains: tuple[float, ...]  # brightness of each frame relative to the scene
 
+    def scalars(self) -> dict[str, float]:
+        """The figures by name, for a log."""
+        return {"psnr_db": self.psnr_db, "depth_mae_m": self.depth_mae_m}
+
     def __str__(self) -> str:
         depth = "" if np.isnan(self.depth_mae_m) else f", {self.depth_mae_m:.4f} m"
         return f"{self.psnr_db:.2f} dB{depth}"

@@ -12,6 +12,7 @@ from flysplat.systems.splats.gaussian_scene import GaussianScene
 from flysplat.training import mcmc
 from flysplat.training.checkpoint import Checkpoint
 from flysplat.training.densification import DefaultStrategy
+from flysplat.training.event_log import event_log
 from flysplat.training.held_out import HeldOutFigures, measure_held_out
 from flysplat.training.losses import log_depth_loss, photometric_loss
 from flysplat.training.mcmc import McmcStrategy
@@ -96,12 +97,19 @@ class Optimization:
             unit="step",
             mininterval=1,
         )
-        with one_torch_thread(), progress:
+        with one_torch_thread(), progress, event_log(config.tensorboard) as log:
             while self.step < config.iterations:
                 self.take_step()
                 progress.update()
                 if self.step % config.measure_every == 0:
-                    progress.set_postfix_str(self._figures())
+                    figures = self.measure()
+                    log(
+                        self.step,
+                        {"gaussians": len(self.splats), **(figures.scalars() if figures else {})},
+                    )
+                    progress.set_postfix_str(
+                        f"{len(self.splats)} Gaussians" + (f", {figures}" if figures else "")
+                    )
                 if self.step % config.checkpoint_every == 0 or self.step == config.iterations:
                     self._save()
 
@@ -206,10 +214,6 @@ class Optimization:
             center = torch.tensor(self.center, dtype=torch.float32, device=self._config.device)
             return DefaultStrategy(self._config, center, self.extent, len(self.splats))
         return McmcStrategy(self._config) if self._config.strategy == "mcmc" else None
-
-    def _figures(self) -> str:
-        figures = self.measure()
-        return f"{len(self.splats)} Gaussians" + ("" if figures is None else f", {figures}")
 
     def _save(self) -> None:
         strategy = {} if self._strategy is None else self._strategy.state()

@@ -113,6 +113,9 @@ class ReconstructConfig:
     """Steps between checkpoints, from which an interrupted run goes on."""
     measure_every: int = 500
     """Steps between measurements on the withheld frames."""
+    tensorboard: str = ""
+    """Folder for these measurements in the format of tensorboard, which must be installed; empty
+    for none."""
 
     @property
     def renderer_threads(self) -> int:

@@ -1,0 +1,30 @@
+"""Numbers of a long run, for tensorboard."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
+    """Yields a function that logs numbers of a step for tensorboard; it does nothing without a
+    folder.
+
+    Raises:
+        ValueError: tensorboard is wanted and not installed.
+    """
+    if not folder:
+        yield lambda step, figures: None
+        return
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError(
+            f"tensorboard is {folder!r}, but tensorboard is not installed: pip install tensorboard"
+        ) from error
+    with SummaryWriter(folder) as writer:
+
+        def log(step: int, figures: dict[str, float]) -> None:
+            for name, value in figures.items():
+                writer.add_scalar(name, value, step)
+
+        yield log
