@@ -107,7 +107,7 @@ def test_gradients_are_those_of_places_on_the_image(representation):
                 step[i, axis] = 0.01 * splats["means"][i, 2] / 40  # a hundredth of a pixel
                 change = loss(splats["means"] + step)[1] - loss(splats["means"] - step)[1]
                 slope.append(change.item() / 0.02 * half)
-            assert strategy.gradients[i].item() == pytest.approx(np.hypot(*slope), rel=0.15)
+            assert strategy.gradients[i].item() == pytest.approx(np.hypot(*slope), rel=0.3)
 
 
 def test_rotation_by_quaternions():
