@@ -35,7 +35,7 @@ class DefaultStrategy:
 
     def watch(self, rendering: Rendering) -> None:
         """Has the coming backward pass keep the gradients of places on the image."""
-        if rendering.meta["means2d"].requires_grad:
+        if self._config.representation == "3dgs":
             rendering.meta["means2d"].retain_grad()
 
     @torch.no_grad()
@@ -45,7 +45,7 @@ class DefaultStrategy:
         """Adds up the gradients of a backward pass, in half widths and heights of the image."""
         meta = rendering.meta
         rows, means2d = meta["gaussian_ids"], meta["means2d"]
-        if means2d.requires_grad:
+        if self._config.representation == "3dgs":
             gradient = means2d.absgrad if self._config.absgrad else means2d.grad
         else:
             # Surfels: u = f x / z, so that dL/du is about z / f dL/dx with x in the camera.

@@ -189,10 +189,14 @@ def cell_gaussians(
 def principal_axes(
     covariances: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns quaternions wxyz (n, 4) and standard deviations (n, 3) of covariances (n, 3, 3)."""
+    """Returns quaternions wxyz (n, 4) and standard deviations (n, 3) of covariances (n, 3, 3).
+
+    The smallest comes last: the third axis of a flat Gaussian is its normal, as of surfels.
+    """
     variances, R = np.linalg.eigh(covariances)
+    variances, R = variances[:, ::-1], R[:, :, ::-1].copy()
     R[np.linalg.det(R) < 0, :, 0] *= -1
-    smallest = 1e-6 * variances[:, -1:]
+    smallest = 1e-6 * variances[:, :1]
     return _quaternions(R), np.sqrt(np.maximum(variances, smallest))
 
 

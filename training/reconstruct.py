@@ -108,7 +108,7 @@ def run(
     config.validate()
     check_scene_target(out)
     summary = reconstruct(
-        read_capture(capture), Path(out), config, path=str(capture), restart=restart
+        read_capture(capture, config.capture), Path(out), config, path=str(capture), restart=restart
     )
     print(summary)
     return summary

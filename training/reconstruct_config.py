@@ -1,9 +1,11 @@
 """How a capture becomes a scene."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+
+from flysplat.training.captures.capture_config import CaptureConfig
 
 REPRESENTATIONS = ("3dgs", "2dgs")
 INITIALIZATIONS = ("auto", "depth", "points", "random")
@@ -16,6 +18,8 @@ DEVICES = ("cpu", "cuda")
 class ReconstructConfig:
     """How a capture becomes a scene. The defaults suit a room or a corridor of some 100 frames."""
 
+    capture: CaptureConfig = field(default_factory=CaptureConfig)
+    """What the capture's files leave open."""
     iterations: int = 7000
     """Steps of optimisation, an image each; 0 takes depth and colours as they are."""
     representation: str = "3dgs"
@@ -187,8 +191,8 @@ class ReconstructConfig:
                 f"max_range is {self.max_range} m, more than the voxel size {self.voxel_size} m is "
                 "needed"
             )
-        if self.representation == "2dgs" and (self.device == "cuda" or self.strategy == "mcmc"):
+        if self.representation == "2dgs" and self.strategy == "mcmc":
             raise ValueError(
-                f"representation 2dgs with device {self.device} and strategy {self.strategy}: "
-                "surfels are optimised on the cpu, with strategy none or default"
+                "representation is 2dgs and strategy mcmc, whose relocation is for Gaussians; use "
+                "none or default"
             )

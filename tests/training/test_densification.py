@@ -86,7 +86,7 @@ def test_gradients_are_those_of_places_on_the_image(representation):
     """What is gathered is the change of the loss with a shift of the Gaussian by half an image,
     as differences of renderings have it, but for what the shift does to its shape."""
     splats = three_gaussians(scales=(0.1, 0.1, 0.1))
-    strategy = strategy_for(splats)
+    strategy = strategy_for(splats, representation=representation)
     torch.manual_seed(0)
     weights = torch.rand((48, 64, 3))
 

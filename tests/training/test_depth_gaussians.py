@@ -158,3 +158,15 @@ def test_principal_axes_of_a_flat_covariance_have_some_thickness():
     _, scales = principal_axes(np.diag([0.0, 1.0, 4.0])[None])
     assert (scales > 0).all()
     assert scales.max() == pytest.approx(2)
+
+
+def test_third_principal_axis_is_the_normal():
+    """Of flat covariances the third axis is the one across, and the rotations are proper."""
+    rng = np.random.default_rng(0)
+    R, _ = np.linalg.qr(rng.normal(size=(20, 3, 3)))
+    covariances = R @ np.diag([0.04, 1e-6, 0.01]) @ R.transpose(0, 2, 1)
+    quats, scales = principal_axes(covariances)
+    np.testing.assert_allclose(scales, [[0.2, 0.1, 1e-3]] * 20, rtol=1e-3)
+    w, x, y, z = quats.T
+    normal = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], axis=1)
+    np.testing.assert_allclose(np.abs((normal * R[:, :, 1]).sum(axis=1)), 1, atol=1e-6)
