@@ -60,6 +60,7 @@ run(capture=room, out=out, config=CONFIG)
 
 def kill_a_run(tmp_path, room, out, when: str) -> None:
     (tmp_path / "tests_config.py").write_text(
+        "from flysplat.training.captures.capture_config import CaptureConfig, ScaleConfig\n"
         f"from flysplat.training.reconstruct_config import ReconstructConfig\nCONFIG = {CONFIG!r}\n"
     )
     child = subprocess.run(
