@@ -212,7 +212,7 @@ def choose_pairs(capture: Capture, count: int) -> list[FramePair]:
     """Chooses frames spread over the capture, each with a later one that sees it differently.
 
     Later means by at most 16 frames: the first whose camera has moved by an eighth of the median
-    depth or turned by ten degrees, and the last of them if none has.
+    depth or turned by ten degrees, but by no more than 45, and the last if none has.
     """
     X_CD = capture.depth_camera.X_CD if capture.depth_camera is not None else RigidTransform()
     axes = capture.axes
@@ -249,7 +249,8 @@ def _partner(capture: Capture, i: int, depth: float) -> int | None:
     for j in range(i + 1, min(i + 17, len(capture))):
         X = capture.X_WCs[i].inverse() @ capture.X_WCs[j]
         angle = X.rotation().ToAngleAxis().angle()
-        if np.linalg.norm(X.translation()) > depth / 8 or abs(angle) > np.deg2rad(10):
+        moved = np.linalg.norm(X.translation()) > depth / 8 or abs(angle) > np.deg2rad(10)
+        if moved and abs(angle) < np.deg2rad(45):
             break
     return j
 

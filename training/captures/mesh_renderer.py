@@ -99,7 +99,7 @@ class MeshRenderer:
         self._engine.RenderColorImage(ColorRenderCamera(core), color)
         self._engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(NEAREST, FARTHEST)), depth)
         return CaptureFrame(
-            np.array(color.data[..., :3]), np.array(depth.data[..., 0]), X_WC, np.array(K)
+            np.array(color.data)[..., :3], np.array(depth.data)[..., 0], X_WC, np.array(K)
         )
 
 

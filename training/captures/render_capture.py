@@ -188,8 +188,7 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     if not isinstance(surface, trimesh.Trimesh) or not surface.area > 0:
         raise ValueError(f"{mesh}: holds no surface; export it again")
     count = int(_SAMPLES_PER_VOXEL_FACE * surface.area / voxel_size**2) + 1
-    points, _ = trimesh.sample.sample_surface(surface, count, seed=0)
-    p_WQ = np.asarray(points, dtype=np.float64)
+    p_WQ = np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0], dtype=np.float64)
     if up == "y":
         p_WQ = p_WQ @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     lower_W = p_WQ.min(axis=0) - voxel_size
