@@ -124,7 +124,16 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
         weights = [linear[f"lin{i}.model.1.weight"].float() for i in range(len(_TAPS))]
         if [w.shape for w in weights] != [(1, channels, 1, 1) for channels in _CHANNELS]:
             raise ValueError("linear layers of other sizes")
-    except (UnpicklingError, OSError, RuntimeError, LookupError, ValueError, EOFError) as error:
+    except (
+        UnpicklingError,
+        OSError,
+        RuntimeError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        EOFError,
+    ) as error:
         raise ValueError(
             f"{' and '.join(map(str, source))}: no LPIPS-squeeze weights ({str(error)[:200]}); "
             "get them again"

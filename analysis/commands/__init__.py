@@ -5,6 +5,15 @@ function that runs it. That function imports what it needs when it runs: torch a
 seconds to load.
 """
 
-from flysplat.analysis.commands import capture, difficulty, fly, reconstruct, tour
+from flysplat.analysis.commands import (
+    ablate,
+    capture,
+    difficulty,
+    fidelity,
+    fly,
+    measure,
+    reconstruct,
+    tour,
+)
 
-COMMANDS = (fly, reconstruct, capture, difficulty, tour)
+COMMANDS = (fly, reconstruct, measure, ablate, fidelity, capture, difficulty, tour)

@@ -19,6 +19,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
+    from flysplat.analysis import measure_scene
     from flysplat.diagrams.configuration import load_config
     from flysplat.training import reconstruct
     from flysplat.training.reconstruct_config import ReconstructConfig
@@ -29,3 +30,4 @@ def _reconstruct(options: argparse.Namespace) -> None:
     reconstruct.run(
         capture=options.capture, out=options.out, config=config, restart=options.restart
     )
+    measure_scene.run(options.out)

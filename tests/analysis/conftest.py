@@ -1,0 +1,109 @@
+"""A small room of Gaussians, and a capture of it that is rendered from those very Gaussians."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from flysplat.analysis import ablation, measure_scene
+from flysplat.diagrams.worlds.scene_folder import write_scene_folder
+from flysplat.diagrams.worlds.world import World
+from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+from flysplat.systems.splats.baked_scene import BakedScene
+from flysplat.systems.splats.gaussian_scene import GaussianScene
+from flysplat.training.captures.capture import Capture, SfmPoints
+
+WIDTH, HEIGHT = 64, 48
+K = np.array([[32.0, 0, 32], [0, 32.0, 24], [0, 0, 1]])
+SIZE = np.array([6.0, 3.0, 2.5])  # [m], the room, its lower corner in the origin
+R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # looking along x, level
+
+
+def room() -> GaussianScene:
+    """The inside of the room, in broad coloured waves."""
+    means = []
+    for axis in range(3):
+        other = [a for a in range(3) if a != axis]
+        for at in (0.0, SIZE[axis]):
+            points = np.zeros((*np.ceil(SIZE[other] / 0.1).astype(int), 3))
+            grids = np.meshgrid(*(np.arange(0.05, SIZE[a], 0.1) for a in other), indexing="ij")
+            points[..., axis] = at
+            for a, grid in zip(other, grids, strict=True):
+                points[..., a] = grid
+            means.append(points.reshape(-1, 3))
+    means = np.concatenate(means)
+    x, y, z = means.T
+    waves = np.column_stack([np.sin(3 * x) * np.cos(4 * z), np.cos(5 * y), np.sin(3 * z + 2 * x)])
+    count = len(means)
+    return GaussianScene.from_colors(
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), 0.06),
+        np.full(count, 0.95),
+        0.5 + 0.3 * waves,
+    )
+
+
+@dataclass(frozen=True)
+class Place:
+    """The room, its capture and a folder for scenes of it."""
+
+    gaussians: GaussianScene
+    capture: Capture
+    folder: Path
+
+    def scene(self, name: str, gaussians: GaussianScene | None = None, **said) -> Path:
+        """Writes a scene folder with these Gaussians, the room's own if None."""
+        free = esdf_from_occupancy(
+            np.zeros((60, 30, 25), bool), np.zeros((60, 30, 25), bool), np.zeros(3), 0.1
+        )
+        world = World(
+            name=name,
+            gaussians=self.gaussians if gaussians is None else gaussians,
+            distance_field=free,
+            esdf=free,
+            background=(0.0, 0.0, 0.0),
+            p_WS=np.ones(3),
+            p_WG=np.ones(3),
+        )
+        said = {"capture": "room", "held_out": [0, 8]} | said
+        write_scene_folder(self.folder / name, world, provenance="a test", **said)
+        return self.folder / name
+
+
+@pytest.fixture(scope="session")
+def seen_room() -> tuple[GaussianScene, Capture]:
+    gaussians = room()
+    baked = BakedScene(gaussians)
+    X_WCs = [RigidTransform(R_WC, [0.5 + 0.15 * i, 1.5, 1.2]) for i in range(16)]
+    views = [baked.render(K, WIDTH, HEIGHT, X_WC) for X_WC in X_WCs]
+    images = [np.round(255 * np.clip(view.color, 0, 1)).astype(np.uint8) for view in views]
+    capture = Capture(
+        name="room",
+        source="a room of Gaussians",
+        K=K,
+        width=WIDTH,
+        height=HEIGHT,
+        X_WCs=X_WCs,
+        load_image=lambda i: images[i],
+        load_depth=lambda i: views[i].depth,
+        points=SfmPoints(gaussians.means[::7].astype(float), gaussians.base_colors[::7]),
+    )
+    return gaussians, capture
+
+
+@pytest.fixture
+def place(seen_room, tmp_path, monkeypatch) -> Place:
+    """The room; a capture at the path "room" is its capture."""
+    gaussians, capture = seen_room
+
+    def read_capture(path):
+        assert str(path) == "room"
+        return capture
+
+    for module in (measure_scene, ablation):
+        monkeypatch.setattr(module, "read_capture", read_capture)
+    monkeypatch.delenv("FLYSPLAT_DATA", raising=False)
+    return Place(gaussians, capture, tmp_path)

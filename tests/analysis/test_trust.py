@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+
+from flysplat.analysis.trust import first_crossing, monotone_fit, reach
+
+
+def test_fit_pools_violators():
+    """The fit keeps what rises and averages what falls; equal x are averaged first."""
+    x, fit = monotone_fit([3, 0, 1, 2, 2], [4, 0, 3, 1, 3])
+    np.testing.assert_allclose(x, [0, 1, 2, 3])
+    # At 2 the mean is 2 (twice the weight), below the 3 at 1: pooled to 7/3.
+    np.testing.assert_allclose(fit, [0, 7 / 3, 7 / 3, 4])
+
+
+def test_reach_is_where_the_fit_crosses():
+    """Errors that grow linearly reach a limit where the line does."""
+    x = np.linspace(0, 2, 21)
+    assert reach(x, 0.3 * x, 0.15) == pytest.approx(0.5)
+    rng = np.random.default_rng(0)
+    many = rng.uniform(0, 2, 4000)
+    assert reach(many, 0.3 * many + rng.normal(0, 0.05, 4000), 0.15) == pytest.approx(0.5, abs=0.08)
+
+
+def test_reach_ends_where_nothing_was_measured():
+    """Errors that never exceed the limit are trusted as far as was measured, those that always do
+    nowhere."""
+    assert reach([0.0, 0.4, 0.8], [0, 0.1, 0.2], 1.0) == 0.8
+    assert reach([0.1, 0.4, 0.8], [2, 2, 2], 1.0) == 0
+
+
+def test_first_crossing():
+    """The first crossing counts, even if values fall again, and values beyond it are not asked
+    for."""
+
+    def values():
+        yield from (0.0, 1.0, 0.0)
+        raise RuntimeError("asked too far")
+
+    assert first_crossing([0, 1, 2, 3], values(), 0.25) == 0.25
+    assert first_crossing([0, 1, 2], [0.5, 0.0, 0.0], 0.25) == 0
+    assert first_crossing([0, 1, 2], [0.0, 0.1, 0.2], 0.25) == 2
