@@ -142,7 +142,7 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
             f"hold_out is {config.hold_out} and iterations {config.iterations}: an ablation "
             "optimises, and measures on held-out frames; neither may be 0"
         )
-    opened = [(path, read_capture(path)) for path in captures]
+    opened = [(path, read_capture(path, config.capture)) for path in captures]
     names = [capture.name for _, capture in opened]
     for path, capture in opened:
         if not capture.has_depth:

@@ -30,16 +30,12 @@ from flysplat.diagrams.worlds.scene_folder import (
 from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.files import require_writable_folder, written_atomically
 from flysplat.training.captures.capture import CaptureFrame
+from flysplat.training.captures.render_capture import true_camera
 from flysplat.training.reconstruct import reconstruct
 from flysplat.training.reconstruct_config import ReconstructConfig
 
 TrueCamera = Callable[[RigidTransform], CaptureFrame]
 """Returns what the camera of a capture would have seen from another pose."""
-
-
-def no_world(capture: Path) -> TrueCamera | None:
-    """Returns the camera of a capture, given its folder, that can be put anywhere: none."""
-
 
 RECIPE = "reconstruct.yaml"
 _GRID = 0.1  # [m], steps in which the surroundings of a pose are tried
@@ -85,11 +81,11 @@ def run(
     scenes: Sequence[Path],
     out: Path,
     config: FidelityConfig,
-    true_camera: Callable[[Path], TrueCamera | None] = no_world,
+    find_camera: Callable[[Path], TrueCamera | None] = true_camera,
 ) -> list[FidelityStudy]:
     """Studies each scene folder, stores the bounds in its `scene.yaml` and writes figures.
 
-    `true_camera` returns, for the folder of a capture that was rendered, the camera that can render
+    `find_camera` returns, for the folder of a capture that was rendered, the camera that can render
     the truth from anywhere, and None for others.
 
     `out` gets `fidelity.png`, `fidelity.csv` and, for each scene, a sheet of views. What is
@@ -106,7 +102,7 @@ def run(
         raise ValueError(f"two scenes have one name ({', '.join(names)}); rename one folder")
     studies = []
     for scene, name in zip(scenes, names, strict=True):
-        study = study_scene(scene, out / name, config, true_camera)
+        study = study_scene(scene, out / name, config, find_camera)
         bounds = store_bounds(scene, study)
         low, middle, high = np.percentile(bounds.pose_perturbation_bounds, [10, 50, 90])
         print(study)
@@ -124,7 +120,7 @@ def study_scene(
     scene: Path,
     out: Path,
     config: FidelityConfig,
-    true_camera: Callable[[Path], TrueCamera | None] = no_world,
+    find_camera: Callable[[Path], TrueCamera | None] = true_camera,
 ) -> FidelityStudy:
     """Measures a scene beside the path of its capture; see `run`."""
     views = SceneViews(scene)
@@ -134,7 +130,7 @@ def study_scene(
             f"{scene}: its capture {capture.source} has no metric depth, without which no depth "
             "error can be measured"
         )
-    camera = true_camera(Path(views.metadata.capture))
+    camera = find_camera(Path(views.metadata.capture))
     if camera is not None:
         frames = _rendered_frames(views, scene, camera, config)
     else:

@@ -200,9 +200,9 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
     return measures
 
 
-def run(scene: Path) -> None:
+def run(scene: Path, capture: Capture | None = None) -> None:
     """Measures a scene folder, see `measure_scene`, and prints the table."""
-    print(measure_scene(scene))
+    print(measure_scene(scene, capture))
 
 
 def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None:

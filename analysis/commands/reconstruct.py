@@ -22,6 +22,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
     from flysplat.analysis import measure_scene
     from flysplat.diagrams.configuration import load_config
     from flysplat.training import reconstruct
+    from flysplat.training.captures.read_capture import read_capture
     from flysplat.training.reconstruct_config import ReconstructConfig
 
     config = load_config(ReconstructConfig(), overrides=options.overrides)
@@ -30,4 +31,4 @@ def _reconstruct(options: argparse.Namespace) -> None:
     reconstruct.run(
         capture=options.capture, out=options.out, config=config, restart=options.restart
     )
-    measure_scene.run(options.out)
+    measure_scene.run(options.out, read_capture(options.capture, config.capture))

@@ -99,7 +99,7 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
     """The room; a capture at the path "room" is its capture."""
     gaussians, capture = seen_room
 
-    def read_capture(path):
+    def read_capture(path, config=None):
         assert str(path) == "room"
         return capture
 
