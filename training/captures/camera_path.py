@@ -94,7 +94,10 @@ def poses_along(
         raise ValueError(f"the path has shape {path.shape}; finite points x, y, z are needed")
     p_WP = _resampled(path, _STEP)
     if len(p_WP) > 1:
-        p_WP = gaussian_filter1d(p_WP, _ROUNDING / _STEP, axis=0, mode="nearest")
+        # Continued beyond its ends point-symmetrically, so that they stay where they are.
+        more = min(len(p_WP) - 1, int(4 * _ROUNDING / _STEP))
+        p_WP = np.pad(p_WP, ((more, more), (0, 0)), mode="reflect", reflect_type="odd")
+        p_WP = gaussian_filter1d(p_WP, _ROUNDING / _STEP, axis=0)[more : len(p_WP) - more]
     p_WP = _resampled(p_WP, spacing)
     way = np.gradient(p_WP, axis=0) if len(p_WP) > 1 else np.array([[1.0, 0, 0]])
     # Where the way is up or down, the heading stays what it was.

@@ -14,9 +14,9 @@ from tqdm import tqdm
 from flysplat.diagrams.configuration import dump_config, load_config
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.gltf import write_gltf
-from flysplat.diagrams.worlds.make_world import make_blueprint
+from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
 from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+from flysplat.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from flysplat.systems.files import require_writable_folder, written_atomically
 from flysplat.training.captures.camera_path import beside, poses_along, visiting_path
 from flysplat.training.captures.capture import CaptureFrame
@@ -105,13 +105,18 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     config.validate()
     out, world = Path(out).absolute(), Path(world).absolute()
     partial = out.with_name(f".{out.name}.partial")
+    blueprint = None
     if world.suffix in (".yaml", ".yml"):
         scenario = load_config(Scenario(), world)
-        blueprint = make_blueprint(scenario.world, seed)  # pyright: ignore[reportArgumentType]
+        if not isinstance(scenario.world, ProceduralConfig):
+            raise ValueError(
+                f"{world}: its world is a {type(scenario.world).__name__}; a generated one is "
+                "needed"
+            )
+        blueprint = make_blueprint(scenario.world, seed)
         recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config)
     else:
         check_mesh(world, config.up)
-        blueprint = None
         recipe = RenderedWorld(str(world), world.name, config)
     text = dump_config(recipe)
     if _is_same(out, text):
@@ -121,20 +126,22 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
         raise ValueError(
             f"{out}: holds something other than this capture; choose another folder, or remove it"
         )
-    if partial.exists() and not _is_same(partial, text):
+    if (partial / RECIPE).is_file() and not _is_same(partial, text):
         raise ValueError(
             f"{partial}: holds a part of another capture; remove it, or repeat what was begun"
         )
+    if blueprint is None:
+        esdf = mesh_distance(world, config.up, config.voxel_size)
+    else:
+        esdf = esdf_from_distance_field(blueprint.distance_field, config.voxel_size)
+    X_WCs = _poses(esdf, config)
     require_writable_folder(partial)
+    with written_atomically(partial / RECIPE) as file:
+        file.write_text(text)
     mesh = partial / recipe.mesh
     if blueprint is not None and not mesh.is_file():
         write_gltf(blueprint, mesh)
     renderer = _renderer(mesh, config)
-    bounds = None if blueprint is None else (blueprint.lower_W, blueprint.upper_W)
-    esdf = mesh_distance(mesh, config.up, config.voxel_size)
-    X_WCs = _poses(esdf, bounds, config)
-    with written_atomically(partial / RECIPE) as file:
-        file.write_text(text)
     K = intrinsics(config.width, config.height)
 
     def view(X_WC: RigidTransform) -> CaptureFrame:
@@ -208,9 +215,7 @@ def _renderer(mesh: Path, config: RenderConfig) -> MeshRenderer:
     return MeshRenderer(mesh, config.up, (red, green, blue))
 
 
-def _poses(
-    esdf: Esdf, bounds: tuple[NDArray, NDArray] | None, config: RenderConfig
-) -> list[RigidTransform]:
+def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
     """Returns the camera poses of the path, given or found.
 
     Raises:
@@ -225,11 +230,10 @@ def _poses(
                     f"the path touches something at {np.round(p_WC, 2).tolist()} m; lead it around"
                 )
         return X_WCs
-    lower_W, upper_W = (esdf.lower_W, esdf.upper_W) if bounds is None else bounds
     path = visiting_path(
         esdf,
-        np.append(lower_W[:2], config.lowest),
-        np.append(upper_W[:2], config.highest),
+        np.append(esdf.lower_W[:2], config.lowest),
+        np.append(esdf.upper_W[:2], config.highest),
         config.clearance,
         config.apart,
     )

@@ -1,0 +1,161 @@
+"""Captures rendered of meshes."""
+
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from flysplat.analysis.cli import main
+from flysplat.training.captures.read_capture import read_capture
+from flysplat.training.captures.render_capture import (
+    RenderConfig,
+    mesh_distance,
+    run,
+    true_camera,
+)
+
+SIZE = np.array([6.0, 4.0, 3.0])  # [m] of a room about the origin, seen from inside
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A room in a file whose z is up, as OBJ has it."""
+    path = tmp_path_factory.mktemp("room") / "room.obj"
+    mesh = trimesh.creation.box(SIZE)
+    mesh.invert()
+    mesh.export(path, include_normals=True)
+    return path
+
+
+def small(**fields) -> RenderConfig:
+    return RenderConfig(
+        width=64,
+        height=48,
+        up="z",
+        path=[[-1.5, 0.0, 0.2], [1.5, 0.5, 0.2]],
+        spacing=1.0,
+        **fields,
+    )
+
+
+def depth_of_room(frame) -> np.ndarray:
+    """Depth (H, W) [m] of the room by intersecting rays with its walls."""
+    height, width = frame.depth.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    rays = frame.back_project(u, v, np.ones_like(u)) @ frame.X_WC.rotation().matrix().T
+    p_WC = frame.X_WC.translation()
+    with np.errstate(divide="ignore"):
+        walls = np.where(rays > 0, (SIZE / 2 - p_WC) / rays, (-SIZE / 2 - p_WC) / rays)
+    return walls.min(axis=-1)
+
+
+def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
+    """Read back by the loader of its format, every frame's depth is that of rays cast from its
+    pose, and the same view can be rendered again."""
+    run(world=room, out=tmp_path / "capture", config=small())
+    capture = read_capture(tmp_path / "capture")
+    assert len(capture) == 12
+    assert not capture.dropped
+    for frame in capture.frames():
+        np.testing.assert_allclose(frame.depth, depth_of_room(frame), rtol=1e-4)
+    camera = true_camera(tmp_path / "capture")
+    again = camera(capture.X_WCs[3])
+    np.testing.assert_array_equal(again.image, capture.load_image(3))
+    np.testing.assert_allclose(again.depth, capture.load_depth(3), atol=1e-5)
+    np.testing.assert_array_equal(again.K, capture.K)
+
+
+def test_offset_captures_stand_beside(opengl, room, tmp_path):
+    """The second capture has the poses beside those of the first, but for those without room."""
+    config = small(yaws=[0.0], offsets=[0.5], clearance=0.3)
+    run(world=room, out=tmp_path / "capture", config=config)
+    middle, beside = (read_capture(tmp_path / p) for p in ("capture", "capture/offset_+0.50"))
+    assert len(beside) == len(middle)
+    for X_WC, X_WD in zip(middle.X_WCs, beside.X_WCs, strict=True):
+        moved = (X_WC.inverse() @ X_WD).translation()
+        np.testing.assert_allclose(moved, [-0.5, 0, 0], atol=1e-9)
+    for frame in beside.frames():
+        np.testing.assert_allclose(frame.depth, depth_of_room(frame), rtol=1e-4)
+
+
+def test_interrupted_rendering_goes_on(opengl, room, tmp_path):
+    """What an interrupted run left is kept, and the whole equals that of an uninterrupted one."""
+    run(world=room, out=tmp_path / "whole", config=small())
+    partial = tmp_path / ".part.partial"
+    shutil.copytree(tmp_path / "whole", partial)
+    (partial / "pose_left.txt").unlink()
+    lost = partial / "image_left" / "000007_left.png"
+    lost.unlink()
+    kept = partial / "image_left" / "000003_left.png"
+    kept.touch()
+    before = kept.stat().st_mtime_ns
+    run(world=room, out=tmp_path / "part", config=small())
+    assert not partial.exists()
+    assert (tmp_path / "part/image_left/000003_left.png").stat().st_mtime_ns == before
+    for file in sorted((tmp_path / "whole").rglob("*.*")):
+        twin = tmp_path / "part" / file.relative_to(tmp_path / "whole")
+        assert twin.read_bytes() == file.read_bytes()
+
+
+def test_generated_world_is_rendered_where_it_is(opengl, tmp_path):
+    """A scenario's generated world is exported with the capture, and all depth seen inside its
+    volume lies on the world's surfaces."""
+    from flysplat.diagrams.worlds.make_world import make_blueprint
+    from flysplat.diagrams.worlds.walls import WallsConfig
+
+    scenario = tmp_path / "slalom.yaml"
+    scenario.write_text("world: !WallsConfig {length: 12, walls: 1, height: 3}\n")
+    config = RenderConfig(width=64, height=48, path=[[2.0, 0, 1.5]], yaws=[0.0, 120.0])
+    run(world=scenario, out=tmp_path / "capture", config=config, seed=4)
+    capture = read_capture(tmp_path / "capture")
+    blueprint = make_blueprint(WallsConfig(length=12, walls=1, height=3), 4)
+    for frame in capture.frames():
+        v, u = np.mgrid[:48, :64] + 0.5
+        p_CQ = frame.back_project(u, v, frame.depth)[np.isfinite(frame.depth)]
+        distance = blueprint.distance_field.distance(frame.X_WC.multiply(p_CQ.T).T)
+        inside = np.isfinite(distance)
+        assert inside.sum() > 500
+        assert np.abs(distance[inside]).max() < 0.01
+
+
+def test_distance_to_a_mesh(room):
+    """The grid's distances are those to the walls, to within a voxel and a half."""
+    esdf = mesh_distance(room, "z", 0.1)
+    p_WQ = np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3)) * SIZE
+    truth = (SIZE / 2 - np.abs(p_WQ)).min(axis=1)
+    assert np.abs(esdf.distance(p_WQ) - truth).max() < 0.15
+
+
+def test_bad_input_is_named(room, tmp_path, capsys):
+    """Each mistake ends with status 1, one message that says what is wrong, and no capture."""
+    (tmp_path / "world.glb").write_bytes(b"x")
+    (tmp_path / "damaged.gltf").write_text("{")
+    out = tmp_path / "capture"
+    for world, options, message in (
+        (tmp_path / "no.gltf", [], "no such file"),
+        (tmp_path / "world.glb", [], "not .glb"),
+        (tmp_path / "damaged.gltf", [], "damaged.gltf"),
+        (room, ["--path", "1,2"], "finite points"),
+        (room, ["--path", "a b"], "separated by spaces"),
+        (room, ["--up", "z", "--path", "0,0,0 5,0,0"], "touches something"),
+        (room, ["--set", "spacing=0"], "spacing is 0"),
+        (room, ["--set", "yaws=[]"], "yaws"),
+        (room, ["--set", "lowest=3"], "nothing lies between"),
+    ):
+        assert main(["capture", "render", str(world), "--out", str(out), *options]) == 1, world
+        assert message in capsys.readouterr().err
+        assert not [path for path in tmp_path.iterdir() if "capture" in path.name]
+
+
+def test_other_contents_are_not_overwritten(opengl, room, tmp_path):
+    """A folder that holds something else, or a capture rendered otherwise, stays as it is."""
+    run(world=room, out=tmp_path / "capture", config=small(yaws=[0.0]))
+    with pytest.raises(ValueError, match="holds something other"):
+        run(world=room, out=tmp_path / "capture", config=small())
+    assert len(read_capture(tmp_path / "capture")) == 4
+
+
+def test_captures_of_other_kinds_have_no_true_camera(tmp_path):
+    """Without a record of a world there is no truth to render."""
+    assert true_camera(tmp_path) is None
