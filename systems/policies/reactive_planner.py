@@ -93,12 +93,11 @@ def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
     """The nearest point of each block of pixels: p_CQ (rows * columns, 3) [m], NaN where none is.
 
     Args:
-        depth: (H, W) [m] planar; infinity is nothing in range, 0 is nearer than the camera's range
-            and is taken to be where that begins.
+        depth: (H, W) [m] planar; infinity is nothing in range, 0 no measurement.
     """
     camera = config.camera
     shape = (config.rows, camera.height // config.rows, config.columns, -1)
-    depth = np.maximum(depth, camera.min_depth)
+    depth = np.where(depth > 0.0, depth, np.inf)
     blocks = depth.reshape(shape).swapaxes(1, 2).reshape(config.rows * config.columns, -1)
     nearest = blocks.argmin(axis=1)[:, None]
     z = np.take_along_axis(blocks, nearest, axis=1)  # (rows * columns, 1)
