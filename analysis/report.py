@@ -27,13 +27,14 @@ from flysplat.diagrams.worlds.make_world import make_world
 from flysplat.systems.files import written_atomically
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1080px; margin: 2em auto;
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1240px; margin: 2em auto;
        padding: 0 1em; }
 h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .6em 0; }
-th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid #e3e5e8; }
+th, td { padding: .25em .6em; white-space: nowrap; text-align: right;
+         border-bottom: 1px solid #e3e5e8; }
 th:first-child, td:first-child { text-align: left; }
-th { background: #f4f5f7; font-weight: 600; }
+th { background: #f4f5f7; font-weight: 600; white-space: normal; }
 img { max-width: 100%; } code { background: #f4f5f7; padding: .1em .3em; font-size: 13px; }
 details { margin: .3em 0; } summary { cursor: pointer; }
 .note { color: #555; } .warn { background: #fff4d6; padding: .5em .8em; border-radius: 4px; }

@@ -57,7 +57,7 @@ def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
     flown = scenario_of(spec, scenario)
     timing: dict[str, Any] = {"id": spec.id}
     try:
-        world = _cached_world(flown)
+        world = study_world(flown)
         timing["world_s"] = time.perf_counter() - started
         diagram = BuildFlightDiagram(flown, world, camera=False)
         flight = fly(diagram, flown, world)
@@ -120,7 +120,8 @@ def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict
     }
 
 
-def _cached_world(scenario: Scenario) -> World:
+def study_world(scenario: Scenario) -> World:
+    """The world of a flight; the last two of a process are kept."""
     # A scene on disk is the same for all seeds.
     seed = 0 if isinstance(scenario.world, SceneConfig) else scenario.seed
     return _world(_Described(dump_config(scenario.world), scenario.world), seed)

@@ -7,6 +7,9 @@ from typing import Any
 from flysplat.analysis.rollout import Rollout, chunks, fly_rollouts
 from flysplat.analysis.study import RolloutSpec
 
+CONNECT_TIMEOUT = 10.0
+"""[s], for a scheduler to answer."""
+
 _CHUNK = 6
 """Most flights through one place handed out together: what of a kill is flown again."""
 
@@ -70,7 +73,7 @@ def _on_cluster(work: list[list[RolloutSpec]], texts: list[str], address: str) -
     except ImportError:
         raise OSError("--cluster needs dask.distributed; pip install 'flysplat[cluster]'") from None
     try:
-        client = Client(address, timeout=10)
+        client = Client(address, timeout=CONNECT_TIMEOUT)
     except (OSError, TimeoutError, ValueError) as error:
         raise OSError(
             f"no dask scheduler answers at {address} ({error}); start one with `dask scheduler` "

@@ -5,6 +5,14 @@ function that runs it. That function imports what it needs when it runs: torch a
 seconds to load.
 """
 
-from flysplat.analysis.commands import benchmark, capture, difficulty, fly, reconstruct, tour
+from flysplat.analysis.commands import (
+    benchmark,
+    capture,
+    difficulty,
+    fly,
+    reconstruct,
+    replay,
+    tour,
+)
 
-COMMANDS = (benchmark, capture, difficulty, fly, reconstruct, tour)
+COMMANDS = (fly, benchmark, replay, difficulty, reconstruct, capture, tour)
