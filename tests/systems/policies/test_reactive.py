@@ -46,7 +46,7 @@ def test_responses_solve_the_tracking_equation():
     for k in range(1, 15001):
         v = v + step * (wanted - v) / RESPONSE_TIME
         p = p + step * v
-        if k % 1500 == 0:
+        if k % 2500 == 0:
             expected.append(p)
     np.testing.assert_allclose(positions, expected, atol=1e-3)
 
