@@ -14,7 +14,7 @@ from flysplat.analysis.tables import format_table, policy_table
 from flysplat.analysis.workers import default_jobs, fly_all
 from flysplat.diagrams.configuration import dump_config
 from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import SceneConfig
+from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
 
 
 def run(
@@ -82,8 +82,11 @@ def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
     """Of the scenarios whose scene is not on this machine: why, and what to do."""
     absent = {}
     for name, scenario in scenarios.items():
-        if isinstance(scenario.world, SceneConfig) and not Path(scenario.world.path).exists():
-            absent[name] = f"there is no scene {scenario.world.path}; make it or put it there"
+        if isinstance(scenario.world, SceneConfig):
+            try:
+                find_scene(scenario.world)
+            except FileNotFoundError as error:
+                absent[name] = str(error)
     return absent
 
 

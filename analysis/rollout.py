@@ -19,7 +19,7 @@ from flysplat.diagrams.configuration import dump_config, parse_config
 from flysplat.diagrams.flight import Flight, decision_times, fly
 from flysplat.diagrams.flight_diagram import BuildFlightDiagram, goal_of
 from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import SceneConfig, make_world
+from flysplat.diagrams.worlds.make_world import make_world
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.policies.time_of_arrival import TimeOfArrival, way_lengths
 
@@ -122,9 +122,7 @@ def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict
 
 def study_world(scenario: Scenario) -> World:
     """The world of a flight; the last two of a process are kept."""
-    # A scene on disk is the same for all seeds.
-    seed = 0 if isinstance(scenario.world, SceneConfig) else scenario.seed
-    return _world(_Described(dump_config(scenario.world), scenario.world), seed)
+    return _world(_Described(dump_config(scenario.world), scenario.world), scenario.seed)
 
 
 class _Described(NamedTuple):

@@ -25,7 +25,7 @@ from flysplat.analysis.rollout import ARRAYS, Rollout
 from flysplat.analysis.study import RolloutSpec, StudyConfig
 from flysplat.diagrams.configuration import dump_config, load_config
 from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import SceneConfig
+from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
 from flysplat.systems.files import require_writable_folder, written_atomically
 
 FORMAT_VERSION = 1
@@ -102,7 +102,7 @@ class StudyFolder:
 
     def _keep_scene(self, world: SceneConfig) -> None:
         """Copies a scene into the study, and lets `world` name the copy."""
-        scene = Path(world.path)
+        scene = find_scene(world)
         kept = self.path / "scenes" / scene.name
         if not kept.exists():
             partial = kept.with_name(f".{kept.name}.partial")

@@ -152,7 +152,8 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
     config = StudyConfig([str(short_scenario), str(absent)], ["straight"], [2.0], seeds=2)
     table = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
     assert (table[0]["flights"], table[0]["not_run"]) == (2, 2)
-    assert f"R99 is not flown: there is no scene {tmp_path / 'nowhere'}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"R99 is not flown: {tmp_path / 'nowhere'}: there is no such scene" in printed
     assert "R99 was not run" in (tmp_path / "out" / "report.html").read_text()
 
 
