@@ -13,10 +13,6 @@ CONNECT_TIMEOUT = 10.0
 _CHUNK = 6
 """Most flights through one place handed out together: what of a kill is flown again."""
 
-_LIFETIME = 240
-"""Flights, about, after which a worker process is replaced: Drake never frees Python systems with
-abstract outputs, which every camera is, and each leaves its baked scene behind."""
-
 
 def fly_all(
     specs: list[RolloutSpec], scenarios: dict[str, str], jobs: int, cluster: str | None = None
@@ -39,10 +35,7 @@ def fly_all(
     if cluster is not None:
         yield from _on_cluster(work, texts, cluster)
         return
-    per_life = max(1, _LIFETIME * jobs // _CHUNK)
-    for start in range(0, len(work), per_life):
-        part = slice(start, start + per_life)
-        yield from _in_processes(work[part], texts[part], jobs)
+    yield from _in_processes(work, texts, jobs)
 
 
 def _in_processes(work: list[list[RolloutSpec]], texts: list[str], jobs: int) -> Iterator[Rollout]:

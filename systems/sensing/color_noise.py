@@ -13,6 +13,7 @@ from flysplat.systems.sensing.observation_noise import (
     image_generator,
     noisy_color,
 )
+from flysplat.systems.weakly import weakly
 
 
 class ColorNoise(LeafSystem):
@@ -50,7 +51,7 @@ class ColorNoise(LeafSystem):
         size = camera.width, camera.height
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(*size)))
         self.DeclareAbstractOutputPort(
-            "color_image", alloc=lambda: Value(ImageRgba8U(*size)), calc=self._calc
+            "color_image", alloc=lambda: Value(ImageRgba8U(*size)), calc=weakly(self._calc)
         )
 
     def _calc(self, context, output) -> None:

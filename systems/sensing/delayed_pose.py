@@ -8,6 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from flysplat.systems.weakly import weakly
 
 
 class DelayedPose(LeafSystem):
@@ -49,7 +50,9 @@ class DelayedPose(LeafSystem):
         samples = math.ceil(latency / period) + 1
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self.DeclareDiscreteState(np.full(samples * 14, np.nan))
-        self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), self._calc_pose)
+        self.DeclareAbstractOutputPort(
+            "pose", lambda: Value(RigidTransform()), weakly(self._calc_pose)
+        )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
     def _samples(self, context: Context) -> np.ndarray:

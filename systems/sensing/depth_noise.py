@@ -13,6 +13,7 @@ from flysplat.systems.sensing.observation_noise import (
     image_generator,
     noisy_depth,
 )
+from flysplat.systems.weakly import weakly
 
 
 class DepthNoise(LeafSystem):
@@ -52,7 +53,7 @@ class DepthNoise(LeafSystem):
         self.DeclareAbstractOutputPort(
             "depth_image_32f",
             alloc=lambda: Value(ImageDepth32F(*size)),
-            calc=self._calc,
+            calc=weakly(self._calc),
         )
 
     def _calc(self, context, output) -> None:
