@@ -50,9 +50,8 @@ class DelayedPose(LeafSystem):
         samples = math.ceil(latency / period) + 1
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self.DeclareDiscreteState(np.full(samples * 14, np.nan))
-        self.DeclareAbstractOutputPort(
-            "pose", lambda: Value(RigidTransform()), weakly(self._calc_pose)
-        )
+        calc = weakly(self._calc_pose)
+        self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), calc)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
     def _samples(self, context: Context) -> np.ndarray:
