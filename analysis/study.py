@@ -72,6 +72,14 @@ class StudyConfig:
             twice = [value for value in values if values.count(value) > 1]
             if twice:
                 raise ValueError(f"the {what} {twice[0]} is given twice; give it once")
+        for override in self.overrides:
+            field = override.partition("=")[0].partition(".")[0]
+            if field in ("policy", "seed"):
+                raise ValueError(
+                    f"the override {override!r} has no place in a study: each of its flights has "
+                    "its own policy, speed and seed; name them with --policies, --speeds and "
+                    "--seeds"
+                )
         for speed in self.speeds:
             if not 0.0 < speed < math.inf:
                 raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
@@ -109,7 +117,7 @@ def scenario_file(scenario: str) -> Path:
     known = benchmark_scenarios()
     if scenario in known:
         return known[scenario]
-    if Path(scenario).suffix in (".yaml", ".yml"):
+    if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
         return Path(scenario)
     raise ValueError(
         f"there is no scenario {scenario!r}; the benchmark's are {', '.join(known)}, others are "

@@ -47,6 +47,7 @@ def test_scenario_of_a_flight_has_its_policy_speed_and_seed():
         ({"speeds": [50.0], "policies": ["straight"]}, "speed is 50"),
         ({"seeds": 0}, "seeds is 0; it must be 1 to"),
         ({"overrides": ["world.spacing=0.1"]}, "scenario short: .*spacing"),
+        ({"overrides": ["policy.rate=3"]}, "'policy.rate=3' has no place in a study"),
         ({"overrides": ["wrld.spacing=1"]}, "did you mean world"),
     ],
 )
