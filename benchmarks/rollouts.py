@@ -62,7 +62,7 @@ def time_workers(flights: int) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--flights", type=int, default=8, help="for the workers (%(default)s)")
     options = parser.parse_args()
     time_policies()
