@@ -50,6 +50,15 @@ def load_config[Config](
     return config
 
 
+def parse_config[Config](defaults: Config, text: str, source: str) -> Config:
+    """The configuration that a YAML text describes; `source` names the text in errors.
+
+    Raises:
+        ValueError: see `load_config`.
+    """
+    return _updated(defaults, text, source)
+
+
 def dump_config(config: Any) -> str:
     """The configuration as YAML, every field written out."""
     return cast(str, yaml_dump_typed(config))

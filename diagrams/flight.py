@@ -136,6 +136,34 @@ def fly(
     return _record(diagram, root, world, ended, wall_time)
 
 
+def decision_times(
+    diagram: Diagram, scenario: Scenario, flight: Flight, count: int = 10
+) -> tuple[float, float]:
+    """
+    Mean wall time [s] of a render for the policy, 0 if it does not see, and of its decision
+    without it, at `count` states evenly spaced along a flight.
+    """
+    root = Simulator(diagram).get_mutable_context()
+    plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
+    policy = diagram.GetSubsystemByName("policy")
+    context = policy.GetMyContextFromRoot(root)
+    images = [n for n in ("depth_image_32f", "color_image") if policy.HasInputPort(n)]
+    rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
+    spent = np.zeros((count + 1, 2))  # [s]
+    # The first time through, what is kept for the whole flight is made: it does not count.
+    for k, row in enumerate([0, *rows]):
+        root.SetTime(flight.times[row])
+        plant.SetContinuousState(flight.states[row])
+        started = time.perf_counter()
+        for name in images:
+            policy.GetInputPort(name).Eval(context)
+        rendered = time.perf_counter()
+        policy.EvalUniquePeriodicDiscreteUpdate(context)
+        spent[k] = rendered - started, time.perf_counter() - rendered
+    render, decide = spent[1:].mean(axis=0)
+    return float(render), float(decide)
+
+
 def flight_outcome(
     diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
 ) -> Outcome | None:

@@ -9,12 +9,12 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.systems.sensors import CameraInfo
 
 from flysplat.diagrams.add_policy import AddPolicy
+from flysplat.diagrams.observation import AddObservation, camera_of
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.esdf_collision import EsdfCollision
 from flysplat.systems.policies.hypotheses import num_hypotheses_in
 from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
-from flysplat.systems.policies.onboard_camera import OnboardCamera
 from flysplat.systems.splats.baked_scene import BakedScene
 from flysplat.systems.splats.splat_camera import SplatCamera
 from flysplat.systems.vehicle.flatness_controller import FlatnessController
@@ -92,10 +92,11 @@ def BuildFlightDiagram(
     builder.Connect(state, controller.GetInputPort("state"))
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
 
-    policy_camera = getattr(scenario.policy, "camera", None)
-    gaussians = BakedScene(world.gaussians) if camera or policy_camera else None
-    if gaussians is not None and policy_camera is not None:
-        _AddPolicyCamera(builder, policy_camera, gaussians, world, pose, policy)
+    gaussians = BakedScene(world.gaussians) if camera or camera_of(scenario) else None
+    if gaussians is not None:
+        AddObservation(
+            builder, scenario, world, gaussians, state, pose.GetOutputPort("pose"), policy
+        )
 
     exported = {
         plant: ["state"],
@@ -158,32 +159,6 @@ def MakeCamera(
         far=config.clipping_far,
         background=world.background,
     )
-
-
-def _AddPolicyCamera(
-    builder: DiagramBuilder,
-    config: OnboardCamera,
-    gaussians: BakedScene,
-    world: World,
-    pose: System,
-    policy: System,
-) -> None:
-    """Adds the camera through which a policy sees; it renders when the policy looks."""
-    camera = builder.AddNamedSystem(
-        "policy_camera",
-        SplatCamera(
-            gaussians,
-            config.camera_info(),
-            config.X_BC(),
-            min_depth=config.min_depth,
-            max_depth=config.max_depth,
-            background=world.background,
-        ),
-    )
-    builder.Connect(pose.GetOutputPort("pose"), camera.GetInputPort("body_pose"))
-    for name in ("color_image", "depth_image_32f"):
-        if policy.HasInputPort(name):
-            builder.Connect(camera.GetOutputPort(name), policy.GetInputPort(name))
 
 
 def _ConnectDecision(

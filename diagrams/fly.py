@@ -53,40 +53,19 @@ def run(
     if graphviz is not None:
         require_writable_folder(graphviz.parent)
 
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    _look_along(meshcat, scenario, world)
+    meshcat = open_meshcat(scenario, world)
     if live:
         print(f"Meshcat shows the flight at {meshcat.web_url()}", flush=True)
-
-    diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
-    if graphviz is not None:
-        with written_atomically(graphviz) as path:
-            path.write_text(diagram.GetGraphvizString())
-
-    meshcat.StartRecording(frames_per_second=scenario.policy.rate)
-    layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
-    with tqdm(
-        total=scenario.timeout, desc="flying", bar_format=layout, leave=False, disable=None
-    ) as bar:
-        flight = fly(
-            diagram,
-            scenario,
-            world,
-            progress=lambda now: bar.update(now - bar.n),
-            realtime_rate=1.0 if live else 0.0,
-        )
-    meshcat.StopRecording()
-    meshcat.PublishRecording()
-
-    summary = flight.summary() | {
-        "render_ms": _render_ms(cast(SplatCamera, diagram.GetSubsystemByName("camera")), flight)
-    }
-    video = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
-    video.save(out / "flight.mp4", max_depth=scenario.camera.z_far)
-    with written_atomically(out / "flight.html") as path:
-        path.write_text(meshcat.StaticHtml())
+    camera, flight = film_flight(
+        scenario,
+        world,
+        meshcat,
+        page=out / "flight.html",
+        video=out / "flight.mp4",
+        graphviz=graphviz,
+        realtime_rate=1.0 if live else 0.0,
+    )
+    summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
     with written_atomically(out / "trajectory.npz") as path:
         flight.save(path)
     with written_atomically(out / "scenario.yaml") as path:
@@ -100,6 +79,64 @@ def run(
         with contextlib.suppress(EOFError):
             input("Press Enter to stop serving Meshcat. ")
     return summary
+
+
+def film_flight(
+    scenario: Scenario,
+    world: World,
+    meshcat: Meshcat | None = None,
+    *,
+    page: Path | None = None,
+    video: Path | None = None,
+    graphviz: Path | None = None,
+    realtime_rate: float = 0.0,
+) -> tuple[SplatCamera, Flight]:
+    """
+    Flies a scenario and films it; what is filmed changes nothing of the flight.
+
+    Args:
+        scenario, world: the flight.
+        meshcat: draws the flight there.
+        page: where to write what Meshcat shows, to replay in a browser.
+        video: where to write what the onboard camera saw, colour beside depth.
+        graphviz: where to write the diagram as Graphviz source.
+        realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
+
+    Returns:
+        The onboard camera and the flight.
+
+    Raises:
+        ValueError: for a scenario that cannot be flown.
+        OSError: if a file cannot be written.
+    """
+    diagram = BuildFlightDiagram(scenario, world, meshcat, video=video is not None)
+    if graphviz is not None:
+        with written_atomically(graphviz) as path:
+            path.write_text(diagram.GetGraphvizString())
+
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=scenario.policy.rate)
+    layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
+    with tqdm(
+        total=scenario.timeout, desc="flying", bar_format=layout, leave=False, disable=None
+    ) as bar:
+        flight = fly(
+            diagram,
+            scenario,
+            world,
+            progress=lambda now: bar.update(now - bar.n),
+            realtime_rate=realtime_rate,
+        )
+    if video is not None:
+        recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
+        recorder.save(video, max_depth=scenario.camera.z_far)
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        if page is not None:
+            with written_atomically(page) as path:
+                path.write_text(meshcat.StaticHtml())
+    return cast(SplatCamera, diagram.GetSubsystemByName("camera")), flight
 
 
 def format_summary(summary: dict[str, float | str]) -> str:
@@ -116,12 +153,16 @@ def format_summary(summary: dict[str, float | str]) -> str:
     return "\n".join(f"{title:<18} {form.format(summary[key])}" for title, key, form in rows)
 
 
-def _look_along(meshcat: Meshcat, scenario: Scenario, world: World) -> None:
-    """Puts Meshcat's camera behind and above the start, looking towards the goal."""
+def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
+    """A Meshcat whose camera is behind and above the start and looks towards the goal."""
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
     p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
     along = goal_of(scenario, world) - p_WS
     along /= max(np.linalg.norm(along), 1e-6)
     meshcat.SetCameraPose(p_WS - 4.0 * along + [0.0, 0.0, 2.0], p_WS + 4.0 * along)
+    return meshcat
 
 
 def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:

@@ -12,6 +12,7 @@ from flysplat.diagrams.add_policy import PolicyConfig
 from flysplat.diagrams.worlds.forest import ForestConfig
 from flysplat.diagrams.worlds.make_world import WorldConfig
 from flysplat.systems.policies.privileged_planner import PrivilegedPlannerConfig
+from flysplat.systems.sensing.observation_noise import ObservationNoise
 from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
@@ -73,6 +74,8 @@ class Scenario:
     camera: CameraConfig = field(default_factory=_default_camera)
     # Who flies: the privileged planner, or (!ReactiveConfig, ...) another of `add_policy.py`.
     policy: PolicyConfig = field(default_factory=PrivilegedPlannerConfig)
+    # What lies between the policy's camera and the policy; nothing by default.
+    observation: ObservationNoise = field(default_factory=ObservationNoise)
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
     simulator: SimulatorConfig = field(default_factory=_default_simulator)
 
@@ -93,6 +96,7 @@ class Scenario:
             _check(name, point, valid, "three finite numbers x, y, z in metres")
         self.world.validate()
         self.policy.validate()
+        self.observation.validate()
         _check_camera(self.camera)
         _check_simulator(self.simulator)
 

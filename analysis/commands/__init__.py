@@ -7,13 +7,26 @@ seconds to load.
 
 from flysplat.analysis.commands import (
     ablate,
+    benchmark,
     capture,
     difficulty,
     fidelity,
     fly,
     measure,
     reconstruct,
+    replay,
     tour,
 )
 
-COMMANDS = (fly, reconstruct, measure, ablate, fidelity, capture, difficulty, tour)
+COMMANDS = (
+    fly,
+    benchmark,
+    replay,
+    difficulty,
+    reconstruct,
+    measure,
+    ablate,
+    fidelity,
+    capture,
+    tour,
+)

@@ -10,7 +10,12 @@ from flysplat.analysis.commands.overrides import add_overrides
 def add_to(verbs: argparse._SubParsersAction) -> None:
     fly = verbs.add_parser("fly", help="fly to a goal and leave a page, a video and a trajectory")
     fly.set_defaults(verb=_fly)
-    fly.add_argument("--scenario", type=Path, metavar="FILE.yaml", help="the scenario to fly")
+    fly.add_argument(
+        "--scenario",
+        metavar="P02|FILE.yaml",
+        help="the scenario to fly: the benchmark's, or a file",
+    )
+    fly.add_argument("--policy", metavar="NAME", help="who flies, by its name in the benchmark")
     fly.add_argument(
         "--scene",
         type=Path,
@@ -27,13 +32,18 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _fly(options: argparse.Namespace) -> None:
+    from flysplat.analysis.study import scenario_file
     from flysplat.diagrams import fly
+    from flysplat.diagrams.add_policy import policy_named
     from flysplat.diagrams.configuration import load_config
     from flysplat.diagrams.scenario import Scenario
     from flysplat.diagrams.worlds.make_world import SceneConfig
 
     logging.getLogger("drake").setLevel(logging.WARNING)
-    scenario = load_config(Scenario(), options.scenario)
+    file = None if options.scenario is None else scenario_file(options.scenario)
+    scenario = load_config(Scenario(), file)
+    if options.policy is not None:
+        scenario.policy = policy_named(options.policy)
     if options.scene is not None:
         scenario.world = SceneConfig(path=str(options.scene.absolute()))
     if options.seed is not None:

@@ -20,7 +20,7 @@ from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 
 class Reactive(LeafSystem):
-    """Turns away from what its depth camera has seen in the last two seconds.
+    """Turns away from what its depth camera has seen in the last second.
 
     .. pydrake_system::
 

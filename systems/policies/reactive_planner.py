@@ -17,8 +17,8 @@ from flysplat.systems.policies.trajectory_lattice import rotation_to
 from flysplat.systems.policies.velocity_tracking import RESPONSE_TIME
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
-_REACH = 3.0  # [m] Points farther than this from a trajectory cost nothing.
-_SAMPLE_PERIOD = 0.15  # [s]
+_REACH = 1.5  # [m] Points farther than this from a trajectory cost nothing.
+_SAMPLE_PERIOD = 0.25  # [s]
 _FREE_RADIUS = 0.6  # [m] Space around the vehicle itself, taken to be free.
 
 
@@ -45,17 +45,17 @@ class ReactiveConfig:
     columns: int = 16
     rows: int = 9
     # [-] How many images are remembered.
-    memory: int = 30
+    memory: int = 20
     # [s] How far ahead candidates are followed.
     horizon: float = 1.5
     # [-] Number of directions to the sides, and [deg] the largest angle from the goal's direction.
-    num_yaws: int = 21
+    num_yaws: int = 17
     max_yaw: float = 100.0
     # [-] Number of directions up and down, and [deg] the largest angle.
-    num_pitches: int = 5
-    max_pitch: float = 30.0
+    num_pitches: int = 3
+    max_pitch: float = 25.0
     # [-] Speeds as fractions of the greatest.
-    speed_fractions: list[float] = field(default_factory=lambda: [0.25, 0.5, 0.75, 1.0])
+    speed_fractions: list[float] = field(default_factory=lambda: [0.33, 0.67, 1.0])
     # [m] Clearance kept for errors of tracking and for what lies between pixels.
     margin: float = 0.15
     barrier_margin: float = 0.5
@@ -93,12 +93,11 @@ def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
     """The nearest point of each block of pixels: p_CQ (rows * columns, 3) [m], NaN where none is.
 
     Args:
-        depth: (H, W) [m] planar; infinity is nothing in range, 0 is nearer than the camera's range
-            and is taken to be where that begins.
+        depth: (H, W) [m] planar; infinity is nothing in range, 0 no measurement.
     """
     camera = config.camera
     shape = (config.rows, camera.height // config.rows, config.columns, -1)
-    depth = np.maximum(depth, camera.min_depth)
+    depth = np.where(depth > 0.0, depth, np.inf)
     blocks = depth.reshape(shape).swapaxes(1, 2).reshape(config.rows * config.columns, -1)
     nearest = blocks.argmin(axis=1)[:, None]
     z = np.take_along_axis(blocks, nearest, axis=1)  # (rows * columns, 1)
@@ -166,10 +165,11 @@ def candidate_costs(
         points_W: (M, 3) [m] seen surfaces.
         seen: (N, S) whether the positions are seen to be free.
     """
-    distances = np.full(positions.shape[:2], _REACH)
+    distances = np.full(positions.shape[:2], np.inf)
+    farthest = np.linalg.norm(positions - p_WB, axis=2).max() + _REACH
+    points_W = points_W[np.square(points_W - p_WB).sum(axis=1) < farthest**2]
     if len(points_W):
         distances = KDTree(points_W).query(positions, distance_upper_bound=_REACH)[0]
-    distances = np.minimum(distances, _REACH)
     starts = np.broadcast_to(p_WB, (len(positions), 1, 3))
     steps = np.linalg.norm(np.diff(positions, axis=1, prepend=starts), axis=2)  # (N, S) [m]
     barrier = soft_barrier(distances, VEHICLE_RADIUS, margin=config.barrier_margin)

@@ -9,6 +9,7 @@ ends in a trap: its only minimum is the goal.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,13 +134,29 @@ class TimeOfArrival:
         return self.times.take(corner_offsets(shape) + base), position - cell
 
 
-def time_of_arrival(field: Esdf, p_WG: np.ndarray, margin: float = 0.0) -> TimeOfArrival:
+def way_lengths(field: Esdf, p_WG: np.ndarray) -> TimeOfArrival:
+    """The lengths [m] of the shortest ways to the goal p_WG (3,) [m] that the vehicle fits through:
+    the times of arrival at 1 m/s, however near the obstacles.
+
+    Raises:
+        ValueError: see `time_of_arrival`.
+    """
+    return time_of_arrival(field, p_WG, slowness=np.ones_like)
+
+
+def time_of_arrival(
+    field: Esdf,
+    p_WG: np.ndarray,
+    margin: float = 0.0,
+    slowness: Callable[[np.ndarray], np.ndarray] = slowness,
+) -> TimeOfArrival:
     """The time of arrival at the goal p_WG (3,) [m] from everywhere in a distance field.
 
     Args:
         field: a conservative distance field, `Esdf.conservative()`.
         p_WG: the goal [m].
         margin: the least clearance of the way [m], beyond the vehicle's radius.
+        slowness: S(d) [s/m].
 
     Raises:
         ValueError: if the field is not conservative, or the goal not finite, outside the field's

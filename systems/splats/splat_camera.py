@@ -21,6 +21,7 @@ from flysplat.systems.splats.drake_images import (
     render_view,
     surface_labels,
 )
+from flysplat.systems.weakly import weakly
 
 
 class SplatCamera(LeafSystem):
@@ -97,14 +98,16 @@ class SplatCamera(LeafSystem):
 
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
-        self._view_entry = self.DeclareCacheEntry(
+        view_entry = self.DeclareCacheEntry(
             "rendered view",
             ValueProducer(
                 Value[object],  # pyright: ignore[reportArgumentType]
-                self._calc_view,
+                weakly(self._calc_view),
             ),
             {pose_ticket},
         )
+        # The index: Drake would never free a system that keeps the entry itself.
+        self._view_index = view_entry.cache_index()
         width, height = camera_info.width(), camera_info.height()
         for name, image, calc in (
             ("color_image", ImageRgba8U, self._calc_color),
@@ -115,13 +118,13 @@ class SplatCamera(LeafSystem):
             self.DeclareAbstractOutputPort(
                 name,
                 alloc=lambda image=image: Value(image(width, height)),
-                calc=calc,
-                prerequisites_of_calc={self._view_entry.ticket()},
+                calc=weakly(calc),
+                prerequisites_of_calc={view_entry.ticket()},
             )
         self.DeclareAbstractOutputPort(
             "body_pose_in_world",
             alloc=lambda: Value(RigidTransform()),
-            calc=self._calc_body_pose,
+            calc=weakly(self._calc_body_pose),
             prerequisites_of_calc={pose_ticket},
         )
         self.DeclareVectorOutputPort(
@@ -153,7 +156,7 @@ class SplatCamera(LeafSystem):
         value.set_value(self.render(X_WB))
 
     def _view(self, context) -> RenderedView:
-        return cast(RenderedView, self._view_entry.Eval(context))
+        return cast(RenderedView, self.get_cache_entry(self._view_index).Eval(context))
 
     def _calc_color(self, context, value) -> None:
         pixels = value.get_mutable_value().mutable_data  # (H, W, 4)

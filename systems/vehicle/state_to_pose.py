@@ -8,6 +8,8 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
+from flysplat.systems.weakly import weakly
+
 
 def pose_from_state(state: np.ndarray) -> RigidTransform:
     """X_WB of ``state`` (13,), its quaternion normalised.
@@ -46,7 +48,7 @@ class StateToPose(LeafSystem):
         super().__init__()
         state = self.DeclareVectorInputPort("state", 13)
         self.DeclareAbstractOutputPort(
-            "pose", lambda: Value(RigidTransform()), self._calc_pose, {state.ticket()}
+            "pose", lambda: Value(RigidTransform()), weakly(self._calc_pose), {state.ticket()}
         )
 
     def _calc_pose(self, context, output):

@@ -1,4 +1,4 @@
-"""A small room of Gaussians, and a capture of it that is rendered from those very Gaussians."""
+"""A room of Gaussians and a capture rendered of it; a study. Small enough for tests."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +8,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from flysplat.analysis import ablation, measure_scene
+from flysplat.analysis.study import StudyConfig
 from flysplat.diagrams.worlds.scene_folder import write_scene_folder
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.esdf_build import esdf_from_occupancy
@@ -107,3 +108,22 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
         monkeypatch.setattr(module, "read_capture", read_capture)
     monkeypatch.delenv("FLYSPLAT_DATA", raising=False)
     return Place(gaussians, capture, tmp_path)
+
+
+@pytest.fixture
+def short_scenario(tmp_path) -> Path:
+    """A forest of a few trees, flown for at most 1.5 s."""
+    path = tmp_path / "short.yaml"
+    path.write_text(
+        "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
+        "timeout: 1.5\n"
+    )
+    return path
+
+
+@pytest.fixture
+def short_study(short_scenario) -> StudyConfig:
+    """Six flights in three places."""
+    return StudyConfig(
+        scenarios=[str(short_scenario)], policies=["straight", "planner"], speeds=[2.0], seeds=3
+    )

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from flysplat.analysis.cli import main
+from flysplat.diagrams.configuration import load_config
+from flysplat.diagrams.scenario import Scenario
+from flysplat.systems.policies.straight import StraightConfig
 from flysplat.systems.splats.gaussian_ply import write_ply
 from flysplat.systems.splats.gaussian_scene import GaussianScene
 
@@ -87,6 +90,8 @@ def fails(arguments: list[str], capsys) -> str:
         (["--set", "world.spacing=0.5"], "spacing"),
         (["--scenario", "nowhere.yaml"], "nowhere.yaml: there is no such"),
         (["--scene", "nowhere"], "nowhere"),
+        (["--policy", "nobody"], "there is no policy 'nobody'"),
+        (["--scenario", "P99"], "there is no scenario 'P99'"),
         (["--seed", "-1"], "seed"),
     ],
 )
@@ -167,3 +172,13 @@ def test_flight_through_a_real_capture(tmp_path):
     assert summary["outcome"] == "goal"
     assert summary["path_length_m"] >= 6.0
     assert summary["min_clearance_m"] > 0.0
+
+
+def test_fly_by_the_names_of_the_benchmark(tmp_path):
+    """`fly` takes a policy by its name, and overrides then set fields of that policy."""
+    out = tmp_path / "flight"
+    words = ["--policy", "straight", "--set", "policy.speed=1.5", *SHORT, "--set", "timeout=1"]
+    assert main(["fly", "--out", str(out), *words]) == 0
+    scenario = load_config(Scenario(), out / "scenario.yaml")
+    assert scenario.policy == StraightConfig(speed=1.5)
+    assert np.load(out / "trajectory.npz")["hypotheses"].shape == (0, 0)

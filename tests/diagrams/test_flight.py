@@ -1,19 +1,23 @@
 """One flight: how it starts, how it ends, and that it repeats."""
 
 import dataclasses
+import gc
 import hashlib
 import subprocess
 import sys
+import weakref
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flysplat.diagrams.add_policy import policy_named
 from flysplat.diagrams.flight import Outcome, flight_outcome, fly, sample_initial_state
 from flysplat.diagrams.flight_diagram import BuildFlightDiagram
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.make_world import make_world
 from flysplat.systems.policies.hypotheses import Hypotheses
+from flysplat.systems.sensing.observation_noise import ObservationNoise
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 
 
@@ -175,3 +179,19 @@ def test_forests_are_flown_through_at_nominal_speed(seed):
     assert np.nanmin(flight.clearances) > 0
     summary: dict[str, Any] = flight.summary()
     assert summary["mean_speed_m_s"] > 1.7
+
+
+@pytest.mark.parametrize("name", ["planner", "reactive"])
+def test_flown_diagrams_are_freed(name, post_world):
+    """A diagram that has flown, with cameras, noise and delay, leaves memory when nobody holds it,
+    and so does all that it holds.
+    """
+    noise = ObservationNoise(depth_additive=0.01, latency=0.02)
+    scenario = Scenario(timeout=0.2, policy=policy_named(name), observation=noise)
+    diagram = BuildFlightDiagram(scenario, post_world)
+    fly(diagram, scenario, post_world)
+    references = [weakref.ref(system) for system in (diagram, *diagram.GetSystems())]
+    assert references[0]() is diagram
+    del diagram
+    gc.collect()
+    assert [reference() for reference in references if reference() is not None] == []

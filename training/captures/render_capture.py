@@ -18,7 +18,7 @@ from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
 from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.training.captures.camera_path import beside, poses_along, visiting_path
+from flysplat.training.captures.camera_path import beside, poses_along, resampled, visiting_path
 from flysplat.training.captures.capture import CaptureFrame
 from flysplat.training.captures.mesh_renderer import MeshRenderer, check_mesh
 from flysplat.training.captures.tartanair import AXES
@@ -150,7 +150,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     _write_frames(partial, "rendering", X_WCs, view)
     for offset in config.offsets:
         moved = [beside(X_WC, offset) for X_WC in X_WCs]
-        room = [X_WC for X_WC in moved if _has_room(esdf, [X_WC.translation()], config.clearance)]
+        room = [X_WC for X_WC in moved if _has_room(esdf, X_WC.translation(), config.clearance)]
         _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", room, view)
     if out.exists():
         out.rmdir()
@@ -223,11 +223,11 @@ def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
     """
     if config.path:
         X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
-        for X_WC in X_WCs:
-            p_WC = X_WC.translation()
-            if not _has_room(esdf, [p_WC], min(config.clearance, esdf.voxel_size)):
+        stops = np.array([X_WC.translation() for X_WC in X_WCs])
+        for p_W in resampled(stops, esdf.voxel_size / 2):
+            if not _has_room(esdf, p_W, min(config.clearance, esdf.voxel_size)):
                 raise ValueError(
-                    f"the path touches something at {np.round(p_WC, 2).tolist()} m; lead it around"
+                    f"the path touches something at {np.round(p_W, 2).tolist()} m; lead it around"
                 )
         return X_WCs
     path = visiting_path(
@@ -240,9 +240,9 @@ def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
     return poses_along(path, config.spacing, config.yaws, config.pitch)
 
 
-def _has_room(esdf: Esdf, p_WQ: Sequence[NDArray], clearance: float) -> bool:
+def _has_room(esdf: Esdf, p_WQ: NDArray, clearance: float) -> bool:
     # Outside the grid there is nothing, so that NaN is room enough.
-    return not (esdf.distance(np.array(p_WQ)) < clearance).any()
+    return not esdf.distance(p_WQ) < clearance
 
 
 def _write_frames(

@@ -27,16 +27,15 @@ def empty_image() -> np.ndarray:
 
 
 def test_nearest_points_are_those_of_single_pixels():
-    """A near pixel stands for its block, at its own ray and depth; blocks without any are NaN and
-    a pixel nearer than the camera's range counts as at its beginning.
+    """A near pixel stands for its block, at its own ray and depth; blocks without any are NaN, as
+    are pixels without a measurement.
     """
     depth = empty_image()
     depth[5, 9], depth[6, 10] = 2.0, 3.0  # Both in block (1, 2).
     depth[35, 63] = 0.0
     points = nearest_points(depth, CONFIG).reshape(CONFIG.rows, CONFIG.columns, 3)
     np.testing.assert_allclose(points[1, 2], 2.0 * CONFIG.camera.ray_slopes()[5, 9])
-    np.testing.assert_allclose(points[8, 15], 0.1 * CONFIG.camera.ray_slopes()[35, 63])
-    assert np.isfinite(points[..., 0]).sum() == 2
+    assert np.isfinite(points[..., 0]).sum() == 1
 
 
 def test_responses_solve_the_tracking_equation():
@@ -47,7 +46,7 @@ def test_responses_solve_the_tracking_equation():
     for k in range(1, 15001):
         v = v + step * (wanted - v) / RESPONSE_TIME
         p = p + step * v
-        if k % 1500 == 0:
+        if k % 2500 == 0:
             expected.append(p)
     np.testing.assert_allclose(positions, expected, atol=1e-3)
 

@@ -1,0 +1,28 @@
+"""`flysplat replay`."""
+
+import argparse
+import logging
+from pathlib import Path
+
+
+def add_to(verbs: argparse._SubParsersAction) -> None:
+    replay = verbs.add_parser("replay", help="fly one flight of a study again, and check it")
+    replay.set_defaults(verb=_replay)
+    replay.add_argument("study", type=Path, help="folder that `flysplat benchmark` has written")
+    replay.add_argument("id", help="of the flight, as in rollouts.csv")
+    replay.add_argument("--meshcat", action="store_true", help="write flight.html, in Meshcat")
+    replay.add_argument("--video", action="store_true", help="write flight.mp4, the onboard view")
+    replay.add_argument("--out", type=Path, help="folder for these (STUDY/replays/ID)")
+
+
+def _replay(options: argparse.Namespace) -> None:
+    from flysplat.analysis import replay
+
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    replay.run(
+        study=options.study,
+        id=options.id,
+        out=options.out,
+        meshcat=options.meshcat,
+        video=options.video,
+    )

@@ -1,0 +1,293 @@
+"""The report of a study: one HTML file that needs nothing else."""
+
+import base64
+import math
+from html import escape
+from itertools import combinations
+from typing import Any
+
+from flysplat.analysis.benchmark_figures import (
+    draw_success_against_speed,
+    draw_trajectories,
+    save_png,
+)
+from flysplat.analysis.study import RolloutSpec, StudyConfig, scenario_of
+from flysplat.analysis.study_folder import StudyFolder
+from flysplat.analysis.tables import (
+    PAPER,
+    PAPER_FLIGHTS,
+    compare,
+    mean_of,
+    policy_table,
+    select,
+    success_summary,
+)
+from flysplat.diagrams.flight_diagram import goal_of
+from flysplat.diagrams.worlds.make_world import make_world
+from flysplat.systems.files import written_atomically
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1240px; margin: 2em auto;
+       padding: 0 1em; }
+h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .6em 0; }
+th, td { padding: .25em .6em; white-space: nowrap; text-align: right;
+         border-bottom: 1px solid #e3e5e8; }
+th:first-child, td:first-child { text-align: left; }
+th { background: #f4f5f7; font-weight: 600; white-space: normal; }
+img { max-width: 100%; } code { background: #f4f5f7; padding: .1em .3em; font-size: 13px; }
+details { margin: .3em 0; } summary { cursor: pointer; }
+.note { color: #555; } .warn { background: #fff4d6; padding: .5em .8em; border-radius: 4px; }
+"""
+
+
+_COMPARED = ("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")
+
+
+def write_report(
+    folder: StudyFolder,
+    config: StudyConfig,
+    rows: list[dict[str, Any]],
+    timings: list[dict[str, Any]],
+    absent: dict[str, str],
+    damaged: list[str],
+) -> None:
+    """
+    Writes `report.html` and its pictures, `success_against_speed.png` and `trajectories.png`.
+
+    Args:
+        folder, config: the study.
+        rows: of its flights.
+        timings: of the same flights.
+        absent: the scenarios that were not flown, and why.
+        damaged: files that were flown again in this run.
+    """
+    table = policy_table(rows, config, len(absent))
+    figure = draw_success_against_speed(table, config.policies)
+    success_png = save_png(figure, folder.path / "success_against_speed.png")
+    sections = [
+        f"<h1>Navigation benchmark</h1><p>{_scope(config, rows)}</p>",
+        _warnings(config, rows, absent, damaged),
+        "<h2>Policies</h2>" + _policies(table) + _timing(config, rows, timings),
+        "<h2>Beside the paper's Table I</h2>" + _paper(table, config),
+        "<h2>Success against speed</h2>" + _image(success_png, "Success rate against velocity"),
+        "<h2>Trajectories through one field</h2>" + _trajectories(folder, config, rows),
+        "<h2>Pairs of policies on the same flights</h2>" + _pairs(config, rows),
+        "<h2>Scenarios</h2>" + _scenarios(config, rows, absent),
+        "<h2>Flights</h2>" + _flights(folder, config, rows),
+        "<h2>Program</h2>" + _program(folder),
+    ]
+    body = "\n".join(sections)
+    html = (
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Navigation benchmark'
+        f"</title><style>{_STYLE}</style></head><body>{body}</body></html>\n"
+    )
+    with written_atomically(folder.path / "report.html") as path:
+        path.write_text(html)
+
+
+def _html_table(header: list[str], rows: list[list[str]]) -> str:
+    head = "".join(f"<th>{cell}</th>" for cell in header)
+    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _image(png: bytes, alt: str) -> str:
+    encoded = base64.b64encode(png).decode()
+    return f'<img src="data:image/png;base64,{encoded}" alt="{escape(alt)}">'
+
+
+def _number(value: float, form: str) -> str:
+    return format(value, form) if math.isfinite(value) else "–"
+
+
+def _rate(summary: dict[str, Any]) -> str:
+    if not summary["flights"]:
+        return "not run"
+    return (
+        f"{summary['success_rate']:.0%} <span class=note>[{summary['wilson_lower']:.0%}, "
+        f"{summary['wilson_upper']:.0%}]</span>"
+    )
+
+
+def _scope(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    speeds = ", ".join(f"{speed:g}" for speed in config.speeds)
+    return (
+        f"{len(rows)} flights: {len(config.scenarios)} scenarios, {len(config.policies)} policies, "
+        f"{config.seeds} seeds, nominal speeds {speeds} m/s. A flight succeeds when it reaches the "
+        "goal and its clearance at the vehicle's radius is never below zero. Brackets are 95 % "
+        "Wilson intervals."
+    )
+
+
+def _warnings(
+    config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str], damaged: list[str]
+) -> str:
+    lines = [
+        f"<b>{escape(name)} was not run</b>, and counts nowhere: {escape(reason)}"
+        for name, reason in absent.items()
+    ]
+    lines += [f"{escape(problem)}; the flight was flown again" for problem in damaged]
+    lines += [
+        f"{escape(row['id'])} ended in an error and counts as a failure: {escape(row['error'])}"
+        for row in rows
+        if "error" in row
+    ]
+    return "".join(f'<p class="warn">{line}</p>' for line in lines)
+
+
+def _policies(table: list[dict[str, Any]]) -> str:
+    header = ["policy", "speed [m/s]", "flights", "success", "collision", "timeout", "left volume"]
+    header += ["error", "not run", "min. clearance [m]", "velocity [m/s]", "path excess"]
+    header += ["jerk [m/s³]", "smoothness"]
+    rows = [
+        [
+            escape(row["policy"]),
+            f"{row['speed']:g}",
+            str(row["flights"]),
+            _rate(row),
+            *(str(row[name]) for name in ("collision", "timeout", "left_volume", "error")),
+            str(row["not_run"]),
+            _number(row["min_clearance_m"], "+.2f"),
+            _number(row["mean_speed_m_s"], ".2f"),
+            _number(row["path_excess"], ".1%"),
+            _number(row["jerk_m_s3"], ".1f"),
+            _number(row["smoothness"], ".1f"),
+        ]
+        for row in table
+    ]
+    return _html_table(header, rows)
+
+
+def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> str:
+    header = ["policy", "decision [ms]", "render [ms]", "real-time factor"]
+    names = "policy_ms", "render_ms", "real_time_factor"
+    lines = []
+    for policy in config.policies:
+        times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
+        lines.append([escape(policy), *(_number(mean_of(times, name), ".1f") for name in names)])
+    return "<p>Mean times, of this machine and its load:</p>" + _html_table(header, lines)
+
+
+def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
+    header = ["policy", "method in the paper", "success, paper", "success, here"]
+    header += ["clearance, paper [m]", "here [m]", "velocity, paper [m/s]", "here [m/s]"]
+    rows = []
+    for policy, paper in PAPER.items():
+        there = f"{paper.successes}/{PAPER_FLIGHTS} ({paper.successes / PAPER_FLIGHTS:.0%})"
+        clearance, speed = f"{paper.min_clearance_m:+.2f}", f"{paper.mean_speed_m_s:.2f}"
+        flown = [row for row in table if row["policy"] == policy]
+        if not flown:
+            rows.append([policy, paper.method, there, "–", clearance, "–", speed, "–"])
+        for row in flown:
+            ours = [_number(row[name], form) for name, form in _COMPARED]
+            name = f"{policy} at {row['speed']:g} m/s"
+            rows.append([name, paper.method, there, _rate(row), clearance, ours[0], speed, ours[1]])
+    for row in table:
+        if row["policy"] not in PAPER:
+            ours = [_number(row[name], form) for name, form in _COMPARED]
+            name = f"{escape(row['policy'])} at {row['speed']:g} m/s"
+            rows.append([name, "–", "–", _rate(row), "–", ours[0], "–", ours[1]])
+    note = (
+        '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
+        "the scenarios here are others of the same kinds.</p>"
+    )
+    return _html_table(header, rows) + note
+
+
+def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    lines = []
+    for speed in config.speeds:
+        for first, second in combinations(config.policies, 2):
+            result = compare(rows, first, second, speed)
+            p = f"{result.p_value:.3f}" if result.p_value >= 0.001 else f"{result.p_value:.0e}"
+            pair = f"{escape(first)} and {escape(second)}"
+            lines.append([pair, f"{speed:g}", str(result.only_first), str(result.only_second), p])
+    if not lines:
+        return "<p>One policy: nothing to compare.</p>"
+    header = ["policies", "speed [m/s]", "only the first succeeds", "only the second", "p"]
+    return _html_table(header, lines) + '<p class="note">Exact McNemar tests.</p>'
+
+
+def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]) -> str:
+    columns = [(policy, speed) for policy in config.policies for speed in config.speeds]
+    header = ["scenario", *(f"{escape(policy)}<br>{speed:g} m/s" for policy, speed in columns)]
+    names = list(dict.fromkeys(spec.scenario for spec in config.rollouts()))
+    lines = []
+    for name in names:
+        cells = []
+        for policy, speed in columns:
+            flown = select(rows, scenario=name, policy=policy, speed=speed)
+            cells.append(_rate(success_summary(flown)))
+        lines.append([escape(name) + (" <b>(not run)</b>" if name in absent else ""), *cells])
+    return _html_table(header, lines)
+
+
+def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    spec = _telling_flight(rows)
+    if spec is None:
+        return "<p>Nothing was flown.</p>"
+    scenario = scenario_of(spec, folder.scenario(spec.scenario))
+    world = make_world(scenario.world, scenario.seed)
+    flights = {}
+    for policy in config.policies:
+        row, arrays = folder.read(spec._replace(policy=policy))
+        if arrays:
+            flights[policy] = arrays["states"][:, :3], row["outcome"]
+    p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
+    title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
+    figure = draw_trajectories(
+        world, flights, p_WS, goal_of(scenario, world), config.policies, title
+    )
+    png = save_png(figure, folder.path / "trajectories.png")
+    note = (
+        '<p class="note">Dark: obstacles at the height of the goal, cut out of the distance field; '
+        "light: where the vehicle's centre would touch them.</p>"
+    )
+    return _image(png, title) + note
+
+
+def _telling_flight(rows: list[dict[str, Any]]) -> RolloutSpec | None:
+    """The field whose flights differ most in how they end, the first of equals."""
+    fields: dict[tuple, list[dict[str, Any]]] = {}
+    for row in rows:
+        fields.setdefault((row["scenario"], row["speed"], row["seed"]), []).append(row)
+
+    def variety(flown: list[dict[str, Any]]) -> tuple[int, int, float]:
+        wins = sum(row["success"] for row in flown)
+        length = sum(row.get("path_length_m", 0.0) for row in flown)
+        return min(wins, len(flown) - wins), wins, length
+
+    if not fields:
+        return None
+    row = max(fields.values(), key=variety)[0]
+    return RolloutSpec(row["scenario"], row["policy"], row["speed"], row["seed"])
+
+
+def _flights(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
+    sections = []
+    for name in dict.fromkeys(row["scenario"] for row in rows):
+        flown = select(rows, scenario=name)
+        lines = [
+            [
+                escape(row["id"]),
+                escape(row["outcome"]),
+                _number(row.get("flight_time_s", math.nan), ".1f"),
+                _number(row.get("min_clearance_m", math.nan), "+.2f"),
+                _number(row.get("mean_speed_m_s", math.nan), ".2f"),
+                f"<code>flysplat replay . {escape(row['id'])} --meshcat</code>",
+            ]
+            for row in flown
+        ]
+        sections.append(
+            f"<details><summary>{escape(name)}: {len(flown)} flights</summary>"
+            f"{_html_table(header, lines)}</details>"
+        )
+    note = "<p>The commands run in the folder that holds this report.</p>"
+    return note + "".join(sections)
+
+
+def _program(folder: StudyFolder) -> str:
+    rows = [[escape(name), escape(value)] for name, value in folder.program().items()]
+    return _html_table(["part", "version"], rows)

@@ -1,0 +1,125 @@
+"""What a study is: the same flights for every policy, each with a name by which it can be flown
+again."""
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from flysplat import diagrams
+from flysplat.diagrams.add_policy import POLICIES, policy_named
+from flysplat.diagrams.configuration import load_config
+from flysplat.diagrams.scenario import Scenario
+
+MAX_SEEDS = 1_000_000
+"""Seeds from here on are for training: nothing is judged where it was trained."""
+
+
+class RolloutSpec(NamedTuple):
+    """One flight of a study."""
+
+    scenario: str
+    policy: str
+    speed: float  # [m/s]
+    seed: int
+
+    @property
+    def id(self) -> str:
+        """Its name: unique in a study, and good as the name of a file."""
+        return f"{self.scenario}-{self.policy}-{self.speed:g}-{self.seed:03d}"
+
+
+@dataclass
+class StudyConfig:
+    """A study: scenarios x policies x speeds x seeds."""
+
+    # Names of the benchmark's scenarios, or YAML files of others.
+    scenarios: list[str] = field(default_factory=lambda: list(benchmark_scenarios()))
+    policies: list[str] = field(default_factory=lambda: list(POLICIES))
+    # [m/s] Nominal speeds.
+    speeds: list[float] = field(default_factory=lambda: [2.0])
+    # Flights of each, with the seeds from 0 on.
+    seeds: int = 20
+    # "dotted.field=YAML value", for all scenarios.
+    overrides: list[str] = field(default_factory=list)
+
+    def rollouts(self) -> list[RolloutSpec]:
+        """All flights; those through the same place stand together."""
+        return [
+            RolloutSpec(Path(scenario).stem, policy, speed, seed)
+            for scenario in self.scenarios
+            for seed in range(self.seeds)
+            for speed in self.speeds
+            for policy in self.policies
+        ]
+
+    def load_scenarios(self) -> dict[str, Scenario]:
+        """
+        The scenarios by name, with the overrides.
+
+        Raises:
+            ValueError: for an unknown scenario, policy or speed, anything given twice, and values
+                that cannot be flown; the message names it and what there is.
+        """
+        if not 1 <= self.seeds <= MAX_SEEDS:
+            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {MAX_SEEDS}")
+        names = [Path(scenario).stem for scenario in self.scenarios]
+        given: dict[str, list[Any]]
+        given = {"scenario": names, "policy": self.policies, "speed": self.speeds}
+        for what, values in given.items():
+            if not values:
+                raise ValueError(f"the study has no {what}; name at least one")
+            twice = [value for value in values if values.count(value) > 1]
+            if twice:
+                raise ValueError(f"the {what} {twice[0]} is given twice; give it once")
+        for override in self.overrides:
+            field = override.partition("=")[0].partition(".")[0]
+            if field in ("policy", "seed"):
+                raise ValueError(
+                    f"the override {override!r} has no place in a study: each of its flights has "
+                    "its own policy, speed and seed; name them with --policies, --speeds and "
+                    "--seeds"
+                )
+        for speed in self.speeds:
+            if not 0.0 < speed < math.inf:
+                raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
+            for policy in self.policies:
+                policy_named(policy, speed)
+        scenarios = {}
+        for name, scenario in zip(names, self.scenarios, strict=True):
+            loaded = load_config(Scenario(), scenario_file(scenario), self.overrides)
+            try:
+                loaded.validate()
+            except ValueError as error:
+                raise ValueError(f"scenario {name}: {error}") from None
+            scenarios[name] = loaded
+        return scenarios
+
+
+def scenario_of(spec: RolloutSpec, scenario: Scenario) -> Scenario:
+    """The scenario of one flight: with its policy, speed and seed."""
+    return replace(scenario, policy=policy_named(spec.policy, spec.speed), seed=spec.seed)
+
+
+def benchmark_scenarios() -> dict[str, Path]:
+    """The files of the benchmark's scenarios by name."""
+    folder = Path(diagrams.__file__).parent / "scenarios"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def scenario_file(scenario: str) -> Path:
+    """
+    The file of a scenario, given by its name in the benchmark or as a path.
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    known = benchmark_scenarios()
+    if scenario in known:
+        return known[scenario]
+    if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
+        return Path(scenario)
+    raise ValueError(
+        f"there is no scenario {scenario!r}; the benchmark's are {', '.join(known)}, others are "
+        "given as YAML files"
+    )

@@ -1,0 +1,69 @@
+"""Speed of rollouts, each without anything but the flight.
+
+    python benchmarks/rollouts.py [--flights 8]
+
+Prints the real-time factor of flights through the default forest: without images (the planner),
+with depth images alone (the reactive policy), and with colour and depth at 320x240 and 15 Hz. Then
+the rollouts per minute of one and of two worker processes, on the same flights. Run it on an idle
+machine: factors are of wall time, the best of three; CPU time is given beside them.
+"""
+
+import argparse
+import os
+import time
+
+from flysplat.analysis.study import RolloutSpec
+from flysplat.analysis.workers import fly_all
+from flysplat.diagrams.add_policy import policy_named
+from flysplat.diagrams.configuration import dump_config
+from flysplat.diagrams.flight import fly
+from flysplat.diagrams.flight_diagram import BuildFlightDiagram
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.make_world import make_world
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def time_policies(repeats: int = 3) -> None:
+    """Prints a line for each kind of flight."""
+    scenario = Scenario(seed=10)
+    world = make_world(scenario.world, scenario.seed)
+    print(f"{'flight':<34}{'x real time':>12}{'of CPU time':>12}")
+    for name, policy, video in (
+        ("planner, no images", "planner", False),
+        ("reactive, depth 64x36 at 15 Hz", "reactive", False),
+        ("planner, colour 320x240 at 15 Hz", "planner", True),
+    ):
+        scenario.policy = policy_named(policy)
+        diagram = BuildFlightDiagram(scenario, world, camera=video, video=video)
+        wall, cpu = [], []
+        for _ in range(repeats):
+            started = time.process_time()
+            flight = fly(diagram, scenario, world)
+            cpu.append(flight.times[-1] / (time.process_time() - started))
+            wall.append(flight.times[-1] / flight.wall_time)
+        print(f"{name:<34}{max(wall):>12.1f}{max(cpu):>12.1f}")
+
+
+def time_workers(flights: int) -> None:
+    """Prints rollouts per minute of one and two worker processes, after they have started."""
+    specs = [RolloutSpec("forest", "reactive", 2.0, seed) for seed in range(flights)]
+    scenarios = {"forest": dump_config(Scenario())}
+    rates = {}
+    for jobs in (1, 2):
+        started, ends = time.perf_counter(), []
+        for _ in fly_all(specs, scenarios, jobs):
+            ends.append(time.perf_counter())
+        # From the first end on: processes take seconds to start.
+        rates[jobs] = 60.0 * (len(ends) - jobs) / (ends[-1] - ends[jobs - 1])
+        print(f"{jobs} workers: {rates[jobs]:.1f} rollouts a minute", end="; ")
+        print(f"{60.0 * len(ends) / (ends[-1] - started):.1f} with their start")
+    print(f"two over one: {rates[2] / rates[1]:.2f}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--flights", type=int, default=8, help="for the workers (%(default)s)")
+    options = parser.parse_args()
+    time_policies()
+    time_workers(options.flights)

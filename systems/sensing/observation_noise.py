@@ -1,0 +1,93 @@
+"""What real cameras add to images: noise, missing depth, changing brightness, delay.
+
+The noise of an image is a function of a seed and of the image's number alone. It can be drawn again
+for any image, in any order, and a flight with it repeats bit for bit.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+_LARGEST_LATENCY = 1.0  # [s]
+
+
+@dataclass
+class ObservationNoise:
+    """How much of each there is; none by default. The noise is Gaussian, its sizes are standard
+    deviations."""
+
+    # [-] Error of each depth pixel relative to its depth.
+    depth_multiplicative: float = 0.0
+    # [m] Error of each depth pixel that does not grow with depth.
+    depth_additive: float = 0.0
+    # [-] Probability of each depth pixel to read nothing, which is 0.
+    depth_dropout: float = 0.0
+    # [-] Noise of each colour pixel and channel, in parts of full scale.
+    color_noise: float = 0.0
+    # [-] Largest change in brightness of a whole image; uniform up to it, up and down.
+    brightness_jitter: float = 0.0
+    # [s] Age of the images that the policy sees; its state is up to date.
+    latency: float = 0.0
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        limits = {"depth_additive": math.inf, "latency": _LARGEST_LATENCY}
+        for field in fields(self):
+            value, limit = getattr(self, field.name), limits.get(field.name, 1.0)
+            if not (0.0 <= value <= limit and value < math.inf):
+                most = f" and at most {limit:g}" if limit < math.inf else " and finite"
+                raise ValueError(
+                    f"observation.{field.name} is {value}; it must be at least 0{most}"
+                )
+
+    @property
+    def changes_depth(self) -> bool:
+        """Whether depth images are touched."""
+        return max(self.depth_multiplicative, self.depth_additive, self.depth_dropout) > 0.0
+
+    @property
+    def changes_color(self) -> bool:
+        """Whether colour images are touched."""
+        return max(self.color_noise, self.brightness_jitter) > 0.0
+
+
+def noisy_depth(
+    depth: np.ndarray,
+    noise: ObservationNoise,
+    generator: np.random.Generator,
+    min_depth: float,
+    max_depth: float,
+) -> np.ndarray:
+    """The depth image (H, W) float32 [m] with errors and holes.
+
+        z' = z (1 + depth_multiplicative n_1) + depth_additive n_2,   n ~ N(0, 1) at each pixel
+
+    Pixels that read 0 or infinity keep that, and what an error takes out of the camera's range
+    reads as Drake's cameras do: 0 below `min_depth`, infinity above `max_depth` [m].
+    """
+    relative, absolute = generator.standard_normal((2, *depth.shape))
+    dropped = generator.random(depth.shape) < noise.depth_dropout
+    measured = np.isfinite(depth) & (depth > 0.0)
+    z = np.where(measured, depth, 1.0).astype(float)
+    z = z * (1.0 + noise.depth_multiplicative * relative) + noise.depth_additive * absolute
+    z = np.where(z < min_depth, 0.0, np.where(z > max_depth, np.inf, z))
+    return np.where(dropped, 0.0, np.where(measured, z, depth)).astype(np.float32)
+
+
+def noisy_color(
+    color: np.ndarray, noise: ObservationNoise, generator: np.random.Generator
+) -> np.ndarray:
+    """The colour image (H, W, 3) uint8, brighter or darker as a whole, with noise at each pixel.
+
+    c' = c (1 + brightness_jitter u) + 255 color_noise n,   u ~ U(-1, 1), n ~ N(0, 1)
+    """
+    gain = 1.0 + noise.brightness_jitter * generator.uniform(-1.0, 1.0)
+    grain = generator.standard_normal(color.shape, dtype=np.float32)
+    noisy = np.float32(gain) * color + np.float32(255.0 * noise.color_noise) * grain
+    return np.clip(noisy + np.float32(0.5), 0.0, 255.0).astype(np.uint8)
+
+
+def image_generator(seed: int, number: int) -> np.random.Generator:
+    """Where the randomness of image `number` of a flight comes from."""
+    return np.random.default_rng([seed, number])

@@ -1,0 +1,89 @@
+"""Noise of images."""
+
+import numpy as np
+import pytest
+
+from flysplat.systems.sensing.observation_noise import (
+    ObservationNoise,
+    image_generator,
+    noisy_color,
+    noisy_depth,
+)
+
+DEPTH = np.full((200, 200), 4.0, dtype=np.float32)
+
+
+def test_depth_errors_have_the_sizes_asked_for():
+    """Relative and absolute errors add as variances; the mean stays."""
+    noise = ObservationNoise(depth_multiplicative=0.03, depth_additive=0.05)
+    errors = noisy_depth(DEPTH, noise, image_generator(0, 0), 0.1, 20.0) - 4.0
+    sigma = np.hypot(0.03 * 4.0, 0.05)
+    assert errors.std() == pytest.approx(sigma, rel=0.02)  # The estimate's own error is 0.35 %.
+    assert abs(errors.mean()) < 4 * sigma / 200
+
+
+def test_dropout_and_range():
+    """Dropped pixels read 0 at the rate asked for; what leaves the range reads 0 or infinity; what
+    read 0 or infinity stays so.
+    """
+    dropped = noisy_depth(DEPTH, ObservationNoise(depth_dropout=0.2), image_generator(1, 0), 0, 20)
+    assert np.mean(dropped == 0) == pytest.approx(0.2, abs=0.01)
+    assert set(np.unique(dropped)) == {0.0, 4.0}
+    wide = noisy_depth(DEPTH, ObservationNoise(depth_additive=3.0), image_generator(2, 0), 1.0, 9.0)
+    read = wide[np.isfinite(wide) & (wide > 0)]
+    assert read.min() >= 1.0
+    assert read.max() <= 9.0
+    assert np.isinf(wide).any()
+    assert (wide == 0).any()
+    ends = np.array([[0.0, np.inf]], dtype=np.float32)
+    noise = ObservationNoise(depth_multiplicative=0.5, depth_additive=0.5)
+    np.testing.assert_array_equal(noisy_depth(ends, noise, image_generator(3, 0), 0.1, 20), ends)
+
+
+def test_color_noise_and_brightness():
+    """Pixel noise has the size asked for; brightness changes a whole image by one factor, within
+    its limit; results stay within 0 to 255.
+    """
+    color = np.full((100, 100, 3), 100, dtype=np.uint8)
+    grain = noisy_color(color, ObservationNoise(color_noise=0.04), image_generator(0, 0))
+    assert grain.std() == pytest.approx(0.04 * 255, rel=0.05)
+    jitter = ObservationNoise(brightness_jitter=0.3)
+    levels = [noisy_color(color, jitter, image_generator(0, k)) for k in range(50)]
+    assert all(len(np.unique(level)) == 1 for level in levels)
+    shades = np.array([level[0, 0, 0] for level in levels])
+    assert 69 <= shades.min() < 80
+    assert 120 < shades.max() <= 130
+    bright = np.full((4, 4, 3), 250, dtype=np.uint8)
+    assert (
+        noisy_color(bright, ObservationNoise(color_noise=1.0), image_generator(0, 0)).max() == 255
+    )
+
+
+def test_noise_is_a_function_of_seed_and_number():
+    """The same seed and image number give the same bits; another of either gives others."""
+    noise = ObservationNoise(depth_additive=0.1)
+    images = [
+        noisy_depth(DEPTH, noise, image_generator(*key), 0.1, 20.0)
+        for key in ((3, 5), (3, 5), (3, 6), (4, 5))
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert np.any(images[0] != images[2])
+    assert np.any(images[0] != images[3])
+
+
+def test_no_noise_changes_nothing():
+    """The default passes images as they are."""
+    none = ObservationNoise()
+    assert not none.changes_depth
+    assert not none.changes_color
+    np.testing.assert_array_equal(noisy_depth(DEPTH, none, image_generator(0, 0), 0.1, 20), DEPTH)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("depth_dropout", 1.1), ("depth_additive", np.inf), ("latency", 1.5), ("color_noise", -0.1)],
+)
+def test_bad_noise_is_named(field, value):
+    """A value out of range names the field."""
+    with pytest.raises(ValueError, match=rf"observation.{field} is {value}"):
+        ObservationNoise(**{field: value}).validate()
