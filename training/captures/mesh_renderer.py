@@ -1,6 +1,5 @@
 """Exact views of a mesh, by Drake's OpenGL renderer."""
 
-import ctypes
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
+from flysplat.systems.opengl import require_opengl
 from flysplat.training.captures.capture import CaptureFrame
 
 NEAREST, FARTHEST = 0.05, 150.0
@@ -30,7 +30,7 @@ NEAREST, FARTHEST = 0.05, 150.0
 # Lamps at infinity: one overhead, four from the sides so that no wall is dark or like its
 # neighbour, one from below for undersides.
 _LAMPS = (
-    ((0.15, 0.25, -1.0), 1.9),
+    ((0.15, 0.25, -1.0), 1.6),
     ((1.0, 0.15, -0.5), 1.1),
     ((-1.0, -0.15, -0.5), 1.3),
     ((0.15, 1.0, -0.5), 0.9),
@@ -55,13 +55,7 @@ class MeshRenderer:
 
     def __init__(self, mesh: Path, up: str, background: tuple[float, float, float]):
         check_mesh(mesh, up)
-        try:
-            ctypes.CDLL("libEGL.so.1")
-        except OSError as error:
-            raise OSError(
-                f"no OpenGL to render with ({error}); on Debian, apt install libegl1 "
-                "libegl-mesa0 libgl1-mesa-dri libglib2.0-0 libx11-6 libsm6"
-            ) from None
+        require_opengl()
         lights = [
             LightParameter(
                 type="directional", frame="world", direction=np.array(way), intensity=intensity

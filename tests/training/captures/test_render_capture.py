@@ -60,6 +60,7 @@ def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
     for frame in capture.frames():
         np.testing.assert_allclose(frame.depth, depth_of_room(frame), rtol=1e-4)
     camera = true_camera(tmp_path / "capture")
+    assert camera is not None
     again = camera(capture.X_WCs[3])
     np.testing.assert_array_equal(again.image, capture.load_image(3))
     np.testing.assert_allclose(again.depth, capture.load_depth(3), atol=1e-5)
