@@ -122,11 +122,13 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    blend_order: Tensor | None = None,
 ) -> Projection:
     """EWA projection: J R Sigma R^T J^T + eps2d I (Zwicker et al. 2001; Kerbl et al. 2023).
 
     `antialiased` multiplies opacities by the square root of the ratio of the determinants without
-    and with eps2d (Yu et al. 2024).
+    and with eps2d (Yu et al. 2024). Gaussians blend by rising `blend_order` (N,), their depth if
+    None.
     """
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -156,7 +158,8 @@ def project(
     on_image = ((mean + radius > 0) & (mean - radius < size)).all(1)
     large = (torch.ceil(radius) > radius_clip).any(1)
     index = torch.nonzero(inside & visible_opacity & on_image & large)[:, 0]
-    index = index[torch.argsort(z[index], stable=True)]
+    key = z if blend_order is None else blend_order
+    index = index[torch.argsort(key[index], stable=True)]
     return Projection(mean[index], covariance[index], z[index], index, opacities[index])
 
 
