@@ -17,8 +17,11 @@ from flysplat.training.reconstruct import ReconstructConfig
 class TourConfig:
     """How each stage of a tour is done."""
 
-    render: RenderConfig = field(default_factory=RenderConfig)
-    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    render: RenderConfig = field(default_factory=lambda: RenderConfig(spacing=0.8, apart=4.0))
+    # Places through which one flies are larger than those that one looks at.
+    reconstruct: ReconstructConfig = field(
+        default_factory=lambda: ReconstructConfig(initial_gaussians=120_000)
+    )
     flight: Scenario = field(default_factory=Scenario)  # its world is the reconstruction
 
 

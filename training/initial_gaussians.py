@@ -56,7 +56,7 @@ def gaussians_from_depth(
         detail: how many.
 
     Raises:
-        ValueError: if even the largest cells make too many.
+        ValueError: if even the largest cells make too many and they are not to be optimised.
     """
     gains = photometry.gains
     # A gain is a rough account of another tone curve, so other images are preferred to odd ones.
@@ -90,7 +90,13 @@ def gaussians_from_depth(
             if sum(len(p_WQ) for p_WQ, _, _ in parts.values()) <= detail.max_gaussians:
                 break
         if contrast < 1:
-            contrast *= 1.3
+            contrast *= 1.3 if estimate < 2 * detail.max_gaussians else 2.0
+        elif detail.optimized:
+            # Edges of depth alone make too many: optimisation fills in what is left out here.
+            for k in set(range(len(frames))).difference(some):
+                parts[k] = gaussians_of(k, with_shell(frames[k]))
+                progress.update()
+            break
         elif max_cell < 64:
             max_cell, max_extent = 2 * max_cell, 2 * max_extent
         else:
@@ -101,11 +107,22 @@ def gaussians_from_depth(
     progress.close()
     in_order = [parts[k] for k in range(len(frames))]
     p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*in_order, strict=True))
+    if len(p_WQ) > detail.max_gaussians:
+        kept = _mostly_large(covariances, detail.max_gaussians)
+        p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
     quats, scales = principal_axes(covariances)
     opacities = np.full(len(p_WQ), detail.opacity)
     red, green, blue = np.clip(colors.mean(axis=0), 0, 1)
     scene = GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
     return scene, (float(red), float(green), float(blue))
+
+
+def _mostly_large(covariances: NDArray, count: int) -> NDArray[np.intp]:
+    """Draws `count` Gaussians without replacement, each with a chance in proportion to its radius
+    (Efraimidis and Spirakis 2006); in their order."""
+    radii = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+    keys = np.log(np.random.default_rng(0).uniform(size=len(radii))) / radii
+    return np.sort(np.argpartition(-keys, count)[:count])
 
 
 def gaussians_from_points(p_WQ: NDArray, colors: NDArray) -> GaussianScene:

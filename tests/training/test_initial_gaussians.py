@@ -6,10 +6,14 @@ import pytest
 from flysplat.training.captures.tartanair import read_tartanair_v1
 from flysplat.training.initial_gaussians import (
     SHELL,
+    Detail,
+    gaussians_from_depth,
     gaussians_from_points,
     random_points,
     with_shell,
 )
+from flysplat.training.overlap import View
+from flysplat.training.photometry import estimate_photometry
 
 
 def test_what_is_beyond_range_stands_on_a_shell(write_room, tmp_path):
@@ -25,6 +29,23 @@ def test_what_is_beyond_range_stands_on_a_shell(write_room, tmp_path):
     np.testing.assert_allclose(distance[beyond], SHELL, rtol=1e-6)
     assert (far.depth[10:12] == 0).all()
     np.testing.assert_array_equal(far.depth[14:], frame.depth[14:])
+
+
+def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
+    """Where even the coarsest cells are too many, exactly as many as allowed are drawn, mostly
+    large ones, each of them one of all; without optimisation it is an error."""
+    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+    frames = list(capture.frames())
+    photometry = estimate_photometry([View.of(frame) for frame in frames], 0)
+    coarse = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
+    detail = Detail(max_gaussians=100_000, optimized=True, **coarse)
+    every, _ = gaussians_from_depth(frames, photometry, detail)
+    some, _ = gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20))
+    assert len(some) == 20 < len(every)
+    assert set(map(tuple, some.means)) <= set(map(tuple, every.means))
+    assert np.linalg.norm(some.scales, axis=1).mean() > np.linalg.norm(every.scales, axis=1).mean()
+    with pytest.raises(ValueError, match="20 Gaussians are too few"):
+        gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20, optimized=False))
 
 
 def test_points_become_gaussians_of_their_spacing():
