@@ -1,36 +1,80 @@
 """The courses that policies train in: of the benchmark's kinds, of seeds that it never uses."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 
 from flysplat.diagrams.worlds.forest_config import CLEARANCE, INSET, ForestConfig
 from flysplat.diagrams.worlds.forest_layout import lay_out
 from flysplat.diagrams.worlds.seeds import TRAINING_SEEDS
-from flysplat.training.policies.fields import Course
+from flysplat.training.policies.fields import Course, Fields
 
-CourseConfig = ForestConfig
+VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
+"""Worlds of the seeds from here on choose among checkpoints and are not trained in either."""
 
-VALIDATION_SEEDS = TRAINING_SEEDS + 500_000
-"""Seeds from here on choose among checkpoints and are not trained on either."""
+_LARGEST_RUN = 1000  # courses of one training seed
+
+KINDS = {
+    "P02": ForestConfig(),
+    "P03": ForestConfig(spacing=2.1, radius_min=0.2, radius_max=0.35),
+}
 
 
-def make_course(config: CourseConfig, seed: int) -> Course:
-    """The world of `config` and `seed` as the benchmark flies it, without what cameras see."""
+@dataclass
+class CourseSelection:
+    """Which worlds, and how many."""
+
+    # Scenarios whose worlds are trained in, in turn; naming one twice doubles its part.
+    kinds: list[str] = field(default_factory=lambda: ["P02", "P03"])
+    # [-] Worlds trained in.
+    count: int = 48
+    # [-] Held-out worlds that choose among checkpoints.
+    held_out: int = 64
+    # [m] Of the grids of the time of arrival.
+    voxel_size: float = 0.25
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        if unknown or not self.kinds:
+            raise ValueError(f"courses.kinds is {self.kinds}; choose from {', '.join(KINDS)}")
+        for name in ("count", "held_out"):
+            value = getattr(self, name)
+            if not 1 <= value <= _LARGEST_RUN:
+                raise ValueError(f"courses.{name} is {value}; it must be 1 to {_LARGEST_RUN}")
+        if not 0.05 <= self.voxel_size <= 0.5:
+            raise ValueError(f"courses.voxel_size is {self.voxel_size} m; it must be 0.05 to 0.5")
+
+
+def make_course(kind: str, seed: int) -> Course:
+    """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
+    config = KINDS[kind]
     start = np.array([INSET, 0.0, config.flight_height])
     goal = np.array([config.length - INSET, 0.0, config.flight_height])
     layout = lay_out(config, np.random.default_rng([seed, 0]), [start[:2], goal[:2]], CLEARANCE)
     return Course(layout.shapes(), layout.lower, layout.upper, start, goal)
 
 
-def training_courses(configs: Sequence[CourseConfig], count: int, first: int) -> list[Course]:
-    """`count` courses, in turn of each config, of the seeds from `first` on.
+def training_fields(
+    selection: CourseSelection, seed: int, device: torch.device | str = "cpu"
+) -> Fields:
+    """The worlds that a training run of `seed` learns in; those of different seeds differ.
 
     Raises:
-        ValueError: if `first` is below `TRAINING_SEEDS`.
+        ValueError: if the seed is not 0 to 999.
     """
-    if first < TRAINING_SEEDS:
-        raise ValueError(
-            f"training seeds start at {TRAINING_SEEDS}, lower ones as {first} are the benchmark's"
-        )
-    return [make_course(configs[i % len(configs)], first + i) for i in range(count)]
+    if not 0 <= seed < (VALIDATION_SEEDS - TRAINING_SEEDS) // _LARGEST_RUN:
+        raise ValueError(f"seed is {seed}; it must be 0 to 999")
+    first = TRAINING_SEEDS + seed * _LARGEST_RUN
+    return Fields(_courses(selection, selection.count, first), selection.voxel_size, device)
+
+
+def validation_fields(selection: CourseSelection, device: torch.device | str = "cpu") -> Fields:
+    """The held-out worlds, the same for every run."""
+    return Fields(_courses(selection, selection.held_out, VALIDATION_SEEDS), None, device)
+
+
+def _courses(selection: CourseSelection, count: int, first: int) -> list[Course]:
+    kinds = selection.kinds
+    return [make_course(kinds[i % len(kinds)], first + i) for i in range(count)]

@@ -66,26 +66,32 @@ class Outcomes(NamedTuple):
     least_clearance: Tensor  # (N,) [m]
     mean_speed: Tensor  # (N,) [m/s]
 
-    @property
-    def success(self) -> float:
-        """Part of the flights that reached the goal; the others collided, left or took too long."""
-        return float(self.reached.float().mean())
+    def measures(self) -> dict[str, float]:
+        """Parts of the flights that reached the goal, collided and left; what remains took too
+        long. Means of least clearance [m] and speed [m/s]."""
+        return {
+            "success": float(self.reached.float().mean()),
+            "collisions": float(self.collided.float().mean()),
+            "left": float(self.left.float().mean()),
+            "clearance": float(self.least_clearance.mean()),
+            "speed": float(self.mean_speed.mean()),
+        }
 
 
 @dataclass
 class FlightConditions:
     """Of the flights that measure a policy."""
 
+    # [m/s] Asked of the policy.
     speed: float = 2.0
-    """[m/s], asked of the policy."""
+    # [m] The goal is reached within this distance.
     goal_radius: float = 0.3
-    """[m]"""
+    # [-] Flights end after this multiple of the time that the straight way takes at that speed.
     patience: float = 2.5
-    """Flights end after this multiple of the time that the straight way takes at `speed`."""
+    # [s] Lag of the acceleration of point masses.
     lag: float = 0.12
-    """[s], of point masses."""
+    # Whether the body-rate quadrotor flies, instead of a point mass.
     body_rate: bool = False
-    """Whether the body-rate quadrotor flies, instead of a point mass."""
 
 
 @torch.no_grad()

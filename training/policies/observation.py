@@ -8,14 +8,14 @@ from torch import Tensor
 
 @dataclass
 class ObservationNoise:
-    """How observations are disturbed in training; all but `scale` is drawn anew at every image."""
+    """How depth images are disturbed in training, each pixel anew in every image."""
 
+    # [-] Standard deviation of each depth, as a part of it.
     scale: float = 0.03
-    """Standard deviation of each depth, as a part of it."""
+    # [m] Standard deviation of what is added to each depth.
     offset: float = 0.02
-    """[m], standard deviation added to each depth."""
+    # [-] Part of the pixels that read nothing, which is as far as can be seen.
     dropout: float = 0.01
-    """Part of the pixels that read nothing, which is as far as can be seen."""
 
     def disturbed(self, depth: Tensor, generator: torch.Generator) -> Tensor:
         """Planar depth (N, R) [m] as a worse camera measures it."""

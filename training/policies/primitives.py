@@ -20,6 +20,12 @@ _FAR = 1e4
 _HELD = 0.5
 """[m], ends of capsules further than this from the volume are left out: they end out of sight."""
 
+_GRAZE, _MISS = 1e-4, 1e6
+"""[m], a shorter way through a shape counts as a miss, whose depth is at least this."""
+
+_PARALLEL = 1e-9
+"""Added to cosines that are divided by: 1 / 0 - 1 / 0 is not a number."""
+
 
 class PinholeGrid(NamedTuple):
     """The rays of a small depth camera that looks along body x, square pixels."""
@@ -122,7 +128,7 @@ class Primitives:
                 kind = _in_front(kind, near, p_WC, R_WC[:, :, 2], nearest)
                 torch.minimum(depth, cast(p_WC, R_WC, rays, kind, grid.half_pixel), out=depth)
             begin += count
-        return depth
+        return torch.where(depth < _MISS, depth, torch.inf)
 
 
 def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
@@ -263,7 +269,7 @@ def _cast_cylinders(
     # Between the flat ends...
     slope = torch.bmm(axis.mT, rays)  # (N, M, R)
     a = torch.addcmul(rays.square().sum(1, keepdim=True), slope, slope, value=-1.0)
-    slope.reciprocal_()
+    slope.add_(_PARALLEL).reciprocal_()
     middle = along[:, :, None] * slope
     width = slope.abs_().mul_((half + extra)[:, :, None])
     # ... and inside the endless cylinder.
@@ -287,7 +293,7 @@ def _cast_boxes(p: Tensor, R: Tensor, rays: Tensor, boxes: Tensor, half_pixel: f
     enter = torch.zeros(N, M, rays.shape[2], device=p.device)
     leave = torch.full_like(enter, torch.inf)
     for axis in range(3):
-        slope = torch.bmm(rotation[:, :, axis].mT, rays).reciprocal_()  # (N, M, R)
+        slope = torch.bmm(rotation[:, :, axis].mT, rays).add_(_PARALLEL).reciprocal_()
         middle = local[:, axis, :, None] * slope
         width = slope.abs_().mul_((boxes[:, 12 + axis] + extra)[:, :, None])
         torch.minimum(leave, width - middle, out=leave)
@@ -304,5 +310,6 @@ def _cast_planes(p: Tensor, R: Tensor, rays: Tensor, planes: Tensor, half_pixel:
 
 
 def _nearest(enter: Tensor, leave: Tensor, depth: Tensor, extra: Tensor) -> Tensor:
-    """The least depth (N, R), of rays that enter a shape before they leave it."""
-    return (depth + extra[:, :, None]).masked_fill_(enter >= leave, torch.inf).amin(1)
+    """The least depth (N, R), of rays that enter a shape before they leave it; large otherwise."""
+    missed = (enter - leave).add_(_GRAZE).clamp_(min=0.0)
+    return missed.mul_(_MISS / _GRAZE).add_(depth).add_(extra[:, :, None]).amin(1)

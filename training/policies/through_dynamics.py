@@ -1,8 +1,7 @@
 """Learning to fly by descending a loss through the dynamics of many vehicles in flight."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -47,21 +46,40 @@ class Learner(Pilot, Protocol):
 class FlightSchool:
     """How vehicles fly while they learn."""
 
+    # [-] Vehicles in flight at once.
     environments: int = 64
-    """Vehicles in flight at once."""
+    # [-] Steps of the policy that the loss is descended through at once.
     steps: int = 32
-    """Steps that the loss is descended through at once."""
-    speed: tuple[float, float] = (1.5, 3.0)
-    """[m/s], between which each vehicle's wanted speed is drawn."""
-    lag: tuple[float, float] = (0.07, 0.2)
-    """[s], between which each vehicle's lag of the acceleration is drawn."""
+    # [m/s] Range that each vehicle's wanted speed is drawn from.
+    speed: list[float] = field(default_factory=lambda: [1.5, 3.0])
+    # [s] Range that each vehicle's lag of the acceleration is drawn from.
+    lag: list[float] = field(default_factory=lambda: [0.07, 0.2])
+    # [-] What is left of a gradient that went back through a second of flight.
     gradient_decay: float = 0.4
-    """What is left of a gradient that went back through a second of flight."""
+    # [s] Time constant of the moving average of the velocity.
     averaging: float = 0.5
-    """[s], time constant of the moving average of the velocity."""
+    # [s] A flight ends after this time, wherever it is.
     longest: float = 30.0
-    """[s], after which a flight ends wherever it is."""
     noise: ObservationNoise = field(default_factory=ObservationNoise)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("environments", "steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"school.{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("speed", "lag"):
+            limits = getattr(self, name)
+            if len(limits) != 2 or not 0.0 < limits[0] <= limits[1] < float("inf"):
+                raise ValueError(
+                    f"school.{name} is {limits}; it must be two positive numbers, the lesser first"
+                )
+        if not 0.0 <= self.gradient_decay <= 1.0:
+            raise ValueError(
+                f"school.gradient_decay is {self.gradient_decay}; it must be between 0 and 1"
+            )
+        for name in ("averaging", "longest"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"school.{name} is {getattr(self, name)} s; it must be positive")
 
 
 class Flying(NamedTuple):
@@ -74,7 +92,7 @@ class Flying(NamedTuple):
     age: Tensor  # (N,) [s]
 
 
-class NotFinite(ArithmeticError):
+class NotFinite(ValueError):
     """A term of the loss, or the gradient, became infinite or not a number."""
 
 
@@ -93,6 +111,17 @@ class School:
         self._control = FlatnessControllerConfig()
         self.flying = self._fresh()
 
+    def state(self) -> dict[str, Any]:
+        """Everything that the next lesson depends on but the learner."""
+        flying = [*self.flying.vehicle, *self.flying[1:]]
+        return {"flying": flying, "generator": self.generator.get_state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """The inverse of `state`."""
+        count = len(PointMass._fields)
+        self.flying = Flying(PointMass(*state["flying"][:count]), *state["flying"][count:])
+        self.generator.set_state(state["generator"])
+
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(*size, generator=self.generator, device=self.generator.device)
 
@@ -100,7 +129,7 @@ class School:
         """New flights, from anywhere, in flight towards about where the way leads."""
         config, N = self.config, self.config.environments
 
-        def between(limits: tuple[float, float], *size: int) -> Tensor:
+        def between(limits: list[float], *size: int) -> Tensor:
             return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
 
         start = (self._uniform(N) * STARTS).long().clamp(max=STARTS - 1)
@@ -147,9 +176,9 @@ class School:
         with torch.no_grad():
             vehicle, v_mean, memory, speed, age = self._renewed(self.flying)
         totals: dict[str, Tensor] = {}
+        distances, normals = self._primitives.near(vehicle.p)
         for _ in range(config.steps):
-            near, _ = self._primitives.near(vehicle.p)
-            depth, R_WB = look(vehicle, self._primitives, learner.grid, near)
+            depth, R_WB = look(vehicle, self._primitives, learner.grid, distances)
             depth = config.noise.disturbed(depth, self.generator)
             R_WH = heading_frame(vehicle.yaw)
             a_cmd, heading, memory = learner.decide(
@@ -158,7 +187,8 @@ class School:
             before = vehicle
             vehicle = vehicle.decayed(keep).step(a_cmd, dt, self._control, heading)
             v_mean = v_mean + forget * (vehicle.v - v_mean)
-            clearance, approach = self._obstacles(vehicle)
+            distances, normals = self._primitives.near(vehicle.p)
+            clearance, approach = _obstacles(vehicle, distances, normals)
             with torch.no_grad():
                 to_goal = (self._p_WG - vehicle.p).norm(dim=1)
                 way = fields.way(vehicle.p, self.world)
@@ -185,36 +215,16 @@ class School:
         )
         return totals
 
-    def _obstacles(self, vehicle: PointMass) -> tuple[Tensor, Tensor]:
-        """Clearance (N, 4) and velocity of approach (N, 4) of the nearest obstacles."""
-        distances, normals = self._primitives.near(vehicle.p.detach())
-        nearest = distances.topk(NEAREST, dim=1, largest=False)
-        n = normals.gather(2, nearest.indices[:, None].expand(-1, 3, -1))  # (N, 3, 4)
-        # The value is the distance and the gradient its normal.
-        along = ((vehicle.p - vehicle.p.detach())[:, :, None] * n).sum(1)
-        approach = -(vehicle.v[:, :, None] * n).sum(1)
-        return nearest.values + along - VEHICLE_RADIUS, approach
 
+def _obstacles(vehicle: PointMass, distances: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Clearance (N, 4) [m] and velocity of approach (N, 4) [m/s] of the nearest obstacles.
 
-def step(
-    lesson: Callable[[], dict[str, Tensor]],
-    network: torch.nn.Module,
-    optimizer: torch.optim.Optimizer,
-    clip: float,
-) -> dict[str, float]:
-    """One descent of the sum of the terms that `lesson` returns; their values.
-
-    Raises:
-        NotFinite: naming the term or the gradient; the weights are then as before.
+    Args:
+      distances, normals: (N, M) and (N, 3, M) of all obstacles.
     """
-    terms = lesson()
-    for name, term in terms.items():
-        if not torch.isfinite(term):
-            raise NotFinite(f"the term {name!r} of the loss became {term.item()}")
-    optimizer.zero_grad(set_to_none=True)
-    torch.stack(list(terms.values())).sum().backward()
-    norm = torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
-    if not torch.isfinite(norm):
-        raise NotFinite(f"the gradient of the loss became {norm.item()}")
-    optimizer.step()
-    return {name: float(term.detach()) for name, term in terms.items()}
+    nearest = distances.topk(NEAREST, dim=1, largest=False)
+    n = normals.gather(2, nearest.indices[:, None].expand(-1, 3, -1))  # (N, 3, 4)
+    # The value is the distance, and the gradient its normal.
+    along = ((vehicle.p - vehicle.p.detach())[:, :, None] * n).sum(1)
+    approach = -(vehicle.v[:, :, None] * n).sum(1)
+    return nearest.values + along - VEHICLE_RADIUS, approach
