@@ -73,7 +73,7 @@ class Outcomes(NamedTuple):
             "success": float(self.reached.float().mean()),
             "collisions": float(self.collided.float().mean()),
             "left": float(self.left.float().mean()),
-            "clearance": float(self.least_clearance.mean()),
+            "least_clearance": float(self.least_clearance.mean()),
             "speed": float(self.mean_speed.mean()),
         }
 
