@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
 from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK, FOV_X, RATE, decide
+from flysplat.systems.policies.observation import require_poolable
 from flysplat.systems.policies.onboard_camera import OnboardCamera
 from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
@@ -40,12 +41,12 @@ class DiffAeroConfig:
                 f"{DiffAeroConfig.speed}"
             )
         self.camera.validate()
-        rows, columns = DIFFAERO_NETWORK.image_height, DIFFAERO_NETWORK.image_width
-        if self.camera.width % columns or self.camera.height % rows:
-            raise ValueError(
-                f"DiffAeroConfig.camera has {self.camera.width}x{self.camera.height} pixels, but "
-                f"they are pooled to {columns}x{rows}; give whole multiples of these"
-            )
+        require_poolable(
+            self.camera.height,
+            self.camera.width,
+            DIFFAERO_NETWORK.image_height,
+            DIFFAERO_NETWORK.image_width,
+        )
 
 
 class DiffAero(LeafSystem):

@@ -16,12 +16,17 @@ def pooled_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
         ValueError: unless H and W are multiples of height and width.
     """
     H, W = depth.shape
-    if H % height or W % width or not depth.size:
+    require_poolable(H, W, height, width)
+    return depth.reshape(height, H // height, width, W // width).min(axis=(1, 3))
+
+
+def require_poolable(H: int, W: int, height: int, width: int) -> None:
+    """Raises ValueError unless images of H x W pixels can be pooled to height x width."""
+    if H < 1 or W < 1 or H % height or W % width:
         raise ValueError(
             f"the depth image has {W}x{H} pixels, but this policy pools it to {width}x{height}; "
             f"give its camera whole multiples of these, as {4 * width}x{4 * height}"
         )
-    return depth.reshape(height, H // height, width, W // width).min(axis=(1, 3))
 
 
 def inverse_depth(depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
