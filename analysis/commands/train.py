@@ -9,7 +9,7 @@ from flysplat.analysis.commands.overrides import add_overrides
 def add_to(verbs: argparse._SubParsersAction) -> None:
     train = verbs.add_parser("train", help="train a policy that flies by depth")
     train.set_defaults(verb=_train)
-    train.add_argument("policy", choices=["diffaero"], help="which one")
+    train.add_argument("policy", choices=["diffaero", "depthnav"], help="which one")
     train.add_argument(
         "--out",
         type=Path,
@@ -22,12 +22,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from flysplat.diagrams.configuration import load_config
-    from flysplat.training.policies.registry import TRAINEES
+    from flysplat.training.policies.registry import RECIPES
     from flysplat.training.policies.train import run
 
-    config, make = TRAINEES[options.policy]
+    recipe = RECIPES[options.policy]
     run(
-        config=load_config(config(), options.config, options.overrides),
+        config=load_config(recipe.config(), options.config, options.overrides),
         out=options.out,
-        make=make,
+        make=recipe.make,
     )

@@ -28,16 +28,11 @@ from flysplat.systems.policies.diffaero_policy import (
     RATE,
 )
 from flysplat.training.policies import observation
-from flysplat.training.policies.courses import (
-    CourseSelection,
-    training_fields,
-    validation_fields,
-)
-from flysplat.training.policies.flights import FlightConditions, Vehicle, fly_courses
+from flysplat.training.policies.flight_trainee import FlightTraining
+from flysplat.training.policies.flights import Vehicle
 from flysplat.training.policies.network import TrainableNetwork
 from flysplat.training.policies.primitives import PinholeGrid
-from flysplat.training.policies.through_dynamics import FlightSchool, Moment, School
-from flysplat.training.policies.train import Schedule
+from flysplat.training.policies.through_dynamics import Moment
 
 
 @dataclass
@@ -59,36 +54,20 @@ class DiffAeroLoss:
 
 
 @dataclass
-class DiffAeroTraining:
+class DiffAeroTraining(FlightTraining):
     """A training run."""
 
-    # Seed of everything random.
-    seed: int = 0
-    # Where the tensors live: cpu, or cuda.
-    device: str = "cpu"
-    schedule: Schedule = field(default_factory=Schedule)
-    courses: CourseSelection = field(default_factory=CourseSelection)
-    school: FlightSchool = field(default_factory=FlightSchool)
     loss: DiffAeroLoss = field(default_factory=DiffAeroLoss)
-    # How the flights are that choose among checkpoints.
-    validation: FlightConditions = field(default_factory=FlightConditions)
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        self.schedule.validate()
-        self.courses.validate()
-        self.school.validate()
 
 
 class DiffAeroLearner:
     """See `flysplat.training.policies.through_dynamics.Learner`."""
 
+    rate = RATE
+
     def __init__(self, loss: DiffAeroLoss, device: torch.device | str = "cpu") -> None:
         spec = DIFFAERO_NETWORK
-        self.rate = RATE
-        self.grid = PinholeGrid.of(
-            spec.image_width, spec.image_height, float(torch.deg2rad(torch.tensor(FOV_X))), device
-        )
+        self.grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X, device)
         self.network = TrainableNetwork(spec).to(device)
         self._loss = loss
         self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
@@ -131,31 +110,3 @@ class DiffAeroLearner:
             "acceleration": weights.acceleration * moment.a.square().sum(1).mean(),
             "jerk": weights.jerk * moment.jerk.square().sum(1).mean(),
         }
-
-
-class DiffAeroTrainee:
-    """See `flysplat.training.policies.train.Trainee`."""
-
-    policy = "diffaero"
-
-    def __init__(self, config: DiffAeroTraining) -> None:
-        self._learner = DiffAeroLearner(config.loss, config.device)
-        self._config = config
-        self.network, self.spec = self._learner.network, self._learner.network.spec
-        generator = torch.Generator(config.device).manual_seed(config.seed)
-        fields = training_fields(config.courses, config.seed, config.device)
-        self._school = School(self._learner, fields, config.school, generator)
-        self._validation = validation_fields(config.courses, config.device)
-        self.state, self.restore = self._school.state, self._school.restore
-
-    def begin(self, update: int) -> None:
-        pass
-
-    def lesson(self) -> dict[str, Tensor]:
-        return self._school.lesson()
-
-    def measured(self) -> dict[str, float]:
-        outcomes = fly_courses(
-            self._learner, self._validation, self._config.validation, self._config.school.noise
-        )
-        return outcomes.measures()

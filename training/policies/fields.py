@@ -1,6 +1,7 @@
 """What policies train in: procedural worlds with the time of arrival at their goals."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -67,6 +68,7 @@ class Fields:
             device,
         )
         self._voxel_size = voxel_size
+        self._times = None
         if voxel_size is not None:
             grids = [_arrival(course, voxel_size, seed) for seed, course in enumerate(courses)]
             shapes = np.array([grid.times.shape for grid in grids])
@@ -79,12 +81,22 @@ class Fields:
     def __len__(self) -> int:
         return len(self.p_WG)
 
+    def emptied(self) -> "Fields":
+        """The same volumes, starts and goals without shapes, and straight ways."""
+        empty = copy(self)
+        empty.primitives = self.primitives.removed()
+        empty._times = None
+        return empty
+
     def way(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """The direction (N, 3) of the way to the goal at p_WQ (N, 3) [m] in `world` (N,).
 
-        Down the gradient of the time of arrival; straight within a metre of the goal.
+        Down the gradient of the time of arrival; straight within a metre of the goal, and where
+        there is none.
         """
-        assert self._voxel_size is not None
+        to_goal = self.p_WG[world] - p_WQ
+        if self._times is None:
+            return torch.nn.functional.normalize(to_goal, dim=1)
         shape = self._shape[world]
         x = (p_WQ - self.lower_W[world]) / self._voxel_size - 0.5
         x = torch.minimum(x.clamp(min=0.0), shape - 1.001)
@@ -100,7 +112,6 @@ class Fields:
             + step[:, None]
         )
         _, *slopes = trilinear_with_gradient(self._times[corners], *(x - cell).unbind(1))
-        to_goal = self.p_WG[world] - p_WQ
         near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
         downhill = torch.where(near, to_goal, -torch.stack(slopes, 1))
         return torch.nn.functional.normalize(downhill, dim=1)

@@ -145,9 +145,7 @@ def flatness_command(
         max=1.0
     )
     thrust = (f * R_WB[:, :, 2]).sum(1).clamp(control.min_thrust, control.max_thrust)
-    return torch.cat(
-        [thrust[:, None], rates, yaw_rate(yaw, v, control, heading)[:, None]], 1
-    )
+    return torch.cat([thrust[:, None], rates, yaw_rate(yaw, v, control, heading)[:, None]], 1)
 
 
 def yaw_rate(

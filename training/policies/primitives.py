@@ -5,6 +5,7 @@ what the benchmark's worlds are made of. Nothing here is differentiable: images 
 and the gradient of a distance is the normal that is returned with it.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -28,19 +29,30 @@ _PARALLEL = 1e-9
 
 
 class PinholeGrid(NamedTuple):
-    """The rays of a small depth camera that looks along body x, square pixels."""
+    """The rays of a small depth camera that looks along body x."""
 
     directions_C: Tensor  # (R, 3), camera frame, z = 1, row by row
-    half_pixel: float  # half the width of a pixel at depth 1
+    half_pixel: float  # half the width of a pixel at depth 1; of oblong ones, of their mean width
 
     @classmethod
-    def of(cls, width: int, height: int, hfov: float, device: torch.device | str = "cpu"):
-        """`hfov` is the horizontal field of view [rad]."""
-        half_pixel = float(np.tan(hfov / 2) / width)
-        x = half_pixel * (2 * torch.arange(width, device=device) + 1 - width)
-        y = half_pixel * (2 * torch.arange(height, device=device) + 1 - height)
+    def of(
+        cls,
+        width: int,
+        height: int,
+        fov_x: float,
+        device: torch.device | str = "cpu",
+        cell_aspect: float = 1.0,
+    ) -> "PinholeGrid":
+        """The camera of `width` x `height` pixels, `cell_aspect` times as high as wide.
+
+        `fov_x` is the horizontal field of view [deg].
+        """
+        half = math.tan(math.radians(0.5 * fov_x)) / width
+        x = half * (2 * torch.arange(width, device=device) + 1 - width)
+        y = half * cell_aspect * (2 * torch.arange(height, device=device) + 1 - height)
         y, x = torch.meshgrid(y, x, indexing="ij")
-        return cls(torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3), half_pixel)
+        directions = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
+        return cls(directions, 0.5 * half * (1.0 + cell_aspect))
 
 
 class Primitives:
@@ -67,7 +79,7 @@ class Primitives:
         self.spheres = _padded(spheres, 4, device)  # (W, 4, M): centre, radius
         self.cylinders = _padded(cylinders, 8, device)  # centre, axis, half length, radius
         self.boxes = _padded(boxes, 15, device)  # centre, rotation (row-major), half sizes
-        self.planes = _padded(planes, 4, device)  # (W, 4, M): normal, offset
+        self.planes = _padded(planes, 4, device, least=1)  # (W, 4, M): normal, offset
 
     def tensors(self) -> list[Tensor]:
         """All there is, kind by kind."""
@@ -80,6 +92,15 @@ class Primitives:
             kind.index_select(0, world) for kind in self.tensors()
         )
         return chosen
+
+    def removed(self) -> "Primitives":
+        """As many worlds with nothing but their planes, the ground."""
+        empty = object.__new__(Primitives)
+        empty.spheres, empty.cylinders, empty.boxes = (
+            kind[:, :, :0] for kind in self.tensors()[:3]
+        )
+        empty.planes = self.planes
+        return empty
 
     @torch.no_grad()
     def near(self, p_WQ: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,9 +181,11 @@ def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list
     ]
 
 
-def _padded(worlds: list[np.ndarray], size: int, device: torch.device | str) -> Tensor:
-    """(W, size, M), the missing ones far away; M = 0 if no world has any."""
-    most = max(len(rows) for rows in worlds)
+def _padded(
+    worlds: list[np.ndarray], size: int, device: torch.device | str, least: int = 0
+) -> Tensor:
+    """(W, size, M), the missing ones far away; M is what the fullest world has, or `least`."""
+    most = max(least, *(len(rows) for rows in worlds))
     filler = np.zeros(size, dtype=np.float32)
     filler[0] = _FAR
     if size == 4:

@@ -92,7 +92,7 @@ class Flying(NamedTuple):
     age: Tensor  # (N,) [s]
 
 
-class NotFinite(ValueError):
+class NotFiniteError(ValueError):
     """A term of the loss, or the gradient, became infinite or not a number."""
 
 
@@ -222,7 +222,7 @@ def _obstacles(vehicle: PointMass, distances: Tensor, normals: Tensor) -> tuple[
     Args:
       distances, normals: (N, M) and (N, 3, M) of all obstacles.
     """
-    nearest = distances.topk(NEAREST, dim=1, largest=False)
+    nearest = distances.topk(min(NEAREST, distances.shape[1]), dim=1, largest=False)
     n = normals.gather(2, nearest.indices[:, None].expand(-1, 3, -1))  # (N, 3, 4)
     # The value is the distance, and the gradient its normal.
     along = ((vehicle.p - vehicle.p.detach())[:, :, None] * n).sum(1)

@@ -17,7 +17,7 @@ from flysplat.diagrams.configuration import dump_config, load_config
 from flysplat.systems.files import require_writable_folder, written_atomically
 from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
 from flysplat.systems.policies.recurrent_network import NetworkSpec
-from flysplat.training.policies.through_dynamics import NotFinite
+from flysplat.training.policies.through_dynamics import NotFiniteError
 
 
 @dataclass
@@ -179,7 +179,7 @@ def run[Config: TrainingConfig](
             trainee.begin(progress.update)
             try:
                 terms = descend(trainee.lesson, network, optimizer, schedule.clip)
-            except NotFinite as error:
+            except NotFiniteError as error:
                 raise ValueError(
                     f"training stopped at update {progress.update}: {error}; the best weights so "
                     f"far are kept in {out}; lower schedule.learning_rate"
@@ -229,17 +229,17 @@ def descend(
     """One step down the sum of the terms that `lesson` returns; their values.
 
     Raises:
-        NotFinite: naming the term, or the gradient; the weights are then as before.
+        NotFiniteError: naming the term, or the gradient; the weights are then as before.
     """
     terms = lesson()
     for name, term in terms.items():
         if not torch.isfinite(term):
-            raise NotFinite(f"the term {name!r} of the loss became {term.item()}")
+            raise NotFiniteError(f"the term {name!r} of the loss became {term.item()}")
     optimizer.zero_grad(set_to_none=True)
     torch.stack(list(terms.values())).sum().backward()
     norm = torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     if not torch.isfinite(norm):
-        raise NotFinite(f"the gradient of the loss became {norm.item()}")
+        raise NotFiniteError(f"the gradient of the loss became {norm.item()}")
     optimizer.step()
     return {name: float(term.detach()) for name, term in terms.items()}
 
