@@ -106,8 +106,8 @@ class FlatnessController(LeafSystem):
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
     - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now.
     - ``acceleration`` (3): a_WB [m/s^2], the acceleration wanted, gravity excluded.
-    - ``heading`` (1), optional: where body x should point, seen from above [rad] from world x; along
-      the motion where it is not connected or NaN.
+    - ``heading`` (1), optional: where body x should point, seen from above, [rad] from world x;
+      along the motion where it is not connected or NaN.
     - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, held between updates; hover thrust
       before the first.
 

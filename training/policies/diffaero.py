@@ -1,7 +1,7 @@
 """Training DiffAero: analytic gradients of a loss through the dynamics of flight.
 
-After X. Zhang, H. Huang et al., "DiffAero: a GPU-accelerated differentiable simulation framework
-for efficient quadrotor policy learning" (2025). As published: a 16x9 image of depth, a state of nine
+After "DiffAero: A GPU-Accelerated Differentiable Simulation Framework for Efficient Quadrotor
+Policy Learning" (2025). As published: a 16x9 image of depth, a state of nine
 numbers (target velocity, velocity and body z axis in the heading frame), target velocity =
 way / max(distance / speed, 1 s), commanded accelerations of a point mass with a lag, 32 steps of
 flight an update, gradients that decay on their way back, and a loss of velocity (smooth L1 on a
@@ -9,10 +9,10 @@ moving average), nearness of obstacles weighted with the velocity towards them, 
 
 Chosen differently, because it learns faster or flies better here: the convolutional and recurrent
 variant instead of the perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - range / 5 m; the
-nearest surface in each pixel instead of one ray; 15 Hz instead of 30; accelerations without gravity;
-64 environments instead of 1024; the velocity wanted points along the way around obstacles (time of
-arrival) instead of straight at the goal, in the loss alone; the clearance terms of Y. Zhang et al.,
-"Back to Newton's laws" (2025); the benchmark's own kinds of worlds.
+nearest surface in each pixel instead of one ray; 15 Hz instead of 30; accelerations without
+gravity; 64 environments instead of 1024; the velocity wanted points along the way around obstacles
+(time of arrival) instead of straight at the goal, in the loss alone; the clearance terms of "Back
+to Newton's Laws: Learning Vision-based Agile Flight via Differentiable Physics" (2024); the benchmark's own kinds of worlds.
 """
 
 from dataclasses import dataclass, field

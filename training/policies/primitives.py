@@ -76,10 +76,15 @@ class Primitives:
             rows = _rows(shapes, lower - _HELD, upper + _HELD)
             for stack, kind in zip((spheres, cylinders, boxes, planes), rows, strict=True):
                 stack.append(kind)
-        self.spheres = _padded(spheres, 4, device)  # (W, 4, M): centre, radius
-        self.cylinders = _padded(cylinders, 8, device)  # centre, axis, half length, radius
-        self.boxes = _padded(boxes, 15, device)  # centre, rotation (row-major), half sizes
-        self.planes = _padded(planes, 4, device, least=1)  # (W, 4, M): normal, offset
+        tiny, upright = 1e-3, (1, 0, 0, 0, 1, 0, 0, 0, 1)
+        # (W, 4, M): centre, radius
+        self.spheres = _padded(spheres, (_FAR, 0, 0, tiny), device)
+        # (W, 8, M): centre, axis, half length, radius
+        self.cylinders = _padded(cylinders, (_FAR, 0, 0, 0, 0, 1, tiny, tiny), device)
+        # (W, 15, M): centre, rotation row by row, half sizes
+        self.boxes = _padded(boxes, (_FAR, 0, 0, *upright, tiny, tiny, tiny), device)
+        # (W, 4, M): normal, offset; never empty, so that there always is a nearest shape
+        self.planes = _padded(planes, (0, 0, 1, -_FAR), device, least=1)
 
     def tensors(self) -> list[Tensor]:
         """All there is, kind by kind."""
@@ -182,19 +187,11 @@ def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list
 
 
 def _padded(
-    worlds: list[np.ndarray], size: int, device: torch.device | str, least: int = 0
+    worlds: list[np.ndarray], filler: Sequence[float], device: torch.device | str, least: int = 0
 ) -> Tensor:
-    """(W, size, M), the missing ones far away; M is what the fullest world has, or `least`."""
+    """(W, size, M), short worlds filled up; M is the size of the fullest, or `least`."""
     most = max(least, *(len(rows) for rows in worlds))
-    filler = np.zeros(size, dtype=np.float32)
-    filler[0] = _FAR
-    if size == 4:
-        filler[:] = (_FAR, 0.0, 0.0, 1e-3)
-    elif size == 8:
-        filler[:] = (_FAR, 0.0, 0.0, 0.0, 0.0, 1.0, 1e-3, 1e-3)
-    elif size == 15:
-        filler[3:] = (1, 0, 0, 0, 1, 0, 0, 0, 1, 1e-3, 1e-3, 1e-3)
-    stacked = np.tile(filler, (len(worlds), most, 1))
+    stacked = np.tile(np.array(filler, np.float32), (len(worlds), most, 1))
     for target, rows in zip(stacked, worlds, strict=True):
         target[: len(rows)] = rows
     return torch.tensor(stacked, device=device).mT.contiguous()

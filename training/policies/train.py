@@ -1,4 +1,4 @@
-"""Training runs: any policy, resumable, with everything that was done written beside the weights."""
+"""Training runs: any policy, resumable, with all that was done written beside the weights."""
 
 import csv
 import io
