@@ -19,7 +19,7 @@ from flysplat.systems.policies.depthnav_policy import (
 )
 from flysplat.systems.policies.observation import require_poolable
 from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from flysplat.systems.policies.recurrent_network import load_network
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 
@@ -92,7 +92,7 @@ class DepthNav(LeafSystem):
         super().__init__()
         self._config = config = config or DepthNavConfig()
         config.validate()
-        self._network = PolicyCheckpoint.load(config.weights, "depthnav").network(DEPTHNAV_NETWORK)
+        self._network = load_network(config.weights, "depthnav", DEPTHNAV_NETWORK)
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
         self._depth_port = self.DeclareAbstractInputPort(

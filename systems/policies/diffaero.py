@@ -11,7 +11,7 @@ from pydrake.systems.sensors import ImageDepth32F
 from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK, FOV_X, RATE, decide
 from flysplat.systems.policies.observation import require_poolable
 from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from flysplat.systems.policies.recurrent_network import load_network
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 
@@ -79,7 +79,7 @@ class DiffAero(LeafSystem):
         super().__init__()
         self._config = config = config or DiffAeroConfig()
         config.validate()
-        self._network = PolicyCheckpoint.load(config.weights, "diffaero").network(DIFFAERO_NETWORK)
+        self._network = load_network(config.weights, "diffaero", DIFFAERO_NETWORK)
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
         self._depth_port = self.DeclareAbstractInputPort(

@@ -2,14 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flysplat.systems.files import written_atomically
-from flysplat.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
 
 FORMAT = 1
 """Of the file; observations and commands that mean something else make another number."""
@@ -23,29 +22,33 @@ class PolicyCheckpoint:
 
     policy: str
     """Name of the policy, as in the benchmark."""
-    spec: NetworkSpec
+    spec: Any
+    """Architecture of the network, a dataclass."""
     weights: Mapping[str, np.ndarray]
     provenance: dict[str, Any]
-    """How it was made: command, config, seed, revision, time and success, as what JSON can hold."""
+    """How it was made: command, config, seed, revision and success, as what JSON can hold."""
 
     def save(self, path: Path) -> None:
         """Writes `path`, whole or not at all."""
         about = {
             "format": FORMAT,
             "policy": self.policy,
-            "spec": self.spec.to_dict(),
+            "spec": asdict(self.spec),
             "provenance": self.provenance,
         }
         with written_atomically(path) as partial:
             np.savez_compressed(partial, about=json.dumps(about), **self.weights)
 
     @classmethod
-    def load(cls, path: str | Path | None, policy: str) -> "PolicyCheckpoint":
+    def load[Spec](cls, path: str | Path | None, policy: str, spec: Spec) -> "PolicyCheckpoint":
         """Reads the weights of `policy` from a file, those that ship if `path` is None or empty.
+
+        Args:
+            spec: the architecture that the file must be of.
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if it is damaged, or of another policy or version.
+            ValueError: if it is damaged, or of another policy, version or architecture.
         """
         path = Path(path) if path else _SHIPPED / f"{policy}.npz"
         remedy = f"train them with: flysplat train {policy} --out DIR"
@@ -55,31 +58,40 @@ class PolicyCheckpoint:
             with np.load(path, allow_pickle=False) as file:
                 about = json.loads(str(file["about"]))
                 weights = {name: file[name] for name in file.files if name != "about"}
-            found = about["format"], about["policy"]
-            spec = NetworkSpec.from_dict(about["spec"]) if found == (FORMAT, policy) else None
+            found_format, found_policy = about["format"], about["policy"]
+            found_spec, provenance = about["spec"], about["provenance"]
         except Exception as error:
             raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None
-        if spec is None:
+        if (found_format, found_policy) != (FORMAT, policy):
             raise ValueError(
-                f"{path} holds weights of the policy {found[1]!r} in format {found[0]}, but needed "
-                f"is {policy!r} in format {FORMAT}; {remedy}"
+                f"{path} holds weights of the policy {found_policy!r} in format {found_format}, "
+                f"but needed is {policy!r} in format {FORMAT}; {remedy}"
             )
-        return cls(policy, spec, weights, about["provenance"])
-
-    def network(self, expected: NetworkSpec) -> RecurrentNetwork:
-        """The network in the file, which must be of the architecture `expected`.
-
-        Raises:
-            ValueError: if it is not.
-        """
-        if self.spec != expected:
+        expected = json.loads(json.dumps(asdict(spec)))  # type: ignore[arg-type]
+        if found_spec != expected:
             differing = [
-                f"{name} {value} instead of {getattr(expected, name)}"
-                for name, value in self.spec.to_dict().items()
-                if value != expected.to_dict()[name]
+                f"{name} {found_spec.get(name)} instead of {value}"
+                for name, value in expected.items()
+                if found_spec.get(name) != value
             ]
             raise ValueError(
-                f"the weights of {self.policy!r} are of another architecture: "
-                f"{', '.join(differing)}; train them with this version"
+                f"{path} holds weights of another architecture ({', '.join(differing)}); {remedy}"
             )
-        return RecurrentNetwork(self.spec, self.weights)
+        return cls(policy, spec, weights, provenance)
+
+
+def check_weights(
+    weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, np.ndarray]:
+    """The arrays that `shapes` names, in single precision.
+
+    Raises:
+        ValueError: if one is missing, of another shape or not finite.
+    """
+    for name, shape in shapes.items():
+        if name not in weights or weights[name].shape != shape:
+            found = weights[name].shape if name in weights else "missing"
+            raise ValueError(f"the weights {name} are {found}, but must be of shape {shape}")
+        if not np.isfinite(weights[name]).all():
+            raise ValueError(f"the weights {name} are not all finite")
+    return {name: np.asarray(weights[name], np.float32) for name in shapes}

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from flysplat.systems.policies.recurrent_network import LEAK, NetworkSpec
+from flysplat.systems.policies.convolutions import LEAK
+from flysplat.systems.policies.recurrent_network import NetworkSpec
 
 
 class TrainableNetwork(nn.Module):

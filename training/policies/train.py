@@ -16,7 +16,6 @@ from tqdm import tqdm
 from flysplat.diagrams.configuration import dump_config, load_config
 from flysplat.systems.files import require_writable_folder, written_atomically
 from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
-from flysplat.systems.policies.recurrent_network import NetworkSpec
 from flysplat.training.policies.through_dynamics import NotFiniteError
 
 
@@ -71,7 +70,7 @@ class Trainee(Protocol):
     """A policy in training, whatever it learns from."""
 
     policy: str
-    spec: NetworkSpec
+    spec: Any
     network: torch.nn.Module
 
     def begin(self, update: int) -> None:
