@@ -155,9 +155,7 @@ def plan(
     nearest = pooled_depth(depth, spec.image_height, spec.image_width)
     image = 1.0 / np.clip(nearest, NEAREST, FARTHEST)
     R_WB = X_WB.rotation().matrix()
-    observed = state_observation(
-        R_WB, X_WB.translation(), state[3:6], state[10:13], p_WG, speed
-    )
+    observed = state_observation(R_WB, X_WB.translation(), state[3:6], state[10:13], p_WG, speed)
     waypoints_B, costs = network(image, observed)
     hypotheses = Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))
     return _continued(hypotheses, last)
@@ -177,6 +175,4 @@ def _continued(hypotheses: Hypotheses, last: Hypotheses | None) -> Hypotheses:
     chosen = ties[np.argmin(away)]
     costs = costs.copy()
     costs[chosen] = least - 1e-3
-    return Hypotheses(
-        hypotheses.plan_time, hypotheses.X_WB, hypotheses.waypoints_B, costs
-    )
+    return Hypotheses(hypotheses.plan_time, hypotheses.X_WB, hypotheses.waypoints_B, costs)

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 
-from flysplat.diagrams.worlds.forest_config import CLEARANCE, INSET, ForestConfig
-from flysplat.diagrams.worlds.forest_layout import lay_out
-from flysplat.diagrams.worlds.seeds import TRAINING_SEEDS
+from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
+from flysplat.diagrams.worlds.forest import ForestConfig
+from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
+from flysplat.diagrams.worlds.walls import WallsConfig
 from flysplat.training.policies.fields import Course, Fields
 
 VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
@@ -15,9 +15,14 @@ VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
 
 _LARGEST_RUN = 1000  # courses of one training seed
 
-KINDS = {
+KINDS: dict[str, ProceduralConfig] = {
+    "P01": ForestConfig(spacing=5.0, radius_min=0.1, radius_max=0.25),
     "P02": ForestConfig(),
     "P03": ForestConfig(spacing=2.1, radius_min=0.2, radius_max=0.35),
+    "P06": WallsConfig(pattern="big_wall"),
+    "P07": WallsConfig(pattern="u_trap"),
+    "P08": WallsConfig(pattern="slits"),
+    "P09": WallsConfig(pattern="slalom"),
 }
 
 
@@ -49,11 +54,9 @@ class CourseSelection:
 
 def make_course(kind: str, seed: int) -> Course:
     """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
-    config = KINDS[kind]
-    start = np.array([INSET, 0.0, config.flight_height])
-    goal = np.array([config.length - INSET, 0.0, config.flight_height])
-    layout = lay_out(config, np.random.default_rng([seed, 0]), [start[:2], goal[:2]], CLEARANCE)
-    return Course(layout.shapes(), layout.lower, layout.upper, start, goal)
+    plan = make_blueprint(KINDS[kind], seed)
+    shapes = [solid.shape for solid in plan.solids]
+    return Course(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
 
 
 def training_fields(

@@ -20,7 +20,6 @@ from flysplat.training.policies.primitives import Primitives
 STARTS = 256
 """Places that flights of training start from, in each world."""
 
-_MARGIN = 0.05  # [m], least clearance of the way to the goal
 _START_CLEARANCE = 0.3  # [m]
 _NEAR_GOAL = 1.0  # [m], within which the way is straight
 
@@ -126,7 +125,7 @@ def _arrival(course: Course, voxel_size: float, seed: int) -> _Arrival:
     """The time of arrival at the goal of a course, and free places from which it can be reached."""
     field = AnalyticDistanceField(course.shapes, course.lower_W, course.upper_W)
     esdf = esdf_from_distance_field(field, voxel_size).conservative()
-    toa = time_of_arrival(esdf, course.p_WG, _MARGIN)
+    toa = time_of_arrival(esdf, course.p_WG)
     roomy = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
     cells = np.argwhere(roomy)
     if len(cells) == 0:

@@ -85,6 +85,14 @@ class Primitives:
         self.boxes = _padded(boxes, (_FAR, 0, 0, *upright, tiny, tiny, tiny), device)
         # (W, 4, M): normal, offset; never empty, so that there always is a nearest shape
         self.planes = _padded(planes, (0, 0, 1, -_FAR), device, least=1)
+        # (W, 4): whether a world has any of a kind
+        self._has = torch.tensor(
+            [
+                [len(rows) > 0 for rows in world]
+                for world in zip(spheres, cylinders, boxes, planes, strict=True)
+            ],
+            device=device,
+        )
 
     def tensors(self) -> list[Tensor]:
         """All there is, kind by kind."""
@@ -96,6 +104,7 @@ class Primitives:
         chosen.spheres, chosen.cylinders, chosen.boxes, chosen.planes = (
             kind.index_select(0, world) for kind in self.tensors()
         )
+        chosen._has = self._has[world]
         return chosen
 
     def removed(self) -> "Primitives":
@@ -105,6 +114,7 @@ class Primitives:
             kind[:, :, :0] for kind in self.tensors()[:3]
         )
         empty.planes = self.planes
+        empty._has = self._has & torch.tensor([False, False, False, True], device=self._has.device)
         return empty
 
     @torch.no_grad()
@@ -147,13 +157,15 @@ class Primitives:
         depth = torch.full(rays[:, 0].shape, torch.inf, device=rays.device)
         begin = 0
         casts = _cast_spheres, _cast_cylinders, _cast_boxes, _cast_planes
-        for cast, kind in zip(casts, self.tensors(), strict=True):
-            count = kind.shape[2]
-            if count:
-                near = distances[:, begin : begin + count]
-                kind = _in_front(kind, near, p_WC, R_WC[:, :, 2], nearest)
-                torch.minimum(depth, cast(p_WC, R_WC, rays, kind, grid.half_pixel), out=depth)
-            begin += count
+        for cast, kind, has in zip(casts, self.tensors(), self._has.unbind(1), strict=True):
+            near = distances[:, begin : begin + kind.shape[2]]
+            begin += kind.shape[2]
+            rows = has.nonzero()[:, 0]  # few kinds of worlds have all kinds of shapes
+            if len(rows):
+                p, R = p_WC[rows], R_WC[rows]
+                kind = _in_front(kind[rows], near[rows], p, R[:, :, 2], nearest)
+                seen = cast(p, R, rays[rows], kind, grid.half_pixel)
+                depth[rows] = torch.minimum(depth[rows], seen)
         return torch.where(depth < _MISS, depth, torch.inf)
 
 
