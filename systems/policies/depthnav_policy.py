@@ -83,7 +83,8 @@ def decide(
     state = np.concatenate([v_WB @ R_WS, q_SB, v_target @ R_WS, [speed]])
     output, memory = network.step(image, state, memory)
     a_WB = R_WS @ limited_acceleration(output[:3], ACCELERATION_LIMITS)
-    heading = yaw_of(X_WB.rotation().matrix()) + np.pi * np.tanh(float(output[3]) / np.pi)
+    to_goal = atan2(v_target[1], v_target[0])
+    heading = to_goal + np.pi * np.tanh(float(output[3]) / np.pi)
     return Decision(a_WB, heading, memory)
 
 

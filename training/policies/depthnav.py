@@ -10,8 +10,8 @@ collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
 
 Chosen here, where the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles;
 a gradient decay of 0.92 a step of 25 Hz; velocity and attitude quaternion as the state, target
-velocity and speed as the target; the yaw as an angle from the present one, whose loss is 1 - cos of
-its angle to the way; rates from the jerk over gravity.
+velocity and speed as the target; the yaw as an angle from the direction of the goal, whose loss is
+1 - cos of its angle to the way; rates from the jerk over gravity.
 """
 
 from dataclasses import dataclass, field
@@ -115,7 +115,8 @@ class DepthNavLearner:
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
         )
         a_S = observation.limited_acceleration(output[:, :3], self._limits)
-        heading = vehicle.yaw + torch.pi * torch.tanh(output[:, 3] / torch.pi)
+        to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
+        heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
         return (
             (R_WS @ a_S[:, :, None])[:, :, 0],
             heading,
