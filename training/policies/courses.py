@@ -1,29 +1,26 @@
 """The courses that policies train in: of the benchmark's kinds, of seeds that it never uses."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
 
 import torch
 
+from flysplat.diagrams.configuration import load_config
+from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
-from flysplat.diagrams.worlds.forest import ForestConfig
 from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
-from flysplat.diagrams.worlds.walls import WallsConfig
 from flysplat.training.policies.fields import Course, Fields
+
+_SCENARIOS = Path(__file__).parents[2] / "diagrams" / "scenarios"
 
 VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
 """Worlds of the seeds from here on choose among checkpoints and are not trained in either."""
 
 _LARGEST_RUN = 1000  # courses of one training seed
 
-KINDS: dict[str, ProceduralConfig] = {
-    "P01": ForestConfig(spacing=5.0, radius_min=0.1, radius_max=0.25),
-    "P02": ForestConfig(),
-    "P03": ForestConfig(spacing=2.1, radius_min=0.2, radius_max=0.35),
-    "P06": WallsConfig(pattern="big_wall"),
-    "P07": WallsConfig(pattern="u_trap"),
-    "P08": WallsConfig(pattern="slits"),
-    "P09": WallsConfig(pattern="slalom"),
-}
+PROCEDURAL = tuple(sorted(path.stem for path in _SCENARIOS.glob("P*.yaml")))
+"""The scenarios whose worlds are made from seeds."""
 
 
 @dataclass
@@ -31,19 +28,19 @@ class CourseSelection:
     """Which worlds, and how many."""
 
     # Scenarios whose worlds are trained in, in turn; naming one twice doubles its part.
-    kinds: list[str] = field(default_factory=lambda: ["P02", "P03"])
+    kinds: list[str] = field(default_factory=lambda: list(PROCEDURAL))
     # [-] Worlds trained in.
-    count: int = 48
+    count: int = 60
     # [-] Held-out worlds that choose among checkpoints.
-    held_out: int = 64
+    held_out: int = 48
     # [m] Of the grids of the time of arrival.
     voxel_size: float = 0.25
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        unknown = [kind for kind in self.kinds if kind not in PROCEDURAL]
         if unknown or not self.kinds:
-            raise ValueError(f"courses.kinds is {self.kinds}; choose from {', '.join(KINDS)}")
+            raise ValueError(f"courses.kinds is {self.kinds}; choose from {', '.join(PROCEDURAL)}")
         for name in ("count", "held_out"):
             value = getattr(self, name)
             if not 1 <= value <= _LARGEST_RUN:
@@ -54,7 +51,8 @@ class CourseSelection:
 
 def make_course(kind: str, seed: int) -> Course:
     """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
-    plan = make_blueprint(KINDS[kind], seed)
+    world = load_config(Scenario(), _SCENARIOS / f"{kind}.yaml").world
+    plan = make_blueprint(cast(ProceduralConfig, world), seed)
     shapes = [solid.shape for solid in plan.solids]
     return Course(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
 

@@ -8,8 +8,8 @@ an update; AdamW; worlds without obstacles first; the wanted velocity down the g
 of arrival, which only the loss knows; and the weights of the loss: velocity 4 (mean over 2 s),
 collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
 
-Chosen here, where the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles;
-a gradient decay of 0.92 a step of 25 Hz; velocity and attitude quaternion as the state, target
+Chosen here, where the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles,
+40 steps an update; a gradient decay of 0.92 a step of 25 Hz; velocity and attitude quaternion as the state, target
 velocity and speed as the target; the yaw as an angle from the direction of the goal, whose loss is
 1 - cos of its angle to the way; rates from the jerk over gravity.
 """
@@ -60,10 +60,10 @@ class DepthNavLoss:
 class DepthNavTraining(FlightTraining):
     """A training run."""
 
-    schedule: Schedule = field(default_factory=lambda: Schedule(updates=800))
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=1000))
     school: FlightSchool = field(
         default_factory=lambda: FlightSchool(
-            environments=32, steps=75, gradient_decay=0.12, averaging=2.0
+            environments=32, steps=40, gradient_decay=0.12, averaging=2.0
         )
     )
     empty: float = 0.1

@@ -24,12 +24,12 @@ class Schedule:
     """How long training takes and what it leaves."""
 
     # [-] Steps of the optimiser.
-    updates: int = 1000
+    updates: int = 1400
     # [-] Updates between two measurements of the success on held-out courses; the weights of the
     # best are kept.
-    validate_every: int = 100
+    validate_every: int = 200
     # [-] Updates between two checkpoints that training goes on from when it was interrupted.
-    checkpoint_every: int = 50
+    checkpoint_every: int = 100
     # [-] Step size of AdamW, which falls to nothing over the last part `decay` of the updates.
     learning_rate: float = 1e-3
     decay: float = 0.3
