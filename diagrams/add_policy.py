@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pydrake.systems.framework import DiagramBuilder, System
 
 from flysplat.diagrams.worlds.world import World
+from flysplat.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from flysplat.systems.policies.depthnav import DepthNav, DepthNavConfig
 from flysplat.systems.policies.diffaero import DiffAero, DiffAeroConfig
 from flysplat.systems.policies.privileged_planner import PrivilegedPlanner, PrivilegedPlannerConfig
@@ -15,7 +16,12 @@ from flysplat.systems.policies.trajectory_lattice import LatticeConfig
 from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 PolicyConfig = (
-    PrivilegedPlannerConfig | StraightConfig | ReactiveConfig | DiffAeroConfig | DepthNavConfig
+    PrivilegedPlannerConfig
+    | StraightConfig
+    | ReactiveConfig
+    | DiffAeroConfig
+    | DepthNavConfig
+    | AgileAutonomyConfig
 )
 """A configuration has `rate` [Hz] and `validate()`, and `camera`, an `OnboardCamera`, if its policy
 sees. Configurations import without torch."""
@@ -26,6 +32,7 @@ POLICIES: dict[str, Callable[[float], PolicyConfig]] = {
     "reactive": lambda speed: ReactiveConfig(speed=speed),
     "diffaero": lambda speed: DiffAeroConfig(speed=speed),
     "depthnav": lambda speed: DepthNavConfig(speed=speed),
+    "agile_autonomy": lambda speed: AgileAutonomyConfig(speed=speed),
 }
 """By its name, the configuration of each policy that flies at a speed [m/s]."""
 
@@ -71,4 +78,6 @@ def AddPolicy(
             policy = DiffAero(config)
         case DepthNavConfig():
             policy = DepthNav(config)
+        case AgileAutonomyConfig():
+            policy = AgileAutonomy(config)
     return builder.AddNamedSystem("policy", policy)

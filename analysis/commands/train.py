@@ -9,7 +9,9 @@ from flysplat.analysis.commands.overrides import add_overrides
 def add_to(verbs: argparse._SubParsersAction) -> None:
     train = verbs.add_parser("train", help="train a policy that flies by depth")
     train.set_defaults(verb=_train)
-    train.add_argument("policy", choices=["diffaero", "depthnav"], help="which one")
+    train.add_argument(
+        "policy", choices=["diffaero", "depthnav", "agile_autonomy"], help="which one"
+    )
     train.add_argument(
         "--out",
         type=Path,

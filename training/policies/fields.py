@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
 from flysplat.systems.collision.shapes import Shape
 from flysplat.systems.collision.trilinear import trilinear_with_gradient
-from flysplat.systems.policies.time_of_arrival import time_of_arrival
+from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from flysplat.training.policies.primitives import Primitives
 
@@ -70,9 +71,10 @@ class Fields:
         self._times = None
         if voxel_size is not None:
             grids = [_arrival(course, voxel_size, seed) for seed, course in enumerate(courses)]
-            shapes = np.array([grid.times.shape for grid in grids])
+            self.maps = [(grid.esdf, grid.toa) for grid in grids]
+            shapes = np.array([grid.toa.times.shape for grid in grids])
             sizes = shapes.prod(1)
-            self._times = tensor(np.concatenate([grid.times.ravel() for grid in grids]))
+            self._times = tensor(np.concatenate([grid.toa.times.ravel() for grid in grids]))
             self._first = torch.tensor(np.cumsum(sizes) - sizes, device=device)  # (W,)
             self._shape = torch.tensor(shapes, device=device)  # (W, 3)
             self.starts_W = tensor([grid.starts_W for grid in grids])  # (W, STARTS, 3) [m]
@@ -117,7 +119,8 @@ class Fields:
 
 
 class _Arrival(NamedTuple):
-    times: np.ndarray  # (nx, ny, nz) [s]
+    esdf: Esdf  # conservative
+    toa: TimeOfArrival
     starts_W: np.ndarray  # (STARTS, 3) [m]
 
 
@@ -132,4 +135,4 @@ def _arrival(course: Course, voxel_size: float, seed: int) -> _Arrival:
         raise ValueError("no place in the course has room to start from; make it less dense")
     rng = np.random.default_rng(seed)
     starts = cells[rng.integers(len(cells), size=STARTS)] + 0.5
-    return _Arrival(toa.times, course.lower_W + voxel_size * starts)
+    return _Arrival(esdf, toa, course.lower_W + voxel_size * starts)

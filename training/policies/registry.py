@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from flysplat.training.policies.agile_autonomy import AgileTrainee, AgileTraining
 from flysplat.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from flysplat.training.policies.flight_trainee import FlightTrainee
@@ -29,4 +30,5 @@ def _depthnav(config: DepthNavTraining) -> Trainee:
 RECIPES = {
     "diffaero": Recipe(DiffAeroTraining, _diffaero),
     "depthnav": Recipe(DepthNavTraining, _depthnav),
+    "agile_autonomy": Recipe(AgileTraining, AgileTrainee),
 }
