@@ -3,15 +3,15 @@
 After "Quadrotor Navigation using Reinforcement Learning with Privileged Information" (2025,
 arXiv:2509.08177). As published: depth of 128x72 pixels from 0.25 to 20 m, inverted and
 max-pooled to 16x12; state and target in the frame of the start; convolutions of 32, 64 and 128
-channels and a gated recurrent unit of 192; commanded acceleration and yaw; three seconds of flight
-an update; AdamW; worlds without obstacles first; the wanted velocity down the gradient of the time
+channels and a gated recurrent unit of 192; commanded acceleration and yaw; AdamW; worlds without obstacles first; the wanted velocity down the gradient of the time
 of arrival, which only the loss knows; and the weights of the loss: velocity 4 (mean over 2 s),
 collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
 
 Chosen here, where the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles,
-40 steps an update; a gradient decay of 0.92 a step of 25 Hz; velocity and attitude quaternion as the state, target
-velocity and speed as the target; the yaw as an angle from the direction of the goal, whose loss is
-1 - cos of its angle to the way; rates from the jerk over gravity.
+40 steps an update instead of 150; a gradient decay of 0.92 a step of 25 Hz; velocity and attitude
+quaternion as the state, target velocity and speed as the target; the yaw as an angle from the
+direction of the goal, whose loss is 1 - cos of its angle to the way; rates from the jerk over
+gravity.
 """
 
 from dataclasses import dataclass, field

@@ -12,11 +12,12 @@ variant instead of the perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - r
 nearest surface in each pixel instead of one ray; 15 Hz instead of 30; accelerations without
 gravity; 64 environments instead of 1024; the velocity wanted points along the way around obstacles
 (time of arrival) instead of straight at the goal, in the loss alone; the clearance terms of "Back
-to Newton's Laws: Learning Vision-based Agile Flight via Differentiable Physics" (2024); the benchmark's own
-kinds of worlds.
+to Newton's Laws: Learning Vision-based Agile Flight via Differentiable Physics" (2024); the
+benchmark's own kinds of worlds.
 """
 
 from dataclasses import dataclass, field
+
 import torch
 from torch import Tensor
 

@@ -144,6 +144,7 @@ def run[Config: TrainingConfig](
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
     )
+    revision = git_revision()
     progress = _Progress()
     checkpoint = out / "checkpoint.pt"
     if checkpoint.exists():
@@ -198,7 +199,7 @@ def run[Config: TrainingConfig](
                         writer.add_scalar(name, value, progress.update)
                 if measured["success"] >= progress.best.get("success", -1.0):
                     progress.best = {"update": progress.update, **measured}
-                    _export(out, trainee, text, progress)
+                    _export(out, trainee, text, revision, progress)
             if due or progress.update % schedule.checkpoint_every == 0:
                 save()
     save()
@@ -253,12 +254,12 @@ def git_revision() -> str:
     return answer.stdout.strip()
 
 
-def _export(out: Path, trainee: Trainee, config: str, progress: _Progress) -> None:
+def _export(out: Path, trainee: Trainee, config: str, revision: str, progress: _Progress) -> None:
     weights = {name: w.detach().cpu().numpy() for name, w in trainee.network.state_dict().items()}
     provenance = {
         "command": f"flysplat train {trainee.policy}",
         "config": config,
-        "revision": git_revision(),
+        "revision": revision,
         "torch": torch.__version__,
         "best": progress.best,
     }
