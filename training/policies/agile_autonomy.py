@@ -58,7 +58,7 @@ class AgileTraining:
     # Where the tensors live: cpu, or cuda.
     device: str = "cpu"
     schedule: Schedule = field(
-        default_factory=lambda: Schedule(updates=4000, validate_every=500, checkpoint_every=500)
+        default_factory=lambda: Schedule(updates=3000, validate_every=500, checkpoint_every=500)
     )
     courses: CourseSelection = field(default_factory=CourseSelection)
     # [-] Rounds of data: in the first the expert flies, then the student more and more.

@@ -1,11 +1,12 @@
 """Training DepthNav: through the dynamics, to where the time of arrival falls, nose first.
 
 After "Quadrotor Navigation using Reinforcement Learning with Privileged Information" (2025,
-arXiv:2509.08177). As published: depth of 128x72 pixels from 0.25 to 20 m, inverted and
-max-pooled to 16x12; state and target in the frame of the start; convolutions of 32, 64 and 128
-channels and a gated recurrent unit of 192; commanded acceleration and yaw; AdamW; worlds without obstacles first; the wanted velocity down the gradient of the time
-of arrival, which only the loss knows; and the weights of the loss: velocity 4 (mean over 2 s),
-collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
+arXiv:2509.08177). As published: depth of 128x72 pixels from 0.25 to 20 m, inverted and max-pooled to
+16x12; state and target in the frame of the start; convolutions of 32, 64 and 128 channels and a
+gated recurrent unit of 192; commanded acceleration and yaw; AdamW; worlds without obstacles first;
+the wanted velocity down the gradient of the time of arrival, which only the loss knows; and the
+weights of the loss: velocity 4 (mean over 2 s), collision 6, acceleration 0.01, jerk 0.001, rates
+0.3, yaw 4.
 
 Chosen here, where the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles,
 40 steps an update instead of 150; a gradient decay of 0.92 a step of 25 Hz; velocity and attitude
@@ -60,7 +61,7 @@ class DepthNavLoss:
 class DepthNavTraining(FlightTraining):
     """A training run."""
 
-    schedule: Schedule = field(default_factory=lambda: Schedule(updates=1000))
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=600))
     school: FlightSchool = field(
         default_factory=lambda: FlightSchool(
             environments=32, steps=40, gradient_decay=0.12, averaging=2.0
@@ -84,7 +85,7 @@ class DepthNavLearner:
             device,
             cell_aspect=(IMAGE_SIZE[1] / spec.image_height) / (IMAGE_SIZE[0] / spec.image_width),
         )
-        self.network = TrainableNetwork(spec).to(device)
+        self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
         self._loss = loss
         self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
 

@@ -17,17 +17,20 @@ from flysplat.systems.policies.recurrent_network import NetworkSpec
 
 
 class TrainableNetwork(nn.Module):
-    """The network of `spec`, with the names and shapes of weights that `RecurrentNetwork` takes."""
+    """The network of `spec`, with the names and shapes of weights that `RecurrentNetwork` takes.
 
-    def __init__(self, spec: NetworkSpec) -> None:
+    `head_scale` multiplies the head's first weights: small ones begin with about hovering.
+    """
+
+    def __init__(self, spec: NetworkSpec, head_scale: float = 0.1) -> None:
         super().__init__()
         self.spec = spec
         self.convolutions = _convolutions(spec.convolutions)
         self.state_layer = nn.Linear(spec.state_size, spec.state_features)
         self.memory = nn.GRUCell(spec.image_features() + spec.state_features, spec.hidden_size)
         self.head = nn.Linear(spec.hidden_size, spec.output_size)
-        with torch.no_grad():  # begins with about hovering
-            self.head.weight.mul_(0.1)
+        with torch.no_grad():
+            self.head.weight.mul_(head_scale)
             self.head.bias.zero_()
 
     def forward(self, image: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
