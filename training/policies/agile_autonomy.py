@@ -200,8 +200,8 @@ class AgileTrainee:
         """The mean collision cost (N, M) of trajectories (N, M, 10, 3) [m] in the body frame."""
         N, M = waypoints_B.shape[:2]
         points = waypoints_B.flatten(1, 2) @ sample["R_WB"].mT + sample["p_WB"][:, None]
-        primitives = self._fields.primitives.of(sample["world"])
-        clearance = primitives.clearances(points) - VEHICLE_RADIUS
+        world = sample["world"].repeat_interleave(points.shape[1])
+        clearance = self._fields.distance(points.flatten(0, 1), world) - VEHICLE_RADIUS
         return collision_cost(clearance).reshape(N, M, -1).mean(2)
 
     @torch.no_grad()

@@ -1,7 +1,7 @@
 """Training DepthNav: through the dynamics, to where the time of arrival falls, nose first.
 
 After "Quadrotor Navigation using Reinforcement Learning with Privileged Information" (2025,
-arXiv:2509.08177). As published: depth of 128x72 pixels from 0.25 to 20 m, inverted and max-pooled to
+arXiv:2509.08177). As published: depth of 128x72 pixels, 0.25 to 20 m, inverted and max-pooled to
 16x12; state and target in the frame of the start; convolutions of 32, 64 and 128 channels and a
 gated recurrent unit of 192; commanded acceleration and yaw; AdamW; worlds without obstacles first;
 the wanted velocity down the gradient of the time of arrival, which only the loss knows; and the

@@ -74,6 +74,9 @@ class Fields:
             self.maps = [(grid.esdf, grid.toa) for grid in grids]
             shapes = np.array([grid.toa.times.shape for grid in grids])
             sizes = shapes.prod(1)
+            self._distances = tensor(
+                np.concatenate([grid.esdf.distances.ravel() for grid in grids])
+            )
             self._times = tensor(np.concatenate([grid.toa.times.ravel() for grid in grids]))
             self._first = torch.tensor(np.cumsum(sizes) - sizes, device=device)  # (W,)
             self._shape = torch.tensor(shapes, device=device)  # (W, 3)
@@ -98,6 +101,19 @@ class Fields:
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
             return torch.nn.functional.normalize(to_goal, dim=1)
+        _, *slopes = self._interpolated(self._times, p_WQ, world)
+        near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
+        downhill = torch.where(near, to_goal, -torch.stack(slopes, 1))
+        return torch.nn.functional.normalize(downhill, dim=1)
+
+    def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
+        """Signed distance (N,) [m] at p_WQ (N, 3) [m] in `world` (N,), from the grid: the bounds of
+        the volume count as surfaces, and it costs the same however many shapes there are."""
+        return self._interpolated(self._distances, p_WQ, world)[0]
+
+    def _interpolated(self, grid: Tensor, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, ...]:
+        """Value and slopes (N,) each of a grid, by voxels, at p_WQ (N, 3)."""
+        assert self._voxel_size is not None
         shape = self._shape[world]
         x = (p_WQ - self.lower_W[world]) / self._voxel_size - 0.5
         x = torch.minimum(x.clamp(min=0.0), shape - 1.001)
@@ -112,10 +128,7 @@ class Fields:
             + step[:, None, None] * stride_y
             + step[:, None]
         )
-        _, *slopes = trilinear_with_gradient(self._times[corners], *(x - cell).unbind(1))
-        near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
-        downhill = torch.where(near, to_goal, -torch.stack(slopes, 1))
-        return torch.nn.functional.normalize(downhill, dim=1)
+        return trilinear_with_gradient(grid[corners], *(x - cell).unbind(1))
 
 
 class _Arrival(NamedTuple):

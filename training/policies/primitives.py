@@ -133,12 +133,6 @@ class Primitives:
         return torch.cat([d for d, _ in parts], 1), torch.cat([n for _, n in parts], 2)
 
     @torch.no_grad()
-    def clearances(self, p_WQ: Tensor) -> Tensor:
-        """Signed distance (N, Q) [m] to the nearest shape at p_WQ (N, Q, 3); row n in world n."""
-        columns = [self.near(p_WQ[:, q])[0].amin(1) for q in range(p_WQ.shape[1])]
-        return torch.stack(columns, 1)
-
-    @torch.no_grad()
     def depth(
         self,
         p_WC: Tensor,
