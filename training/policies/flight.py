@@ -135,28 +135,43 @@ def flatness_command(
     f = f * (control.max_thrust / f.norm(dim=1, keepdim=True)).clamp(max=1.0)
 
     R_WB = rotation_of(state[:, 6:10])
-    yaw = torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0])
-    z_B = (R_WB.mT @ f[:, :, None])[:, :, 0]  # the wanted thrust in the body frame
-    sine = z_B[:, :2].norm(dim=1)
-    angle = torch.atan2(sine, z_B[:, 2])
-    tilt = torch.stack([-z_B[:, 1], z_B[:, 0]], 1) * (angle / sine.clamp(min=1e-6))[:, None]
-    rates = control.tilt_gain * tilt
+    heading, pull = heading_and_pull(v, control, heading)
+    R_BD = R_WB.mT @ attitude_from_thrust(f, heading)
+    # First the shortest turn of the body's z axis, about n in its x-y plane, then yaw.
+    z1, z2, z3 = R_BD[:, :, 2].unbind(1)
+    sine = torch.sqrt(z1 * z1 + z2 * z2 + 1e-12)
+    angle = torch.atan2(sine, z3)
+    n1, n2 = -z2 / sine, z1 / sine
+    rates = control.tilt_gain * torch.stack([angle * n1, angle * n2], 1)
     rates = rates * (control.max_tilt_rate / rates.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(
         max=1.0
     )
+    x1, x2, x3 = R_BD[:, :, 0].unbind(1)
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    along = (n1 * x1 + n2 * x2) * (1.0 - cosine)
+    ahead = cosine * x1 - sine * n2 * x3 + along * n1
+    left = cosine * x2 + sine * n1 * x3 + along * n2
+    yaw = control.yaw_gain * pull * torch.atan2(left, ahead)
+    yaw = yaw.clamp(-control.max_yaw_rate, control.max_yaw_rate)
     thrust = (f * R_WB[:, :, 2]).sum(1).clamp(control.min_thrust, control.max_thrust)
-    return torch.cat([thrust[:, None], rates, yaw_rate(yaw, v, control, heading)[:, None]], 1)
+    return torch.cat([thrust[:, None], rates, yaw[:, None]], 1)
+
+
+def heading_and_pull(
+    v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Where to look (N,) [rad], `heading` or along the velocity, and how strongly (N,), 0 to 1."""
+    if heading is not None:
+        return heading, torch.ones_like(heading)
+    pull = (v[:, :2].norm(dim=1) / control.yaw_speed).clamp(max=1.0).square()
+    return torch.atan2(v[:, 1], v[:, 0]), pull
 
 
 def yaw_rate(
     yaw: Tensor, v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
 ) -> Tensor:
-    """The controller's yaw rate (N,) [rad/s]: to `heading` (N,), or along the velocity."""
-    if heading is None:
-        pull = (v[:, :2].norm(dim=1) / control.yaw_speed).clamp(max=1.0).square()
-        heading = torch.atan2(v[:, 1], v[:, 0])
-    else:
-        pull = torch.ones_like(yaw)
+    """The controller's yaw rate (N,) [rad/s] of level vehicles at `yaw` (N,) [rad]."""
+    heading, pull = heading_and_pull(v, control, heading)
     error = torch.remainder(heading - yaw + torch.pi, 2 * torch.pi) - torch.pi
     return (control.yaw_gain * pull * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
 

@@ -101,6 +101,7 @@ class _Progress:
     update: int = 0
     cpu_seconds: float = 0.0
     best: dict[str, Any] = field(default_factory=dict)
+    means: dict[str, float] = field(default_factory=dict)
     curves: list[dict[str, float]] = field(default_factory=list)
 
 
@@ -151,7 +152,6 @@ def run[Config: TrainingConfig](
         progress = _resumed(checkpoint, trainee, optimizer)
     spent_before = progress.cpu_seconds
     writer = _tensorboard(out) if schedule.tensorboard else None
-    means: dict[str, float] = {}
 
     def save() -> None:
         progress.cpu_seconds = spent_before + time.process_time() - started
@@ -186,6 +186,7 @@ def run[Config: TrainingConfig](
                 ) from None
             progress.update += 1
             bar.update()
+            means = progress.means
             for name, value in terms.items():
                 means[name] = value if name not in means else 0.98 * means[name] + 0.02 * value
             due = progress.update % schedule.validate_every == 0
