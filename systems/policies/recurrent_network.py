@@ -98,7 +98,7 @@ class RecurrentNetwork:
                     f"{shape}"
                 )
         x = self._convolutions(image)
-        state = np.asarray(state, np.float32)
+        state, hidden = np.asarray(state, np.float32), np.asarray(hidden, np.float32)
         features = rectified(w["state_layer.weight"] @ state + w["state_layer.bias"])
         features = np.concatenate([x, features])
         H = spec.hidden_size

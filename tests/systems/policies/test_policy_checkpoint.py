@@ -41,7 +41,7 @@ def test_other_files_are_refused_with_the_remedy(path, tmp_path):
     with pytest.raises(ValueError, match="'diffaero' in format 1, but needed is 'depthnav'"):
         load_network(str(path), "depthnav", DIFFAERO_NETWORK)
     wider = replace(DIFFAERO_NETWORK, hidden_size=96)
-    with pytest.raises(ValueError, match="another architecture .hidden_size 128 instead of 96"):
+    with pytest.raises(ValueError, match=r"another architecture \(hidden_size 128 instead of 96"):
         load_network(str(path), "diffaero", wider)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=r"policy.npz holds no weights of a policy"):
