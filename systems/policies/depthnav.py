@@ -99,8 +99,8 @@ class DepthNav(LeafSystem):
             "depth_image_32f", Value(ImageDepth32F(config.camera.width, config.camera.height))
         )
         self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
-        self.DeclareStateOutputPort("heading", self.DeclareDiscreteState([np.nan]))
-        self._start_yaw = self.DeclareDiscreteState([np.nan])
+        self.DeclareStateOutputPort("heading", self.DeclareDiscreteState(np.full(1, np.nan)))
+        self._start_yaw = self.DeclareDiscreteState(np.full(1, np.nan))
         self._memory = self.DeclareDiscreteState(self._network.initial_hidden())
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
 
@@ -108,7 +108,7 @@ class DepthNav(LeafSystem):
         state = np.asarray(self._state_port.Eval(context))
         image = cast(ImageDepth32F, self._depth_port.Eval(context))
         X_WB = pose_from_state(state)
-        start_yaw = float(context.get_discrete_state(self._start_yaw).value()[0])
+        start_yaw = float(context.get_discrete_state(int(self._start_yaw)).value()[0])
         if np.isnan(start_yaw):
             start_yaw = yaw_of(X_WB.rotation().matrix())
         decision = decide(
@@ -119,9 +119,9 @@ class DepthNav(LeafSystem):
             np.asarray(self._goal_port.Eval(context)),
             self._config.speed,
             start_yaw,
-            np.asarray(context.get_discrete_state(self._memory).value()),
+            np.asarray(context.get_discrete_state(int(self._memory)).value()),
         )
         discrete_state.set_value(0, decision.a_WB)
-        discrete_state.set_value(1, [decision.heading])
-        discrete_state.set_value(int(self._start_yaw), [start_yaw])
+        discrete_state.set_value(1, np.array([decision.heading]))
+        discrete_state.set_value(int(self._start_yaw), np.array([start_yaw]))
         discrete_state.set_value(int(self._memory), decision.memory)

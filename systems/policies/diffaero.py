@@ -99,7 +99,7 @@ class DiffAero(LeafSystem):
             state[3:6],
             np.asarray(self._goal_port.Eval(context)),
             self._config.speed,
-            np.asarray(context.get_discrete_state(self._memory).value()),
+            np.asarray(context.get_discrete_state(int(self._memory)).value()),
         )
         discrete_state.set_value(0, a_WB)
         discrete_state.set_value(int(self._memory), memory)

@@ -37,10 +37,11 @@ class PolicyCheckpoint:
             "provenance": self.provenance,
         }
         with written_atomically(path) as partial:
-            np.savez_compressed(partial, about=json.dumps(about), **self.weights)
+            arrays: dict[str, Any] = dict(self.weights)
+            np.savez_compressed(partial, about=json.dumps(about), **arrays)
 
     @classmethod
-    def load[Spec](cls, path: str | Path | None, policy: str, spec: Spec) -> "PolicyCheckpoint":
+    def load(cls, path: str | Path | None, policy: str, spec: Any) -> "PolicyCheckpoint":
         """Reads the weights of `policy` from a file, those that ship if `path` is None or empty.
 
         Args:
@@ -67,7 +68,7 @@ class PolicyCheckpoint:
                 f"{path} holds weights of the policy {found_policy!r} in format {found_format}, "
                 f"but needed is {policy!r} in format {FORMAT}; {remedy}"
             )
-        expected = json.loads(json.dumps(asdict(spec)))  # type: ignore[arg-type]
+        expected = json.loads(json.dumps(asdict(spec)))
         if found_spec != expected:
             differing = [
                 f"{name} {found_spec.get(name)} instead of {value}"

@@ -1,4 +1,4 @@
-"""Rollouts to imitate: an expert flies, and at moments of its flight says what the best ways are."""
+"""Rollouts to imitate: an expert flies, and along its flight says what the best ways are."""
 
 from dataclasses import dataclass, replace
 
@@ -105,7 +105,7 @@ def expert_rollout(scenario: Scenario, world: World, config: ExpertConfig) -> Ex
         return None
     moments = np.arange(0.0, flight.times[-1], config.period)
     rows = np.searchsorted(flight.times, moments - 1e-9)
-    labels = [labeller.label(flight.times[row], flight.states[row]) for row in rows]
+    labels = [labeller.label(float(flight.times[row]), flight.states[row]) for row in rows]
     return ExpertRollout(
         flight,
         goal_of(scenario, world),

@@ -71,7 +71,9 @@ class Trainee(Protocol):
 
     policy: str
     spec: Any
-    network: torch.nn.Module
+
+    @property
+    def network(self) -> torch.nn.Module: ...
 
     def begin(self, update: int) -> None:
         """Called before each update with its number."""
