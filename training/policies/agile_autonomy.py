@@ -184,9 +184,9 @@ class AgileTrainee:
 
     def measured(self) -> dict[str, float]:
         config = self._config
-        return fly_courses(
-            self._pilot, self._validation, config.validation, config.noise
-        ).measures()
+        return fly_courses(self._pilot, self._validation, config.validation, config.noise).measures(
+            config.courses.kinds
+        )
 
     def state(self) -> dict[str, Any]:
         return {"data": self._data, "generator": self._generator.get_state()}

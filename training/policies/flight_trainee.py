@@ -67,7 +67,7 @@ class FlightTrainee:
         config = self._config
         return fly_courses(
             self._learner, self._validation, config.validation, config.school.noise
-        ).measures()
+        ).measures(config.courses.kinds)
 
     def state(self) -> dict[str, Any]:
         schools = [school for school in (self._main, self._empty) if school is not None]

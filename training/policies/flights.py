@@ -66,15 +66,22 @@ class Outcomes(NamedTuple):
     least_clearance: Tensor  # (N,) [m]
     mean_speed: Tensor  # (N,) [m/s]
 
-    def measures(self) -> dict[str, float]:
+    def measures(self, kinds: list[str] | None = None) -> dict[str, float]:
         """Parts of the flights that reached the goal, collided and left; what remains took too
-        long. Means of least clearance [m] and speed [m/s]."""
+        long. Means of least clearance [m] and speed [m/s]. Flight n is of kind n modulo their
+        number, and success is also given for each of `kinds`."""
+        each = {
+            kind: float(self.reached[i :: len(kinds)].float().mean())
+            for i, kind in enumerate(kinds or [])
+            if kinds and i < len(self.reached)
+        }
         return {
             "success": float(self.reached.float().mean()),
             "collisions": float(self.collided.float().mean()),
             "left": float(self.left.float().mean()),
             "least_clearance": float(self.least_clearance.mean()),
             "speed": float(self.mean_speed.mean()),
+            **each,
         }
 
 

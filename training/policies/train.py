@@ -115,7 +115,7 @@ def run[Config: TrainingConfig](
 
     Leaves in `out`: `POLICY.npz`, the weights that did best on held-out courses, for
     `PolicyCheckpoint`; `config.yaml`; `curves.csv`, the terms of the loss and the success over the
-    updates; `summary.json`; `checkpoint.pt`, to go on from.
+    updates; `POLICY.md`, a model card; `summary.json`; `checkpoint.pt`, to go on from.
 
     Args:
         config: with its seed it decides the result: on a CPU the same weights, bit for bit,
@@ -196,7 +196,7 @@ def run[Config: TrainingConfig](
                 measured = trainee.measured()
                 row = {"update": float(progress.update), **means, **measured}
                 progress.curves.append(row)
-                bar.set_postfix({name: f"{value:.2f}" for name, value in measured.items()})
+                bar.set_postfix(success=f"{measured['success']:.2f}")
                 if writer is not None:
                     for name, value in row.items():
                         writer.add_scalar(name, value, progress.update)
@@ -215,6 +215,8 @@ def run[Config: TrainingConfig](
     }
     with written_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=2) + "\n")
+    with written_atomically(out / f"{trainee.policy}.md") as path:
+        path.write_text(model_card(summary, text, revision))
     print(
         f"{trainee.policy}: success {progress.best['success']:.0%} on held-out courses after "
         f"{progress.best['update']} of {progress.update} updates, "
@@ -245,6 +247,30 @@ def descend(
         raise NotFiniteError(f"the gradient of the loss became {norm.item()}")
     optimizer.step()
     return {name: float(term.detach()) for name, term in terms.items()}
+
+
+def model_card(summary: dict[str, Any], config: str, revision: str) -> str:
+    """What there is to know of trained weights, as Markdown."""
+    policy, best = summary["policy"], summary["best"]
+    measures = "\n".join(
+        f"| {name} | {value:.2f} |" for name, value in best.items() if name != "update"
+    )
+    return f"""# {policy}
+
+Made by `flysplat train {policy} --out DIR --config CONFIG` with the configuration below at revision
+{revision} of the source, in {summary["cpu_minutes"]:.1f} minutes of one core; {summary["updates"]}
+updates, of which the weights after {best["update"]} did best on held-out courses.
+
+| on held-out courses, simulated as in training | |
+|---|---|
+{measures}
+
+`success` is the part that reached the goal; `collisions` and `left` (the volume) are the failures
+that are not for lack of time; a scenario's name stands before the success in worlds of its kind.
+
+```yaml
+{config}```
+"""
 
 
 def git_revision() -> str:
