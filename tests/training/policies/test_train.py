@@ -26,16 +26,16 @@ from flysplat.training.policies.registry import RECIPES
 from flysplat.training.policies.train import Schedule, run
 
 TINY = [
-    "courses.kinds=[P01]",
-    "courses.count=2",
-    "courses.held_out=2",
-    "courses.voxel_size=0.4",
+    "courses.kinds=[P10]",
+    "courses.count=1",
+    "courses.held_out=1",
+    "courses.voxel_size=0.5",
     "school.environments=4",
     "school.steps=4",
     "schedule.updates=6",
     "schedule.validate_every=3",
     "schedule.checkpoint_every=2",
-    "validation.patience=0.2",
+    "validation.patience=0.3",
 ]
 
 
