@@ -5,6 +5,9 @@ from collections.abc import Callable
 from pydrake.systems.framework import DiagramBuilder, System
 
 from flysplat.diagrams.worlds.world import World
+from flysplat.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from flysplat.systems.policies.depthnav import DepthNav, DepthNavConfig
+from flysplat.systems.policies.diffaero import DiffAero, DiffAeroConfig
 from flysplat.systems.policies.privileged_planner import PrivilegedPlanner, PrivilegedPlannerConfig
 from flysplat.systems.policies.reactive import Reactive
 from flysplat.systems.policies.reactive_planner import ReactiveConfig
@@ -12,7 +15,14 @@ from flysplat.systems.policies.straight import Straight, StraightConfig
 from flysplat.systems.policies.trajectory_lattice import LatticeConfig
 from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
-PolicyConfig = PrivilegedPlannerConfig | StraightConfig | ReactiveConfig
+PolicyConfig = (
+    PrivilegedPlannerConfig
+    | StraightConfig
+    | ReactiveConfig
+    | DiffAeroConfig
+    | DepthNavConfig
+    | AgileAutonomyConfig
+)
 """A configuration has `rate` [Hz] and `validate()`, and `camera`, an `OnboardCamera`, if its policy
 sees. Configurations import without torch."""
 
@@ -20,6 +30,9 @@ POLICIES: dict[str, Callable[[float], PolicyConfig]] = {
     "planner": lambda speed: PrivilegedPlannerConfig(lattice=LatticeConfig(speed=speed)),
     "straight": lambda speed: StraightConfig(speed=speed),
     "reactive": lambda speed: ReactiveConfig(speed=speed),
+    "diffaero": lambda speed: DiffAeroConfig(speed=speed),
+    "depthnav": lambda speed: DepthNavConfig(speed=speed),
+    "agile_autonomy": lambda speed: AgileAutonomyConfig(speed=speed),
 }
 """By its name, the configuration of each policy that flies at a speed [m/s]."""
 
@@ -45,7 +58,8 @@ def AddPolicy(
 
     A policy has the inputs `state` and `goal`, and `depth_image_32f` or `color_image` if it sees
     through the camera `config.camera`; and one of the outputs `hypotheses` (see
-    `flysplat.systems.policies.hypotheses`), `acceleration` (3) and `waypoint` (3).
+    `flysplat.systems.policies.hypotheses`), `acceleration` (3) and `waypoint` (3); beside
+    these it may have `heading` (1), where to look.
 
     Args:
         builder: of the diagram.
@@ -60,4 +74,10 @@ def AddPolicy(
             policy = Straight(config)
         case ReactiveConfig():
             policy = Reactive(config)
+        case DiffAeroConfig():
+            policy = DiffAero(config)
+        case DepthNavConfig():
+            policy = DepthNav(config)
+        case AgileAutonomyConfig():
+            policy = AgileAutonomy(config)
     return builder.AddNamedSystem("policy", policy)

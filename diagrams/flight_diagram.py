@@ -181,6 +181,8 @@ def _ConnectDecision(
     else:
         kind = "acceleration" if policy.HasOutputPort("acceleration") else "waypoint"
         builder.Connect(policy.GetOutputPort(kind), controller.GetInputPort(kind))
+    if policy.HasOutputPort("heading"):
+        builder.Connect(policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
 
 
 def goal_of(scenario: Scenario, world: World) -> np.ndarray:

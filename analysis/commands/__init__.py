@@ -16,6 +16,7 @@ from flysplat.analysis.commands import (
     reconstruct,
     replay,
     tour,
+    train,
 )
 
 COMMANDS = (
@@ -29,4 +30,5 @@ COMMANDS = (
     fidelity,
     capture,
     tour,
+    train,
 )

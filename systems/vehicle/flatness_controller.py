@@ -99,12 +99,15 @@ class FlatnessController(LeafSystem):
         - state
         - waypoint
         - acceleration
+        - heading
         output_ports:
         - command
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
     - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now.
     - ``acceleration`` (3): a_WB [m/s^2], the acceleration wanted, gravity excluded.
+    - ``heading`` (1), optional: where body x should point, seen from above, [rad] from world x;
+      along the motion where it is not connected or NaN.
     - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, held between updates; hover thrust
       before the first.
 
@@ -116,8 +119,8 @@ class FlatnessController(LeafSystem):
         c       = f_W · z_B
         w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
 
-    where tilt and yaw turn the body so that z lies along f_W and x along the motion: towards the
-    waypoint, or along v_WB when an acceleration is flown. See
+    where tilt and yaw turn the body so that z lies along f_W and x to the heading or along the
+    motion: towards the waypoint, or along v_WB when an acceleration is flown. See
     :mod:`~flysplat.systems.vehicle.flatness`.
 
     Raises:
@@ -138,6 +141,7 @@ class FlatnessController(LeafSystem):
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorInputPort("waypoint", 3)
         self.DeclareVectorInputPort("acceleration", 3)
+        self.DeclareVectorInputPort("heading", 1)
         command = self.DeclareDiscreteState(np.array([self._params.gravity, 0.0, 0.0, 0.0]))
         self.DeclareStateOutputPort("command", command)
         self.DeclarePeriodicDiscreteUpdateEvent(self._config.period, 0.0, self._update)
@@ -165,15 +169,24 @@ class FlatnessController(LeafSystem):
 
         f_W = thrust_for_acceleration(a_WB, v_WB, params.drag, params.gravity)
         f_W = limit_thrust(f_W, config.min_thrust, config.max_thrust, config.max_tilt)
-        R_WD = attitude_from_thrust(f_W, yaw=math.atan2(motion_W[1], motion_W[0]))
-        tilt_B, yaw = attitude_error(R_WB, R_WD)
-        yaw *= min(1.0, math.hypot(motion_W[0], motion_W[1]) / config.yaw_speed) ** 2
+        heading = self._heading(context)
+        pull = 1.0
+        if math.isnan(heading):
+            heading = math.atan2(motion_W[1], motion_W[0])
+            pull = min(1.0, math.hypot(motion_W[0], motion_W[1]) / config.yaw_speed) ** 2
+        tilt_B, yaw = attitude_error(R_WB, attitude_from_thrust(f_W, heading))
+        yaw *= pull
 
         command = np.empty(4)
         command[0] = min(max(f_W.dot(R_WB[:, 2]), config.min_thrust), config.max_thrust)
         command[1:3] = limit_norm(config.tilt_gain * tilt_B, config.max_tilt_rate)
         command[3] = min(max(config.yaw_gain * yaw, -config.max_yaw_rate), config.max_yaw_rate)
         discrete_state.set_value(command)
+
+    def _heading(self, context: Context) -> float:
+        """The heading asked for [rad], or NaN."""
+        port = self.GetInputPort("heading")
+        return float(np.asarray(port.Eval(context))[0]) if port.HasValue(context) else math.nan
 
     def _eval_finite(self, name: str, context: Context) -> np.ndarray:
         value = np.asarray(self.GetInputPort(name).Eval(context))

@@ -1,0 +1,78 @@
+"""How fast policies learn and fly: steps per second of one core, and what a tick costs in flight.
+
+    OMP_NUM_THREADS=1 python benchmarks/flight_school.py
+
+Times are processor time, the least of a few repeats.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK, decide
+from flysplat.systems.policies.recurrent_network import RecurrentNetwork
+from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
+from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from flysplat.training.policies.courses import CourseSelection, training_fields
+from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
+from flysplat.training.policies.flights import look
+from flysplat.training.policies.through_dynamics import FlightSchool, School
+from flysplat.training.policies.train import descend
+
+
+def seconds(run: Callable[[], object], repeats: int) -> float:
+    """The least processor time of `repeats` runs [s]."""
+    times = []
+    for _ in range(repeats):
+        started = time.process_time()
+        run()
+        times.append(time.process_time() - started)
+    return min(times)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    print(f"{'worlds':<12}{'learning':>12}{'flying':>12}{'rendering':>12}{'its part':>10}")
+    for kinds in (["P02", "P03"], ["P06", "P09"], ["P04", "P05"]):
+        selection = CourseSelection(kinds=kinds, count=16, voxel_size=0.4)
+        fields = training_fields(selection, seed=0)
+        learner = DiffAeroLearner(DiffAeroLoss())
+        school = School(learner, fields, FlightSchool(), torch.Generator().manual_seed(0))
+        optimizer = torch.optim.AdamW(learner.network.parameters())
+        steps = school.config.environments * school.config.steps
+
+        def learn(school=school, learner=learner, optimizer=optimizer) -> None:
+            descend(school.lesson, learner.network, optimizer, 1.0)
+
+        def render(school=school, learner=learner, fields=fields) -> None:
+            primitives = fields.primitives.of(school.world)
+            distances, _ = primitives.near(school.flying.vehicle.p)
+            look(school.flying.vehicle, primitives, learner.grid, distances)
+
+        learn()
+        learning = seconds(learn, 4)
+        with torch.no_grad():
+            flying = seconds(school.lesson, 4)
+        rendering = seconds(render, 20) * school.config.steps
+        row = "".join(f"{steps / s:>10.0f}/s" for s in (learning, flying, rendering))
+        print(f"{'+'.join(kinds):<12}{row}{rendering / learning:>10.0%}")
+
+    rng = np.random.default_rng(0)
+    network = RecurrentNetwork(
+        DIFFAERO_NETWORK,
+        {name: rng.normal(size=s) for name, s in DIFFAERO_NETWORK.weight_shapes().items()},
+    )
+    X_WB, depth = pose_from_state(hover_state([0, 0, 2])), rng.uniform(0.5, 15.0, (36, 64))
+    memory, p_WG = network.initial_hidden(), np.array([9.0, 0.0, 2.0])
+
+    def tick() -> None:
+        for _ in range(100):
+            decide(network, depth, X_WB, np.zeros(3), p_WG, 2.0, memory)
+
+    print(f"one tick of diffaero in flight: {10.0 * seconds(tick, 5):.3f} ms")
+
+
+if __name__ == "__main__":
+    main()

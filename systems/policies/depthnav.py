@@ -1,0 +1,127 @@
+"""DepthNav: a recurrent depth policy that turns its nose by itself."""
+
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.sensors import ImageDepth32F
+
+from flysplat.systems.policies.depthnav_policy import (
+    DEPTHNAV_NETWORK,
+    FARTHEST,
+    FOV_X,
+    IMAGE_SIZE,
+    RATE,
+    decide,
+    yaw_of,
+)
+from flysplat.systems.policies.observation import require_poolable
+from flysplat.systems.policies.onboard_camera import OnboardCamera
+from flysplat.systems.policies.recurrent_network import load_network
+from flysplat.systems.vehicle.state_to_pose import pose_from_state
+
+
+@dataclass
+class DepthNavConfig:
+    """The policy's weights, and what it is asked for."""
+
+    # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
+    speed: float = 2.0
+    # File of weights, as `flysplat train depthnav` writes them; those that ship where left empty.
+    weights: str = ""
+    # What it sees through: pixels are pooled to 16x12, so give multiples of these.
+    camera: OnboardCamera = field(
+        default_factory=lambda: OnboardCamera(
+            width=IMAGE_SIZE[0], height=IMAGE_SIZE[1], fov_x=FOV_X, max_depth=FARTHEST
+        )
+    )
+
+    @property
+    def rate(self) -> float:
+        """[Hz], that the policy was trained at."""
+        return RATE
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        if not 0.1 <= self.speed <= 10.0:
+            raise ValueError(
+                f"DepthNavConfig.speed is {self.speed} m/s but must be 0.1 to 10; the default is "
+                f"{DepthNavConfig.speed}"
+            )
+        self.camera.validate()
+        require_poolable(
+            self.camera.height,
+            self.camera.width,
+            DEPTHNAV_NETWORK.image_height,
+            DEPTHNAV_NETWORK.image_width,
+        )
+
+
+class DepthNav(LeafSystem):
+    """Flies to the goal by a 16x12 depth image and what it remembers, and says where to look.
+
+    .. pydrake_system::
+
+        name: DepthNav
+        input_ports:
+        - state
+        - goal
+        - depth_image_32f
+        output_ports:
+        - acceleration
+        - heading
+
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``goal`` (3): p_WG [m], W frame.
+    - ``depth_image_32f``: planar depth [m] of the camera ``config.camera``.
+    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded; zero before the first update.
+    - ``heading`` (1): where body x should point, seen from above [rad] from world x; NaN before.
+
+    Updates at 25 Hz from time 0 by :func:`~flysplat.systems.policies.depthnav_policy.decide`. The
+    discrete state holds the acceleration, the heading, the yaw of the start frame (NaN before the
+    first update) and the network's memory.
+
+    Raises:
+        ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights
+            that are missing, damaged, or of another policy, version or architecture.
+    """
+
+    def __init__(self, config: DepthNavConfig | None = None) -> None:
+        super().__init__()
+        self._config = config = config or DepthNavConfig()
+        config.validate()
+        self._network = load_network(config.weights, "depthnav", DEPTHNAV_NETWORK)
+        self._state_port = self.DeclareVectorInputPort("state", 13)
+        self._goal_port = self.DeclareVectorInputPort("goal", 3)
+        self._depth_port = self.DeclareAbstractInputPort(
+            "depth_image_32f", Value(ImageDepth32F(config.camera.width, config.camera.height))
+        )
+        self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
+        self.DeclareStateOutputPort("heading", self.DeclareDiscreteState(np.full(1, np.nan)))
+        self._start_yaw = self.DeclareDiscreteState(np.full(1, np.nan))
+        self._memory = self.DeclareDiscreteState(self._network.initial_hidden())
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = np.asarray(self._state_port.Eval(context))
+        image = cast(ImageDepth32F, self._depth_port.Eval(context))
+        X_WB = pose_from_state(state)
+        start_yaw = float(context.get_discrete_state(int(self._start_yaw)).value()[0])
+        if np.isnan(start_yaw):
+            start_yaw = yaw_of(X_WB.rotation().matrix())
+        decision = decide(
+            self._network,
+            np.asarray(image.data)[..., 0],
+            X_WB,
+            state[3:6],
+            np.asarray(self._goal_port.Eval(context)),
+            self._config.speed,
+            start_yaw,
+            np.asarray(context.get_discrete_state(int(self._memory)).value()),
+        )
+        discrete_state.set_value(0, decision.a_WB)
+        discrete_state.set_value(1, np.array([decision.heading]))
+        discrete_state.set_value(int(self._start_yaw), np.array([start_yaw]))
+        discrete_state.set_value(int(self._memory), decision.memory)

@@ -1,0 +1,98 @@
+"""Files of trained policies: weights, architecture and how they were made, in one .npz."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flysplat.systems.files import written_atomically
+
+FORMAT = 1
+"""Of the file; observations and commands that mean something else make another number."""
+
+_SHIPPED = Path(__file__).parent / "weights"
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyCheckpoint:
+    """What a file holds."""
+
+    policy: str
+    """Name of the policy, as in the benchmark."""
+    spec: Any
+    """Architecture of the network, a dataclass."""
+    weights: Mapping[str, np.ndarray]
+    provenance: dict[str, Any]
+    """How it was made: command, config, seed, revision and success, as what JSON can hold."""
+
+    def save(self, path: Path) -> None:
+        """Writes `path`, whole or not at all."""
+        about = {
+            "format": FORMAT,
+            "policy": self.policy,
+            "spec": asdict(self.spec),
+            "provenance": self.provenance,
+        }
+        with written_atomically(path) as partial:
+            arrays: dict[str, Any] = dict(self.weights)
+            np.savez_compressed(partial, about=json.dumps(about), **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path | None, policy: str, spec: Any) -> "PolicyCheckpoint":
+        """Reads the weights of `policy` from a file, those that ship if `path` is None or empty.
+
+        Args:
+            spec: the architecture that the file must be of.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is damaged, or of another policy, version or architecture.
+        """
+        path = Path(path) if path else _SHIPPED / f"{policy}.npz"
+        remedy = f"train them with: flysplat train {policy} --out DIR"
+        if not path.is_file():
+            raise FileNotFoundError(f"there are no weights at {path}; {remedy}")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                about = json.loads(str(file["about"]))
+                weights = {name: file[name] for name in file.files if name != "about"}
+            found_format, found_policy = about["format"], about["policy"]
+            found_spec, provenance = about["spec"], about["provenance"]
+        except Exception as error:
+            raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None
+        if (found_format, found_policy) != (FORMAT, policy):
+            raise ValueError(
+                f"{path} holds weights of the policy {found_policy!r} in format {found_format}, "
+                f"but needed is {policy!r} in format {FORMAT}; {remedy}"
+            )
+        expected = json.loads(json.dumps(asdict(spec)))
+        if found_spec != expected:
+            differing = [
+                f"{name} {found_spec.get(name)} instead of {value}"
+                for name, value in expected.items()
+                if found_spec.get(name) != value
+            ]
+            raise ValueError(
+                f"{path} holds weights of another architecture ({', '.join(differing)}); {remedy}"
+            )
+        return cls(policy, spec, weights, provenance)
+
+
+def check_weights(
+    weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, np.ndarray]:
+    """The arrays that `shapes` names, in single precision.
+
+    Raises:
+        ValueError: if one is missing, of another shape or not finite.
+    """
+    for name, shape in shapes.items():
+        if name not in weights or weights[name].shape != shape:
+            found = weights[name].shape if name in weights else "missing"
+            raise ValueError(f"the weights {name} are {found}, but must be of shape {shape}")
+        if not np.isfinite(weights[name]).all():
+            raise ValueError(f"the weights {name} are not all finite")
+    return {name: np.asarray(weights[name], np.float32) for name in shapes}

@@ -1,0 +1,154 @@
+"""The learned depth policies as Drake systems."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.sensors import ImageDepth32F
+
+from flysplat.systems.policies import agile_policy, depthnav_policy, diffaero_policy
+from flysplat.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from flysplat.systems.policies.depthnav import DepthNav, DepthNavConfig
+from flysplat.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from flysplat.systems.policies.hypotheses import Hypotheses
+from flysplat.systems.policies.observation import pooled_depth
+from flysplat.systems.policies.onboard_camera import OnboardCamera
+from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from flysplat.systems.policies.recurrent_network import RecurrentNetwork
+from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
+from flysplat.systems.vehicle.state_to_pose import pose_from_state
+
+SPECS = {
+    "diffaero": diffaero_policy.DIFFAERO_NETWORK,
+    "depthnav": depthnav_policy.DEPTHNAV_NETWORK,
+    "agile_autonomy": agile_policy.AGILE_NETWORK,
+}
+SYSTEMS = {
+    "diffaero": (DiffAero, DiffAeroConfig),
+    "depthnav": (DepthNav, DepthNavConfig),
+    "agile_autonomy": (AgileAutonomy, AgileAutonomyConfig),
+}
+P_WG = np.array([12.0, 3.0, 2.0])
+
+
+def weights(name: str) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        key: rng.normal(scale=0.1, size=shape).astype(np.float32)
+        for key, shape in SPECS[name].weight_shapes().items()
+    }
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp("weights")
+    paths = {name: str(folder / f"{name}.npz") for name in SPECS}
+    for name, path in paths.items():
+        PolicyCheckpoint(name, SPECS[name], weights(name), {}).save(Path(path))
+    return paths
+
+
+def state() -> np.ndarray:
+    state = hover_state([1.0, 2.0, 1.5], yaw=0.6)
+    state[3:6] = [1.0, 0.3, 0.1]
+    state[10:13] = [0.1, -0.2, 0.3]
+    return state
+
+
+def depth_of(config) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return rng.uniform(0.5, 15.0, (config.camera.height, config.camera.width)).astype(np.float32)
+
+
+def simulator_of(system, config) -> Simulator:
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.GetInputPort("state").FixValue(context, state())
+    system.GetInputPort("goal").FixValue(context, P_WG)
+    image = ImageDepth32F(config.camera.width, config.camera.height)
+    image.mutable_data[..., 0] = depth_of(config)
+    system.GetInputPort("depth_image_32f").FixValue(context, Value(image))
+    simulator.Initialize()
+    return simulator
+
+
+@pytest.mark.parametrize("name", ["diffaero", "depthnav"])
+def test_recurrent_policy_decides_and_remembers_at_its_rate(name, files):
+    """After three periods the output is that of three steps of the pure policy, whose memory is in
+    the Context: a fresh Context begins anew."""
+    make, configure = SYSTEMS[name]
+    config = configure(weights=files[name], speed=1.7)
+    system = make(config)
+    network = RecurrentNetwork(SPECS[name], weights(name))
+    X_WB, memory = pose_from_state(state()), network.initial_hidden()
+    v_WB, depth = state()[3:6], depth_of(config)
+    a_WB, heading = np.zeros(3), np.nan
+    for _ in range(3):
+        if name == "diffaero":
+            a_WB, memory = diffaero_policy.decide(network, depth, X_WB, v_WB, P_WG, 1.7, memory)
+        else:
+            a_WB, heading, memory = depthnav_policy.decide(
+                network, depth, X_WB, v_WB, P_WG, 1.7, 0.6, memory
+            )
+    for _ in range(2):
+        simulator = simulator_of(system, config)
+        simulator.AdvanceTo(2.5 / config.rate)
+        context = simulator.get_context()
+        found = system.GetOutputPort("acceleration").Eval(context)
+        np.testing.assert_allclose(found, a_WB, rtol=0, atol=1e-9)
+        if name == "depthnav":
+            found = system.GetOutputPort("heading").Eval(context)
+            assert float(found[0]) == pytest.approx(heading, abs=1e-9)
+
+
+def test_trajectory_policy_plans_at_its_rate(files):
+    """The hypotheses are those of the pure policy at the last multiple of the period."""
+    config = AgileAutonomyConfig(weights=files["agile_autonomy"])
+    system = AgileAutonomy(config)
+    simulator = simulator_of(system, config)
+    simulator.AdvanceTo(1.5 / config.rate)
+    vector = np.array(system.GetOutputPort("hypotheses").Eval(simulator.get_context()))
+    found = Hypotheses.from_vector(vector, 3)
+    assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
+    network = agile_policy.TrajectoryNetwork(SPECS["agile_autonomy"], weights("agile_autonomy"))
+    expected = agile_policy.plan(
+        network, 0.0, depth_of(config), pose_from_state(state()), state(), P_WG, 2.0, None
+    )
+    np.testing.assert_allclose(found.waypoints_B, expected.waypoints_B, atol=1e-9)
+
+
+def test_near_ties_continue_the_last_plan(files):
+    """Of two hypotheses of nearly equal cost the one beside the last plan is followed; a clearly
+    cheaper one is followed wherever it leads."""
+    way = np.linspace(0.1, 1.0, 10)[:, None]
+    left, right, far = way * [1.0, 1.0, 0.0], way * [1.0, -1.0, 0.0], way * [0.0, 0.0, 1.0]
+    X_WB = pose_from_state(hover_state([0, 0, 2]))
+    last = Hypotheses(0.0, X_WB, np.stack([right, left, far]), np.array([0.1, 0.5, 0.9]))
+
+    def followed(costs) -> int:
+        new = Hypotheses(0.1, X_WB, np.stack([left, right, far]), np.array(costs))
+        return agile_policy._continued(new, last).best
+
+    assert followed([0.100, 0.101, 0.9]) == 1
+    assert followed([0.100, 0.900, 0.9]) == 0
+    assert followed([0.100, 0.900, 0.101]) in (0, 2)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_cameras_that_cannot_be_pooled_are_refused(name, files):
+    """A camera of 50x30 pixels is refused with the sizes that would do."""
+    make, configure = SYSTEMS[name]
+    config = configure(weights=files[name], camera=OnboardCamera(width=50, height=30))
+    with pytest.raises(ValueError, match=r"50x30 pixels, but this policy pools it to"):
+        make(config)
+    with pytest.raises(ValueError, match=r"speed is 0"):
+        make(configure(weights=files[name], speed=0.0))
+
+
+def test_pooling_keeps_the_nearest():
+    """Each coarse pixel is the least of its block; 0, too near, stays."""
+    depth = np.full((4, 6), 9.0)
+    depth[1, 1], depth[3, 5], depth[0, 4] = 2.0, 0.0, np.inf
+    np.testing.assert_array_equal(pooled_depth(depth, 2, 3), [[2.0, 9.0, 9.0], [9.0, 9.0, 0.0]])

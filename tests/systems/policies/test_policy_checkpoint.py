@@ -1,0 +1,70 @@
+"""Files of weights: what is refused, and how it says so."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK
+from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from flysplat.systems.policies.recurrent_network import RecurrentNetwork, load_network
+
+
+def some_weights(spec=DIFFAERO_NETWORK) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        name: rng.normal(scale=0.1, size=shape).astype(np.float32)
+        for name, shape in spec.weight_shapes().items()
+    }
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    path = tmp_path / "policy.npz"
+    PolicyCheckpoint("diffaero", DIFFAERO_NETWORK, some_weights(), {"seed": 3}).save(path)
+    return path
+
+
+def test_what_is_saved_is_loaded(path):
+    """Weights, architecture and provenance come back as they were."""
+    loaded = PolicyCheckpoint.load(path, "diffaero", DIFFAERO_NETWORK)
+    assert loaded.provenance == {"seed": 3} and loaded.spec == DIFFAERO_NETWORK
+    for name, value in some_weights().items():
+        np.testing.assert_array_equal(loaded.weights[name], value)
+
+
+def test_other_files_are_refused_with_the_remedy(path, tmp_path):
+    """Missing, damaged, of another policy, of another architecture: each says what and how on."""
+    with pytest.raises(FileNotFoundError, match=r"no weights at .*none.npz; train them with"):
+        load_network(str(tmp_path / "none.npz"), "diffaero", DIFFAERO_NETWORK)
+    with pytest.raises(ValueError, match="'diffaero' in format 1, but needed is 'depthnav'"):
+        load_network(str(path), "depthnav", DIFFAERO_NETWORK)
+    wider = replace(DIFFAERO_NETWORK, hidden_size=96)
+    with pytest.raises(ValueError, match=r"another architecture \(hidden_size 128 instead of 96"):
+        load_network(str(path), "diffaero", wider)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"policy.npz holds no weights of a policy"):
+        load_network(str(path), "diffaero", DIFFAERO_NETWORK)
+
+
+def test_weights_that_cannot_fly_are_refused():
+    """A missing, misshapen or infinite array is named."""
+    weights = some_weights()
+    without = {name: value for name, value in weights.items() if name != "head.bias"}
+    with pytest.raises(ValueError, match=r"head.bias are missing"):
+        RecurrentNetwork(DIFFAERO_NETWORK, without)
+    with pytest.raises(ValueError, match=r"head.bias are \(4,\), but must be of shape \(3,\)"):
+        RecurrentNetwork(DIFFAERO_NETWORK, weights | {"head.bias": np.zeros(4)})
+    with pytest.raises(ValueError, match=r"head.bias are not all finite"):
+        RecurrentNetwork(DIFFAERO_NETWORK, weights | {"head.bias": np.full(3, np.nan)})
+
+
+def test_observations_of_the_wrong_size_are_refused():
+    """The network says which input has which shape and which it takes."""
+    network = RecurrentNetwork(DIFFAERO_NETWORK, some_weights())
+    image, state = np.zeros((9, 16)), np.zeros(9)
+    with pytest.raises(ValueError, match=r"image has shape \(16, 9\), .* takes \(9, 16\)"):
+        network.step(image.T, state, network.initial_hidden())
+    with pytest.raises(ValueError, match=r"state has shape \(8,\)"):
+        network.step(image, state[:8], network.initial_hidden())

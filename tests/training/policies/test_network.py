@@ -1,0 +1,126 @@
+"""Networks and observations in torch against those in numpy that fly."""
+
+import numpy as np
+import pytest
+import torch
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from flysplat.systems.policies import agile_policy, depthnav_policy, diffaero_policy
+from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS
+from flysplat.systems.policies.recurrent_network import RecurrentNetwork
+from flysplat.training.policies.agile_autonomy import AgilePilot
+from flysplat.training.policies.depthnav import DepthNavLearner, DepthNavLoss, quaternion_of
+from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
+from flysplat.training.policies.flight import BodyRate
+from flysplat.training.policies.network import TrajectoryModule
+from flysplat.training.policies.observation import ObservationNoise, heading_frame
+
+P_WG = np.array([9.0, 2.0, 1.5])
+
+
+def weights_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
+    return {name: w.detach().numpy() for name, w in module.state_dict().items()}
+
+
+def vehicle() -> BodyRate:
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=(1, 13))
+    state[0, 6:10] = RollPitchYaw(0.3, -0.2, 2.0).ToQuaternion().wxyz()
+    return BodyRate(torch.tensor(state, dtype=torch.float32), torch.zeros(1, 3))
+
+
+def pose(state: np.ndarray) -> RigidTransform:
+    return RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), state[:3])
+
+
+@pytest.mark.parametrize("name", ["diffaero", "depthnav"])
+def test_what_flies_is_what_was_trained(name):
+    """For three images in a row the numpy policy decides and remembers what torch does."""
+    torch.manual_seed(1)
+    if name == "diffaero":
+        learner, policy = DiffAeroLearner(DiffAeroLoss()), diffaero_policy
+    else:
+        learner, policy = DepthNavLearner(DepthNavLoss()), depthnav_policy
+    spec = learner.network.spec
+    with torch.no_grad():
+        learner.network.head.weight.mul_(10.0)
+    network = RecurrentNetwork(spec, weights_of(learner.network))
+    body = vehicle()
+    state = body.state[0].double().numpy()
+    memory, hidden = learner.initial_memory(1), network.initial_hidden()
+    start_yaw = 2.0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        depth = rng.uniform(0.0, 25.0, (spec.image_height, spec.image_width)).astype(np.float32)
+        depth[0, 0], depth[1, 1] = 0.0, np.inf
+        R_WB = body.attitude()
+        with torch.no_grad():
+            a_cmd, heading, memory = learner.decide(
+                torch.tensor(depth).reshape(1, -1),
+                body,
+                R_WB,
+                heading_frame(body.yaw),
+                torch.tensor(P_WG, dtype=torch.float32)[None],
+                torch.tensor([2.0]),
+                memory,
+            )
+        fine = depth.repeat(4, axis=0).repeat(4, axis=1)  # pooled back to the same
+        if name == "diffaero":
+            a_WB, hidden = policy.decide(network, fine, pose(state), state[3:6], P_WG, 2.0, hidden)
+        else:
+            decision = policy.decide(
+                network, fine, pose(state), state[3:6], P_WG, 2.0, start_yaw, hidden
+            )
+            a_WB, hidden = decision.a_WB, decision.memory
+            assert heading is not None
+            assert float(heading[0]) == pytest.approx(decision.heading, abs=1e-4)
+        np.testing.assert_allclose(a_WB, a_cmd[0].numpy(), atol=2e-4)
+        np.testing.assert_allclose(hidden, memory[0, : spec.hidden_size].numpy(), atol=1e-5)
+        assert np.abs(a_WB).max() > 0.01
+
+
+def test_trajectories_that_fly_are_those_trained():
+    """Waypoints and costs of the numpy network are torch's, from the same observation."""
+    torch.manual_seed(2)
+    module = TrajectoryModule(agile_policy.AGILE_NETWORK)
+    pilot = AgilePilot(module)
+    network = agile_policy.TrajectoryNetwork(agile_policy.AGILE_NETWORK, weights_of(module))
+    body = vehicle()
+    state = body.state[0].double().numpy()
+    depth = np.random.default_rng(0).uniform(0.0, 25.0, (24, 32)).astype(np.float32)
+    p_WG = torch.tensor(P_WG, dtype=torch.float32)[None]
+    with torch.no_grad():
+        observed = pilot.observe(
+            torch.tensor(depth).reshape(1, -1), body, body.attitude(), p_WG, torch.tensor([2.0])
+        )
+        waypoints, costs = module(*observed)
+    found = agile_policy.plan(network, 1.0, depth, pose(state), state, P_WG, 2.0, None)
+    assert found.waypoints_B.shape == (3, NUM_WAYPOINTS, 3)
+    np.testing.assert_allclose(found.waypoints_B, waypoints[0].numpy(), atol=1e-4)
+    np.testing.assert_allclose(found.costs, costs[0].numpy(), atol=1e-4)
+
+
+def test_quaternions_of_rotations():
+    """Rotations of all kinds, half turns included, give back their quaternion with w >= 0."""
+    angles = [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.3, -2.0, 1.0), (3, 1, -2)]
+    for roll, pitch, yaw in angles:
+        rpy = RollPitchYaw(roll, pitch, yaw)
+        q = rpy.ToQuaternion().wxyz()
+        q = q if q[0] >= 0 else -q
+        R = torch.tensor(rpy.ToRotationMatrix().matrix(), dtype=torch.float32)[None]
+        found = quaternion_of(R)[0].numpy()
+        assert min(np.abs(found - q).max(), np.abs(found + q).max()) < 1e-5
+        assert found[0] >= -1e-6
+
+
+def test_noise_is_what_was_asked_for():
+    """Scale and dropout have their sizes, and the same generator gives the same noise."""
+    noise = ObservationNoise(scale=0.05, offset=0.0, dropout=0.1)
+    depth = torch.full((400, 100), 4.0)
+    noisy = noise.disturbed(depth, torch.Generator().manual_seed(0))
+    again = noise.disturbed(depth, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(noisy, again, rtol=0, atol=0)
+    seen = torch.isfinite(noisy)
+    assert float((~seen).float().mean()) == pytest.approx(0.1, abs=0.01)
+    assert float(noisy[seen].std()) == pytest.approx(0.2, rel=0.05)
+    assert float(noisy[seen].mean()) == pytest.approx(4.0, rel=0.01)

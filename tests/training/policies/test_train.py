@@ -1,0 +1,195 @@
+"""Training runs: they learn, go on where they were killed, and stop at nonsense."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from flysplat.diagrams.configuration import load_config
+from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
+from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK
+from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from flysplat.training.policies import courses
+from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
+from flysplat.training.policies.flights import FlightConditions, fly_courses
+from flysplat.training.policies.network import TrainableNetwork
+from flysplat.training.policies.registry import RECIPES
+from flysplat.training.policies.train import Schedule, run
+
+TINY = [
+    "courses.kinds=[P10]",
+    "courses.count=1",
+    "courses.held_out=1",
+    "courses.voxel_size=0.5",
+    "school.environments=4",
+    "school.steps=4",
+    "schedule.updates=6",
+    "schedule.validate_every=3",
+    "schedule.checkpoint_every=2",
+    "validation.patience=0.3",
+]
+
+
+def tiny(*more: str) -> DiffAeroTraining:
+    return load_config(DiffAeroTraining(), overrides=[*TINY, *more])
+
+
+def weights(out: Path) -> dict[str, np.ndarray]:
+    saved = torch.load(out / "checkpoint.pt", weights_only=True)
+    return {name: value.numpy() for name, value in saved["network"].items()}
+
+
+def assert_same(a: Path, b: Path) -> None:
+    for name, value in weights(a).items():
+        np.testing.assert_array_equal(value, weights(b)[name], err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """The folder of a tiny run that was not disturbed."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    run(config=tiny(), out=out, make=RECIPES["diffaero"].make)
+    return out
+
+
+def test_run_leaves_what_it_says(finished):
+    """Weights that fly, the configuration, curves and a summary lie in the folder."""
+    checkpoint = PolicyCheckpoint.load(finished / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
+    assert "updates: 6" in checkpoint.provenance["config"]
+    assert checkpoint.provenance["revision"]
+    assert load_config(DiffAeroTraining(), finished / "config.yaml") == tiny()
+    rows = list(csv.DictReader((finished / "curves.csv").open()))
+    assert [float(row["update"]) for row in rows] == [3.0, 6.0]
+    assert {"velocity", "contact", "success", "collisions"} <= set(rows[0])
+    summary = json.loads((finished / "summary.json").read_text())
+    assert summary["updates"] == 6 and summary["seed"] == 0
+
+
+def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
+    """After kill -9 between two checkpoints the same command ends with the same weights."""
+    program = "import sys; from flysplat.analysis.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
+    for override in TINY:
+        command += ["--set", override]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    run(config=tiny(), out=tmp_path, make=RECIPES["diffaero"].make)
+    assert_same(tmp_path, finished)
+    rows = (tmp_path / "curves.csv").read_text()
+    assert rows == (finished / "curves.csv").read_text()
+
+
+def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
+    """A folder of another run, and a checkpoint that is none, are named with the remedy."""
+    with pytest.raises(ValueError, match="another configuration"):
+        run(config=tiny("seed=1"), out=finished, make=RECIPES["diffaero"].make)
+    (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
+    with pytest.raises(ValueError, match="delete it to begin anew"):
+        run(config=tiny(), out=tmp_path, make=RECIPES["diffaero"].make)
+    with pytest.raises(ValueError, match=r"schedule\.updates is 0"):
+        run(config=tiny("schedule.updates=0"), out=tmp_path, make=RECIPES["diffaero"].make)
+    with pytest.raises(ValueError, match=r"courses\.kinds is \['P99'\]"):
+        run(config=tiny("courses.kinds=[P99]"), out=tmp_path, make=RECIPES["diffaero"].make)
+
+
+@dataclass
+class FragileTraining:
+    """Of a trainee whose loss breaks."""
+
+    seed: int = 0
+    device: str = "cpu"
+    schedule: Schedule = field(
+        default_factory=lambda: Schedule(updates=9, validate_every=2, checkpoint_every=2)
+    )
+
+    def validate(self) -> None:
+        self.schedule.validate()
+
+
+class FragileTrainee:
+    """Its term `second` is not a number from the fifth update on."""
+
+    policy, spec = "diffaero", DIFFAERO_NETWORK
+
+    def __init__(self, config: FragileTraining) -> None:
+        self.network = TrainableNetwork(self.spec)
+        self._update = 0
+
+    def begin(self, update: int) -> None:
+        self._update = update
+
+    def lesson(self) -> dict[str, torch.Tensor]:
+        size = self.network.head.weight.square().sum()
+        return {"first": size, "second": size * (torch.nan if self._update >= 5 else 1.0)}
+
+    def measured(self) -> dict[str, float]:
+        return {"success": 0.5}
+
+    def state(self) -> dict:
+        return {}
+
+    def restore(self, state: dict) -> None:
+        pass
+
+
+def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp_path):
+    """The error names the term; the last good weights and checkpoint stay and are finite."""
+    with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
+        run(config=FragileTraining(), out=tmp_path, make=FragileTrainee)
+    checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
+    assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
+    assert checkpoint.provenance["best"]["update"] == 4
+    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["progress"]["update"] == 4
+
+
+def test_training_seeds_are_not_the_benchmarks(monkeypatch):
+    """Every world of training and validation is of a seed the benchmark leaves to training, and
+    training, its other seeds and validation share none."""
+    asked: list[int] = []
+    monkeypatch.setattr(courses, "make_course", lambda kind, seed: asked.append(seed))
+    monkeypatch.setattr(courses, "Fields", lambda *_: None)
+    selection = courses.CourseSelection(count=1000, held_out=1000)
+    for seed in (0, 1, 999):
+        courses.training_fields(selection, seed)
+    courses.validation_fields(selection)
+    assert len(asked) == len(set(asked)) == 4000
+    assert min(asked) >= TRAINING_SEEDS
+    with pytest.raises(ValueError, match="seed is 1000"):
+        courses.training_fields(selection, 1000)
+
+
+def test_miniature_learns_to_fly(tmp_path):
+    """Some seconds of training reach goals among sparse poles that an untrained policy never
+    reaches."""
+    overrides = [
+        "courses.kinds=[P01]",
+        "courses.count=3",
+        "courses.held_out=8",
+        "courses.voxel_size=0.5",
+        "school.environments=24",
+        "school.steps=24",
+        "schedule.updates=70",
+        "schedule.validate_every=70",
+        "schedule.learning_rate=0.002",
+        "validation.patience=4",
+    ]
+    config = load_config(DiffAeroTraining(), overrides=overrides)
+    held_out = courses.validation_fields(config.courses)
+    torch.manual_seed(0)
+    untrained = DiffAeroLearner(config.loss)
+    before = fly_courses(untrained, held_out, FlightConditions(patience=1.0)).measures()
+    summary = run(config=config, out=tmp_path, make=RECIPES["diffaero"].make)
+    assert before["success"] == 0.0
+    assert summary["best"]["success"] >= 0.5

@@ -1,0 +1,308 @@
+"""Training Agile Autonomy: trajectories imitated from an expert that samples and knows the world.
+
+After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021). As
+published: depth to 20 m and a state of 18 numbers give three trajectories of ten waypoints in one
+second with a cost each; relaxed winner-takes-all with epsilon 0.05 on the expert's three best; the
+cost head learns the collision cost of what was predicted; data is aggregated in rounds in which the
+student flies while the expert says what it would have done; 15 Hz.
+
+Chosen here: the expert is the lattice of `systems.policies.trajectory_lattice` instead of a
+Metropolis-Hastings sampler, because it finds its three best distinct trajectories in 2 ms; a
+convolutional encoder of 32x24 pixels, trained with the rest, instead of a frozen MobileNet at 224,
+whose weights alone are 14 MB and whose forward pass takes 15 ms of a core; dense layers instead of
+convolutions of length one; experts much worse than the best are not imitated; contact costs 2,
+which the published cost has at 0.3 m, at the vehicle's own radius.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from flysplat.systems.policies.agile_policy import (
+    AGILE_NETWORK,
+    FARTHEST,
+    FOV_X,
+    MODES,
+    NEAREST,
+    RATE,
+)
+from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS
+from flysplat.systems.policies.privileged_planner import plan
+from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from flysplat.training.policies.courses import CourseSelection, training_fields, validation_fields
+from flysplat.training.policies.fields import STARTS, Fields
+from flysplat.training.policies.flight import BodyRate
+from flysplat.training.policies.flights import FlightConditions, Vehicle, fly_courses, look
+from flysplat.training.policies.network import TrajectoryModule
+from flysplat.training.policies.observation import ObservationNoise, target_velocity
+from flysplat.training.policies.primitives import PinholeGrid
+from flysplat.training.policies.train import Schedule
+
+EPSILON = 0.05
+"""Part of an expert's pull on the hypotheses that are not the closest to it."""
+
+_LOOKAHEAD = 3  # the waypoint that is tracked: at 0.4 s, as the controller's lookahead
+_WORSE = 1.5  # [s] of cost by which an expert's trajectory may be worse than its best
+
+
+@dataclass
+class AgileTraining:
+    """A training run."""
+
+    # Seed of everything random, 0 to 999.
+    seed: int = 0
+    # Where the tensors live: cpu, or cuda.
+    device: str = "cpu"
+    schedule: Schedule = field(
+        default_factory=lambda: Schedule(updates=3000, validate_every=500, checkpoint_every=500)
+    )
+    courses: CourseSelection = field(default_factory=CourseSelection)
+    # [-] Rounds of data: in the first the expert flies, then the student more and more.
+    rounds: int = 5
+    # [-] Updates between rounds.
+    round_updates: int = 500
+    # [-] Vehicles in flight at once, and steps of 1/15 s that they fly in a round.
+    environments: int = 60
+    steps: int = 300
+    # [-] Steps between two questions to the expert.
+    ask_every: int = 4
+    # [m/s] Speeds that are asked for.
+    speeds: list[float] = field(default_factory=lambda: [1.5, 2.0, 2.5, 3.0])
+    # [-] Samples a step of the optimiser.
+    batch: int = 128
+    # [-] Weight of the cost head's error.
+    cost_weight: float = 0.1
+    noise: ObservationNoise = field(default_factory=ObservationNoise)
+    # How the flights are that choose among checkpoints.
+    validation: FlightConditions = field(default_factory=lambda: FlightConditions(body_rate=True))
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        self.schedule.validate()
+        self.courses.validate()
+        for name in ("rounds", "round_updates", "environments", "steps", "ask_every", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
+            raise ValueError(f"speeds is {self.speeds}; give one or more of 0.1 to 10 m/s")
+
+
+class AgilePilot:
+    """Flies by the cheapest hypothesis, as `HypothesisSelector` and `FlatnessController` do."""
+
+    rate = RATE
+
+    def __init__(self, network: TrajectoryModule, device: torch.device | str = "cpu") -> None:
+        spec = network.spec
+        self.network = network
+        self.grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X, device)
+        self._device = device
+
+    def initial_memory(self, count: int) -> Tensor:
+        return torch.zeros(count, 0, device=self._device)
+
+    def observe(
+        self, depth: Tensor, vehicle: Vehicle, R_WB: Tensor, p_WG: Tensor, speed: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Images (N, 24, 32) and states (N, 18)."""
+        spec = self.network.spec
+        image = 1.0 / depth.clamp(NEAREST, FARTHEST)
+        rates = vehicle.state[:, 10:13] if isinstance(vehicle, BodyRate) else 0.0 * vehicle.v
+        rows = torch.stack([vehicle.v, target_velocity(vehicle.p, p_WG, speed)], 1) @ R_WB
+        state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
+        return image.reshape(-1, spec.image_height, spec.image_width), state
+
+    def decide(
+        self,
+        depth: Tensor,
+        vehicle: Vehicle,
+        R_WB: Tensor,
+        R_WH: Tensor,
+        p_WG: Tensor,
+        speed: Tensor,
+        memory: Tensor,
+    ) -> tuple[Tensor, None, Tensor]:
+        waypoints, costs = self.network(*self.observe(depth, vehicle, R_WB, p_WG, speed))
+        best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
+        p_WR = vehicle.p + (R_WB @ best[:, _LOOKAHEAD, :, None])[:, :, 0]
+        return _reaching(p_WR, vehicle), None, memory
+
+
+class AgileTrainee:
+    """See `flysplat.training.policies.train.Trainee`."""
+
+    policy = "agile_autonomy"
+
+    def __init__(self, config: AgileTraining) -> None:
+        self._config = config
+        self.spec = AGILE_NETWORK
+        self.network = TrajectoryModule(self.spec).to(config.device)
+        self._pilot = AgilePilot(self.network, config.device)
+        self._generator = torch.Generator(config.device).manual_seed(config.seed)
+        self._fields = training_fields(config.courses, config.seed, config.device)
+        self._validation = validation_fields(config.courses, config.device)
+        self._lattices = [TrajectoryLattice(LatticeConfig(speed=s)) for s in config.speeds]
+        self._data: dict[str, Tensor] = {}
+
+    def begin(self, update: int) -> None:
+        config = self._config
+        number, within = divmod(update, config.round_updates)
+        if within == 0 and number < config.rounds:
+            student = number / config.rounds  # part of the vehicles that the student flies
+            new = self._collected(student)
+            if self._data:
+                new = {name: torch.cat([self._data[name], new[name]]) for name in new}
+            self._data = new
+
+    def lesson(self) -> dict[str, Tensor]:
+        config, data = self._config, self._data
+        chosen = torch.randint(
+            len(data["state"]), (config.batch,), generator=self._generator, device=config.device
+        )
+        sample = {name: values[chosen] for name, values in data.items()}
+        spec = self.spec
+        depth = config.noise.disturbed(sample["depth"].float(), self._generator)
+        image = (1.0 / depth.clamp(NEAREST, FARTHEST)).reshape(
+            -1, spec.image_height, spec.image_width
+        )
+        waypoints, costs = self.network(image, sample["state"])
+        errors = (10.0 / (3 * NUM_WAYPOINTS)) * (
+            sample["experts"][:, :, None] - waypoints[:, None]
+        ).square().sum((3, 4))  # (N, K, M)
+        pull = torch.full_like(errors, EPSILON / (MODES - 1))
+        pull.scatter_(2, errors.argmin(2, keepdim=True), 1.0 - EPSILON)
+        imitated = (pull * errors).sum(2) * sample["imitated"]
+        target = self._collision_costs(waypoints.detach(), sample)
+        return {
+            "imitation": imitated.sum(1).mean(),
+            "cost": config.cost_weight * (costs - target).square().sum(1).mean(),
+        }
+
+    def measured(self) -> dict[str, float]:
+        config = self._config
+        return fly_courses(self._pilot, self._validation, config.validation, config.noise).measures(
+            config.courses.kinds
+        )
+
+    def state(self) -> dict[str, Any]:
+        return {"data": self._data, "generator": self._generator.get_state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._data = state["data"]
+        self._generator.set_state(state["generator"])
+
+    @torch.no_grad()
+    def _collision_costs(self, waypoints_B: Tensor, sample: dict[str, Tensor]) -> Tensor:
+        """The mean collision cost (N, M) of trajectories (N, M, 10, 3) [m] in the body frame."""
+        N, M = waypoints_B.shape[:2]
+        points = waypoints_B.flatten(1, 2) @ sample["R_WB"].mT + sample["p_WB"][:, None]
+        world = sample["world"].repeat_interleave(points.shape[1])
+        clearance = self._fields.distance(points.flatten(0, 1), world) - VEHICLE_RADIUS
+        return collision_cost(clearance).reshape(N, M, -1).mean(2)
+
+    @torch.no_grad()
+    def _collected(self, student: float) -> dict[str, Tensor]:
+        """Observations, and what the expert would do, while both fly."""
+        config, fields = self._config, self._fields
+        N, device = config.environments, config.device
+        world = torch.arange(N, device=device) % len(fields)
+        primitives, p_WG = fields.primitives.of(world), fields.p_WG[world]
+        which = torch.randint(len(config.speeds), (N,), generator=self._generator, device=device)
+        speed = torch.tensor(config.speeds, device=device)[which]
+        control = FlatnessControllerConfig()
+        vehicle, by_student = self._started(fields, world, student)
+        tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
+        rows: list[dict[str, Tensor]] = []
+        for step in range(config.steps):
+            distances, _ = primitives.near(vehicle.p)
+            ended = (distances.amin(1) < VEHICLE_RADIUS) | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
+            inside = (vehicle.p > fields.lower_W[world]) & (vehicle.p < fields.upper_W[world])
+            ended |= ~inside.all(1)
+            if ended.any():
+                fresh, flown = self._started(fields, world, student)
+                vehicle = BodyRate(
+                    *(
+                        torch.where(ended[:, None], a, b)
+                        for a, b in zip(fresh, vehicle, strict=True)
+                    )
+                )
+                by_student = torch.where(ended, flown, by_student)
+                tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
+                distances, _ = primitives.near(vehicle.p)
+            depth, R_WB = look(vehicle, primitives, self._pilot.grid, distances)
+            asked = step % config.ask_every == 0
+            if asked:
+                valid, experts, costs = self._ask(vehicle, world, which)
+                best = experts[:, 0] @ R_WB.mT + vehicle.p[:, None]
+                hold = best[:, -1:].expand(-1, config.ask_every, -1)
+                tracked = torch.where(valid[:, None, None], torch.cat([best, hold], 1), tracked)
+                _, state = self._pilot.observe(depth, vehicle, R_WB, p_WG, speed)
+                worse = costs - costs[:, :1]
+                sample = {
+                    "depth": depth.half(),
+                    "state": state,
+                    "experts": experts,
+                    "imitated": (worse < _WORSE).float(),
+                    "world": world,
+                    "R_WB": R_WB,
+                    "p_WB": vehicle.p,
+                }
+                rows.append({name: values[valid] for name, values in sample.items()})
+            # The time since the plan, in waypoints of 0.1 s; 1/15 s are two thirds of one.
+            along = _LOOKAHEAD + (step % config.ask_every) * 2.0 / 3.0
+            i, part = int(along), along - int(along)
+            p_WR = (1.0 - part) * tracked[:, i] + part * tracked[:, i + 1]
+            noisy = config.noise.disturbed(depth, self._generator)
+            of_student, _, _ = self._pilot.decide(
+                noisy, vehicle, R_WB, R_WB, p_WG, speed, self._pilot.initial_memory(N)
+            )
+            a_cmd = torch.where(by_student[:, None], of_student, _reaching(p_WR, vehicle))
+            vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE, control)
+        return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+
+    def _started(self, fields: Fields, world: Tensor, student: float) -> tuple[BodyRate, Tensor]:
+        """Vehicles at rest anywhere in their worlds, and which of them the student flies."""
+        N, device = len(world), world.device
+        draws = torch.rand(N, 3, generator=self._generator, device=device)
+        p = fields.starts_W[world, (draws[:, 0] * STARTS).long().clamp(max=STARTS - 1)]
+        way = fields.way(p, world)
+        yaw = torch.atan2(way[:, 1], way[:, 0]) + 1.5 * (draws[:, 1] - 0.5)
+        return BodyRate.hovering(p, yaw), draws[:, 2] < student
+
+    def _ask(
+        self, vehicle: BodyRate, world: Tensor, which: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The expert's three best: whether it has any (N,), waypoints (N, 3, 10, 3) [m] in the
+        body frame, and costs (N, 3)."""
+        N, device = len(world), world.device
+        valid = torch.zeros(N, dtype=torch.bool)
+        experts, costs = torch.zeros(N, 3, NUM_WAYPOINTS, 3), torch.zeros(N, 3)
+        for n, state in enumerate(vehicle.state.double().cpu().numpy()):
+            esdf, toa = self._fields.maps[int(world[n])]
+            try:
+                best = plan(0.0, state, esdf, toa, self._lattices[int(which[n])])
+            except ValueError:  # no way leads on from here
+                continue
+            valid[n] = True
+            experts[n] = torch.tensor(best.waypoints_B)
+            costs[n] = torch.tensor(best.costs)
+        return valid.to(device), experts.to(device), costs.to(device)
+
+
+def collision_cost(clearance: Tensor) -> Tensor:
+    """The cost [-] of being at a clearance (...,) [m]: 4 - 2 d² / 0.09 below d = 0.3 m and from
+    there linearly from 2 to 0 at d = 0.8 m, with d = clearance + 0.3 m."""
+    d = clearance + 0.3
+    inner = 4.0 - 2.0 * d.clamp(min=0.0).square() / 0.09
+    outer = 2.0 * (0.8 - d) / 0.5
+    return torch.where(d < 0.3, inner, outer.clamp(min=0.0))
+
+
+def _reaching(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+    """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
+    T = FlatnessControllerConfig.lookahead
+    return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2

@@ -1,0 +1,81 @@
+"""The courses that policies train in: of the benchmark's kinds, of seeds that it never uses."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+import torch
+
+from flysplat.diagrams.configuration import load_config
+from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
+from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
+from flysplat.training.policies.fields import Course, Fields
+
+_SCENARIOS = Path(__file__).parents[2] / "diagrams" / "scenarios"
+
+VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
+"""Worlds of the seeds from here on choose among checkpoints and are not trained in either."""
+
+_LARGEST_RUN = 1000  # courses of one training seed
+
+PROCEDURAL = tuple(sorted(path.stem for path in _SCENARIOS.glob("P*.yaml")))
+"""The scenarios whose worlds are made from seeds."""
+
+
+@dataclass
+class CourseSelection:
+    """Which worlds, and how many."""
+
+    # Scenarios whose worlds are trained in, in turn; naming one twice doubles its part.
+    kinds: list[str] = field(default_factory=lambda: list(PROCEDURAL))
+    # [-] Worlds trained in.
+    count: int = 60
+    # [-] Held-out worlds that choose among checkpoints.
+    held_out: int = 48
+    # [m] Of the grids of the time of arrival.
+    voxel_size: float = 0.25
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        unknown = [kind for kind in self.kinds if kind not in PROCEDURAL]
+        if unknown or not self.kinds:
+            raise ValueError(f"courses.kinds is {self.kinds}; choose from {', '.join(PROCEDURAL)}")
+        for name in ("count", "held_out"):
+            value = getattr(self, name)
+            if not 1 <= value <= _LARGEST_RUN:
+                raise ValueError(f"courses.{name} is {value}; it must be 1 to {_LARGEST_RUN}")
+        if not 0.05 <= self.voxel_size <= 0.5:
+            raise ValueError(f"courses.voxel_size is {self.voxel_size} m; it must be 0.05 to 0.5")
+
+
+def make_course(kind: str, seed: int) -> Course:
+    """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
+    world = load_config(Scenario(), _SCENARIOS / f"{kind}.yaml").world
+    plan = make_blueprint(cast(ProceduralConfig, world), seed)
+    shapes = [solid.shape for solid in plan.solids]
+    return Course(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
+
+
+def training_fields(
+    selection: CourseSelection, seed: int, device: torch.device | str = "cpu"
+) -> Fields:
+    """The worlds that a training run of `seed` learns in; those of different seeds differ.
+
+    Raises:
+        ValueError: if the seed is not 0 to 999.
+    """
+    if not 0 <= seed < (VALIDATION_SEEDS - TRAINING_SEEDS) // _LARGEST_RUN:
+        raise ValueError(f"seed is {seed}; it must be 0 to 999")
+    first = TRAINING_SEEDS + seed * _LARGEST_RUN
+    return Fields(_courses(selection, selection.count, first), selection.voxel_size, device)
+
+
+def validation_fields(selection: CourseSelection, device: torch.device | str = "cpu") -> Fields:
+    """The held-out worlds, the same for every run."""
+    return Fields(_courses(selection, selection.held_out, VALIDATION_SEEDS), None, device)
+
+
+def _courses(selection: CourseSelection, count: int, first: int) -> list[Course]:
+    kinds = selection.kinds
+    return [make_course(kinds[i % len(kinds)], first + i) for i in range(count)]

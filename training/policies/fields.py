@@ -1,0 +1,151 @@
+"""What policies train in: procedural worlds with the time of arrival at their goals."""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
+from flysplat.systems.collision.esdf import Esdf
+from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from flysplat.systems.collision.shapes import Shape
+from flysplat.systems.collision.trilinear import trilinear_with_gradient
+from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from flysplat.training.policies.primitives import Primitives
+
+STARTS = 256
+"""Places that flights of training start from, in each world."""
+
+_START_CLEARANCE = 0.3  # [m]
+_NEAR_GOAL = 1.0  # [m], within which the way is straight
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """One world: its shapes and volume, and where to fly."""
+
+    shapes: Sequence[Shape]
+    lower_W: np.ndarray  # (3,) [m]
+    upper_W: np.ndarray  # (3,) [m]
+    p_WS: np.ndarray  # (3,) [m] start
+    p_WG: np.ndarray  # (3,) [m] goal
+
+
+class Fields:
+    """W courses as tensors: shapes, volumes, starts, goals, and the way to each goal.
+
+    Args:
+      courses: the worlds.
+      voxel_size: [m] of the grids of the time of arrival; None for none of them, which evaluation
+        does not need.
+      device: where the tensors live.
+    """
+
+    def __init__(
+        self,
+        courses: Sequence[Course],
+        voxel_size: float | None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        def tensor(values: Any) -> Tensor:
+            return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+        self.lower_W, self.upper_W = (
+            tensor([getattr(c, name) for c in courses]) for name in ("lower_W", "upper_W")
+        )
+        self.p_WS, self.p_WG = (
+            tensor([getattr(c, name) for c in courses]) for name in ("p_WS", "p_WG")
+        )
+        self.primitives = Primitives(
+            [c.shapes for c in courses],
+            np.array([c.lower_W for c in courses]),
+            np.array([c.upper_W for c in courses]),
+            device,
+        )
+        self._voxel_size = voxel_size
+        self._times = None
+        if voxel_size is not None:
+            grids = [_arrival(course, voxel_size, seed) for seed, course in enumerate(courses)]
+            self.maps = [(grid.esdf, grid.toa) for grid in grids]
+            shapes = np.array([grid.toa.times.shape for grid in grids])
+            sizes = shapes.prod(1)
+            self._distances = tensor(
+                np.concatenate([grid.esdf.distances.ravel() for grid in grids])
+            )
+            self._times = tensor(np.concatenate([grid.toa.times.ravel() for grid in grids]))
+            self._first = torch.tensor(np.cumsum(sizes) - sizes, device=device)  # (W,)
+            self._shape = torch.tensor(shapes, device=device)  # (W, 3)
+            self.starts_W = tensor([grid.starts_W for grid in grids])  # (W, STARTS, 3) [m]
+
+    def __len__(self) -> int:
+        return len(self.p_WG)
+
+    def emptied(self) -> "Fields":
+        """The same volumes, starts and goals without shapes, and straight ways."""
+        empty = copy(self)
+        empty.primitives = self.primitives.removed()
+        empty._times = None
+        return empty
+
+    def way(self, p_WQ: Tensor, world: Tensor) -> Tensor:
+        """The direction (N, 3) of the way to the goal at p_WQ (N, 3) [m] in `world` (N,).
+
+        Down the gradient of the time of arrival; straight within a metre of the goal, and where
+        there is none.
+        """
+        to_goal = self.p_WG[world] - p_WQ
+        if self._times is None:
+            return torch.nn.functional.normalize(to_goal, dim=1)
+        _, *slopes = self._interpolated(self._times, p_WQ, world)
+        near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
+        downhill = torch.where(near, to_goal, -torch.stack(slopes, 1))
+        return torch.nn.functional.normalize(downhill, dim=1)
+
+    def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
+        """Signed distance (N,) [m] at p_WQ (N, 3) [m] in `world` (N,), from the grid: the bounds of
+        the volume count as surfaces, and it costs the same however many shapes there are."""
+        return self._interpolated(self._distances, p_WQ, world)[0]
+
+    def _interpolated(self, grid: Tensor, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, ...]:
+        """Value and slopes (N,) each of a grid, by voxels, at p_WQ (N, 3)."""
+        assert self._voxel_size is not None
+        shape = self._shape[world]
+        x = (p_WQ - self.lower_W[world]) / self._voxel_size - 0.5
+        x = torch.minimum(x.clamp(min=0.0), shape - 1.001)
+        cell = x.long()
+        stride_y = shape[:, 2]
+        stride_x = shape[:, 1] * stride_y
+        base = self._first[world] + cell[:, 0] * stride_x + cell[:, 1] * stride_y + cell[:, 2]
+        step = torch.arange(2, device=p_WQ.device)
+        corners = (
+            base
+            + step[:, None, None, None] * stride_x
+            + step[:, None, None] * stride_y
+            + step[:, None]
+        )
+        return trilinear_with_gradient(grid[corners], *(x - cell).unbind(1))
+
+
+class _Arrival(NamedTuple):
+    esdf: Esdf  # conservative
+    toa: TimeOfArrival
+    starts_W: np.ndarray  # (STARTS, 3) [m]
+
+
+def _arrival(course: Course, voxel_size: float, seed: int) -> _Arrival:
+    """The time of arrival at the goal of a course, and free places from which it can be reached."""
+    field = AnalyticDistanceField(course.shapes, course.lower_W, course.upper_W)
+    esdf = esdf_from_distance_field(field, voxel_size).conservative()
+    toa = time_of_arrival(esdf, course.p_WG)
+    roomy = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
+    cells = np.argwhere(roomy)
+    if len(cells) == 0:
+        raise ValueError("no place in the course has room to start from; make it less dense")
+    rng = np.random.default_rng(seed)
+    starts = cells[rng.integers(len(cells), size=STARTS)] + 0.5
+    return _Arrival(esdf, toa, course.lower_W + voxel_size * starts)

@@ -1,0 +1,56 @@
+"""What depth policies are told, in torch; see `systems.policies.observation` for each formula."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class ObservationNoise:
+    """How depth images are disturbed in training, each pixel anew in every image."""
+
+    # [-] Standard deviation of each depth, as a part of it.
+    scale: float = 0.03
+    # [m] Standard deviation of what is added to each depth.
+    offset: float = 0.02
+    # [-] Part of the pixels that read nothing, which is as far as can be seen.
+    dropout: float = 0.01
+
+    def disturbed(self, depth: Tensor, generator: torch.Generator) -> Tensor:
+        """Planar depth (N, R) [m] as a worse camera measures it."""
+        normal = torch.empty_like(depth).normal_(generator=generator)
+        depth = depth * (1.0 + self.scale * normal)
+        if self.offset > 0.0:
+            depth = depth + self.offset * normal.normal_(generator=generator)
+        dropped = normal.uniform_(generator=generator) < self.dropout
+        return torch.where(dropped, torch.inf, depth.clamp(min=0.0))
+
+
+def inverse_depth(depth: Tensor, nearest: float, farthest: float) -> Tensor:
+    return 3.0 / depth.clamp(nearest, farthest) - 0.6
+
+
+def target_velocity(p: Tensor, p_WG: Tensor, speed: Tensor, slowing_time: float = 1.0) -> Tensor:
+    to_goal = p_WG - p
+    distance = to_goal.square().sum(1, keepdim=True).clamp(min=1e-6).sqrt()
+    return to_goal / (distance / speed[:, None]).clamp(min=slowing_time)
+
+
+def heading_frame(yaw: Tensor) -> Tensor:
+    """R_WH (N, 3, 3)."""
+    cos, sin = torch.cos(yaw), torch.sin(yaw)
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    return torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], 1).reshape(-1, 3, 3)
+
+
+def heading_observation(
+    R_WB: Tensor, R_WH: Tensor, p: Tensor, v: Tensor, p_WG: Tensor, speed: Tensor
+) -> Tensor:
+    """(N, 9) target velocity, velocity and the body's z axis in the heading frame."""
+    rows = torch.stack([target_velocity(p, p_WG, speed), v, R_WB[:, :, 2]], 1)
+    return (rows @ R_WH).flatten(1)
+
+
+def limited_acceleration(output: Tensor, limits: Tensor) -> Tensor:
+    return limits * torch.tanh(output / limits)

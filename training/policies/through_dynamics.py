@@ -1,0 +1,230 @@
+"""Learning to fly by descending a loss through the dynamics of many vehicles in flight."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from flysplat.training.policies.fields import STARTS, Fields
+from flysplat.training.policies.flight import PointMass
+from flysplat.training.policies.flights import Pilot, look
+from flysplat.training.policies.network import TrainableNetwork
+from flysplat.training.policies.observation import ObservationNoise, heading_frame
+
+NEAREST = 4
+"""Obstacles that the loss looks at, the nearest ones of each moment."""
+
+
+class Moment(NamedTuple):
+    """What a loss is made of: N vehicles after one step, everything in W and with gradients."""
+
+    v: Tensor  # (N, 3) [m/s], v_WB
+    v_mean: Tensor  # (N, 3) [m/s], its moving average
+    v_target: Tensor  # (N, 3) [m/s], along the way to the goal
+    a: Tensor  # (N, 3) [m/s^2]
+    jerk: Tensor  # (N, 3) [m/s^3]
+    clearance: Tensor  # (N, 4) [m], beyond the vehicle's radius, of the nearest obstacles
+    approach: Tensor  # (N, 4) [m/s], velocity towards them
+    yaw: Tensor  # (N,) [rad]
+    heading: Tensor | None  # (N,) [rad], asked for
+
+
+class Learner(Pilot, Protocol):
+    """A pilot that learns: its network, and what it wants."""
+
+    network: TrainableNetwork
+
+    def losses(self, moment: Moment) -> dict[str, Tensor]:
+        """The weighted terms of the loss, by name, each a mean over the vehicles."""
+        ...
+
+
+@dataclass
+class FlightSchool:
+    """How vehicles fly while they learn."""
+
+    # [-] Vehicles in flight at once.
+    environments: int = 64
+    # [-] Steps of the policy that the loss is descended through at once.
+    steps: int = 32
+    # [m/s] Range that each vehicle's wanted speed is drawn from.
+    speed: list[float] = field(default_factory=lambda: [1.5, 3.0])
+    # [s] Range that each vehicle's lag of the acceleration is drawn from.
+    lag: list[float] = field(default_factory=lambda: [0.07, 0.2])
+    # [-] What is left of a gradient that went back through a second of flight.
+    gradient_decay: float = 0.4
+    # [s] Time constant of the moving average of the velocity.
+    averaging: float = 0.5
+    # [s] A flight ends after this time, wherever it is.
+    longest: float = 30.0
+    noise: ObservationNoise = field(default_factory=ObservationNoise)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("environments", "steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"school.{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("speed", "lag"):
+            limits = getattr(self, name)
+            if len(limits) != 2 or not 0.0 < limits[0] <= limits[1] < float("inf"):
+                raise ValueError(
+                    f"school.{name} is {limits}; it must be two positive numbers, the lesser first"
+                )
+        if not 0.0 <= self.gradient_decay <= 1.0:
+            raise ValueError(
+                f"school.gradient_decay is {self.gradient_decay}; it must be between 0 and 1"
+            )
+        for name in ("averaging", "longest"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"school.{name} is {getattr(self, name)} s; it must be positive")
+
+
+class Flying(NamedTuple):
+    """The flights that go on from one update to the next."""
+
+    vehicle: PointMass
+    v_mean: Tensor  # (N, 3) [m/s]
+    memory: Tensor  # (N, H)
+    speed: Tensor  # (N,) [m/s]
+    age: Tensor  # (N,) [s]
+
+
+class NotFiniteError(ValueError):
+    """A term of the loss, or the gradient, became infinite or not a number."""
+
+
+class School:
+    """Flights in `fields` from which `learner` learns; vehicle n flies in world n modulo W."""
+
+    def __init__(
+        self, learner: Learner, fields: Fields, config: FlightSchool, generator: torch.Generator
+    ) -> None:
+        self.learner, self.fields, self.config = learner, fields, config
+        self.generator = generator
+        device = fields.p_WG.device
+        self.world = torch.arange(config.environments, device=device) % len(fields)
+        self._primitives = fields.primitives.of(self.world)
+        self._p_WG = fields.p_WG[self.world]
+        self._control = FlatnessControllerConfig()
+        self.flying = self._fresh()
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next lesson depends on but the learner."""
+        flying = [*self.flying.vehicle, *self.flying[1:]]
+        return {"flying": flying, "generator": self.generator.get_state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """The inverse of `state`."""
+        count = len(PointMass._fields)
+        self.flying = Flying(PointMass(*state["flying"][:count]), *state["flying"][count:])
+        self.generator.set_state(state["generator"])
+
+    def _uniform(self, *size: int) -> Tensor:
+        return torch.rand(*size, generator=self.generator, device=self.generator.device)
+
+    def _fresh(self) -> Flying:
+        """New flights, from anywhere, in flight towards about where the way leads."""
+        config, N = self.config, self.config.environments
+
+        def between(limits: list[float], *size: int) -> Tensor:
+            return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
+
+        start = (self._uniform(N) * STARTS).long().clamp(max=STARTS - 1)
+        p = self.fields.starts_W[self.world, start]
+        speed = between(config.speed, N)
+        way = self.fields.way(p, self.world)
+        v = way * (speed * self._uniform(N))[:, None] + 0.3 * (self._uniform(N, 3) - 0.5)
+        yaw = torch.atan2(way[:, 1], way[:, 0]) + 1.0 * (self._uniform(N) - 0.5)
+        lag = between(config.lag, N, 1)
+        return Flying(
+            PointMass(p, v, torch.zeros_like(p), yaw, lag),
+            v,
+            self.learner.initial_memory(N),
+            speed,
+            self._uniform(N) * config.longest,
+        )
+
+    def _renewed(self, flying: Flying) -> Flying:
+        """Flights that have ended begin anew."""
+        p = flying.vehicle.p
+        clearance = self._primitives.near(p)[0].amin(1) - VEHICLE_RADIUS
+        inside = (p > self.fields.lower_W[self.world]) & (p < self.fields.upper_W[self.world])
+        ended = (
+            (clearance < 0.0)
+            | ~inside.all(1)
+            | ((p - self._p_WG).norm(dim=1) < 0.5)
+            | (flying.age > self.config.longest)
+        )
+        fresh = self._fresh()
+        fresh = fresh._replace(age=torch.zeros_like(fresh.age))
+
+        def chosen(new: Tensor, old: Tensor) -> Tensor:
+            return torch.where(ended.reshape(-1, *[1] * (old.dim() - 1)), new, old)
+
+        vehicle = PointMass(*map(chosen, fresh.vehicle, flying.vehicle))
+        return Flying(vehicle, *map(chosen, fresh[1:], flying[1:]))
+
+    def lesson(self) -> dict[str, Tensor]:
+        """Flies on for `steps` and returns the mean of each term of the loss, differentiable."""
+        config, learner, fields = self.config, self.learner, self.fields
+        dt = 1.0 / learner.rate
+        keep = config.gradient_decay**dt
+        forget = 1.0 - torch.exp(torch.tensor(-dt / config.averaging))
+        with torch.no_grad():
+            vehicle, v_mean, memory, speed, age = self._renewed(self.flying)
+        totals: dict[str, Tensor] = {}
+        distances, normals = self._primitives.near(vehicle.p)
+        for _ in range(config.steps):
+            depth, R_WB = look(vehicle, self._primitives, learner.grid, distances)
+            depth = config.noise.disturbed(depth, self.generator)
+            R_WH = heading_frame(vehicle.yaw)
+            a_cmd, heading, memory = learner.decide(
+                depth, vehicle, R_WB, R_WH, self._p_WG, speed, memory
+            )
+            before = vehicle
+            vehicle = vehicle.decayed(keep).step(a_cmd, dt, self._control, heading)
+            v_mean = v_mean + forget * (vehicle.v - v_mean)
+            distances, normals = self._primitives.near(vehicle.p)
+            clearance, approach = _obstacles(vehicle, distances, normals)
+            with torch.no_grad():
+                to_goal = (self._p_WG - vehicle.p).norm(dim=1)
+                way = fields.way(vehicle.p, self.world)
+                v_target = way * torch.minimum(speed, to_goal)[:, None]
+            moment = Moment(
+                vehicle.v,
+                v_mean,
+                v_target,
+                vehicle.a,
+                (vehicle.a - before.a) / dt,
+                clearance,
+                approach,
+                vehicle.yaw,
+                heading,
+            )
+            for name, term in learner.losses(moment).items():
+                totals[name] = totals.get(name, 0.0) + term / config.steps
+        self.flying = Flying(
+            vehicle.detached(),
+            v_mean.detach(),
+            memory.detach(),
+            speed,
+            age + config.steps * dt,
+        )
+        return totals
+
+
+def _obstacles(vehicle: PointMass, distances: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Clearance (N, 4) [m] and velocity of approach (N, 4) [m/s] of the nearest obstacles.
+
+    Args:
+      distances, normals: (N, M) and (N, 3, M) of all obstacles.
+    """
+    nearest = distances.topk(min(NEAREST, distances.shape[1]), dim=1, largest=False)
+    n = normals.gather(2, nearest.indices[:, None].expand(-1, 3, -1))  # (N, 3, 4)
+    # The value is the distance, and the gradient its normal.
+    along = ((vehicle.p - vehicle.p.detach())[:, :, None] * n).sum(1)
+    approach = -(vehicle.v[:, :, None] * n).sum(1)
+    return nearest.values + along - VEHICLE_RADIUS, approach
