@@ -189,9 +189,9 @@ def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
 def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
     """Writes how far poses may be perturbed into `scene.yaml`: each pose, and any pose.
 
-    The latter is the offset to which the median view stays within the limits where the truth
-    was rendered; a few poses bear less, which their own bounds say. Withheld frames do not say this directly, for taking them away takes views away too:
-    there it is the median over the poses.
+    The latter is the offset to which the median view stays within the limits where the truth was
+    rendered; a few poses bear less, as their own bounds say. Withheld frames do not say this
+    directly, for taking them away takes views away too: there it is the median over the poses.
     """
     bounds = pose_bounds(SceneViews(scene), study)
     metadata = replace(

@@ -25,8 +25,8 @@ _ERROR_LIMIT = 0.2  # [m]
 
 
 def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
-    """Draws PSNR and depth errors of each scene against the offset from the path: medians
-    with the 10th to 90th percentile, the limits, and as a vertical line how far medians keep them."""
+    """Draws PSNR and depth errors of each scene against the offset from the path: medians with the
+    10th to 90th percentile, the limits, and as a vertical line how far the medians keep them."""
     figure = Figure(figsize=(11, 3.6), dpi=150, layout="constrained")
     axes = figure.subplots(1, 3)
     panels = (
