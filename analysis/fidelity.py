@@ -57,7 +57,7 @@ class FidelityConfig:
     kept: int = 5
     """Frames kept between them."""
     max_depth_error: float = 0.05
-    """Mean relative error of depth that is still trusted."""
+    """Relative error of depth, mean over a view, of which the median view is still trusted."""
     max_psnr_drop: float = 6.0
     """[dB] below the held-out frames on the path that is still trusted: errors twice as large."""
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
@@ -189,9 +189,9 @@ def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
 def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
     """Writes how far poses may be perturbed into `scene.yaml`: each pose, and any pose.
 
-    The latter is the offset to which mean errors stay within the limits where the truth was
-    rendered. Withheld frames do not say this directly, for taking them away takes views away too:
-    there it is the median over the poses.
+    The latter is the offset to which the median view stays within the limits where the truth was
+    rendered; a few poses bear less, as their own bounds say. Withheld frames do not say this
+    directly, for taking them away takes views away too: there it is the median over the poses.
     """
     bounds = pose_bounds(SceneViews(scene), study)
     metadata = replace(

@@ -16,17 +16,17 @@ from flysplat.analysis.figures import (
     write_sheet,
 )
 from flysplat.analysis.measure_scene import SceneViews, depth_panels
+from flysplat.analysis.trust import band
 from flysplat.training.captures.capture import CaptureFrame
 from flysplat.training.measures import fit_exposure
 
-_BINS = 8
 _COLUMNS = 6
 _ERROR_LIMIT = 0.2  # [m]
 
 
 def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
-    """Draws PSNR and depth errors of each scene against the offset from the path: medians with
-    quartiles, the limits, and as a vertical line how far they are kept on average."""
+    """Draws PSNR and depth errors of each scene against the offset from the path: medians with the
+    10th to 90th percentile, the limits, and as a vertical line how far the medians keep them."""
     figure = Figure(figsize=(11, 3.6), dpi=150, layout="constrained")
     axes = figure.subplots(1, 3)
     panels = (
@@ -40,9 +40,9 @@ def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
         for axis, (name, title, factor) in zip(axes, panels, strict=True):
             y = factor * study.column(name)
             axis.plot(x, y, ".", color=color, alpha=0.4, markersize=5, markeredgewidth=0)
-            at, low, middle, high = _quartiles(x, y)
-            axis.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
-            axis.plot(at, middle, "o-", color=color, markersize=4, label=study.name)
+            found = band(x, y)
+            axis.fill_between(found.at, found.low, found.high, color=color, alpha=0.2, linewidth=0)
+            axis.plot(found.at, found.middle, "o-", color=color, markersize=4, label=study.name)
             axis.axvline(study.reach, color=color, linestyle="--", linewidth=1)
             axis.set_ylabel(title)
         if len(studies) == 1:
@@ -59,7 +59,7 @@ def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
         axis.grid(alpha=0.3)
         axis.set_xlim(left=0)
         if name != "psnr_db":
-            top = max(np.percentile(factor * study.column(name), 98) for study in studies)
+            top = max(np.percentile(factor * study.column(name), 92) for study in studies)
             axis.set_ylim(0, 1.1 * top)
     axes[0].legend(frameon=False)
     save(figure, path)
@@ -85,16 +85,3 @@ def write_views(
     columns = [f"{samples[k].offset:.2f} m" for k in picked]
     titles = ["truth", "scene", "its depth", "depth error"]
     write_sheet(path, rows, columns, titles, [None, None, depths, errors])
-
-
-def _quartiles(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns mean x and quartiles of y over the distinct x, or over bins of as many samples."""
-    order = np.argsort(x, kind="stable")
-    distinct = np.unique(np.round(x, 6))
-    if len(distinct) <= 2 * _BINS:
-        groups = [np.flatnonzero(np.isclose(x, value)) for value in distinct]
-    else:
-        groups = np.array_split(order, min(_BINS, len(x)))
-    at = np.array([x[group].mean() for group in groups])
-    low, middle, high = np.array([np.percentile(y[group], [25, 50, 75]) for group in groups]).T
-    return at, low, middle, high

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flysplat.analysis.trust import monotone_fit, reach
+from flysplat.analysis.trust import band, monotone_fit, reach
 from flysplat.training.measures import ViewMeasures
 
 
@@ -56,17 +56,17 @@ class FidelityStudy:
 
     @cached_property
     def reach(self) -> float:
-        """[m], the largest offset up to which mean errors stay within the limits."""
+        """[m], the largest offset up to which the median view stays within the limits."""
         return self._reach("offset")
 
     @cached_property
     def unseen_limit(self) -> float:
-        """The largest unseen share of a view at which mean errors stay within the limits."""
+        """The largest unseen share of a view at which the median view stays within the limits."""
         return self._reach("unseen")
 
     def at(self, offset: float) -> dict[str, float]:
-        """Returns PSNR and depth errors at an offset [m], from the monotone fits; NaN where nothing
-        was measured."""
+        """Returns what the median view has at an offset [m], from the monotone fits; NaN where
+        nothing was measured."""
         x = self.column("offset")
         if not x.min() - 1e-9 <= offset <= x.max() + 1e-9:
             return dict.fromkeys(("psnr_db", "depth_mae_m", "depth_relative"), float("nan"))
@@ -101,19 +101,24 @@ class FidelityStudy:
     def __str__(self) -> str:
         lines = [
             f"{self.name}: {len(self.samples)} views, truth {self.kind}; on the path "
-            f"{self.on_path_psnr_db:.2f} dB",
-            f"{'offset [m]':>12} {'PSNR [dB]':>10} {'depth MAE [m]':>14} {'relative':>9}",
+            f"{self.on_path_psnr_db:.2f} dB; medians and 10 to 90 % of the views",
+            f"{'offset [m]':>10} {'views':>6} {'PSNR [dB]':>21} {'depth MAE [m]':>24} "
+            f"{'relative [%]':>20}",
         ]
-        for offset in (0.0, 0.1, 0.25, 0.5, 0.75, 1.0):
-            row = self.at(offset)
-            if np.isfinite(row["psnr_db"]):
-                lines.append(
-                    f"{offset:>12.2f} {row['psnr_db']:>10.2f} {row['depth_mae_m']:>14.3f} "
-                    f"{row['depth_relative']:>9.2%}"
-                )
+        x = self.column("offset")
+        bands = [
+            band(x, factor * self.column(name))
+            for name, factor in (("psnr_db", 1), ("depth_mae_m", 1), ("depth_relative", 100))
+        ]
+        for k, (at, count) in enumerate(zip(bands[0].at, bands[0].counts, strict=True)):
+            psnr, mae, relative = (
+                f"{b.middle[k]:.{digits}f} ({b.low[k]:.{digits}f} to {b.high[k]:.{digits}f})"
+                for b, digits in zip(bands, (1, 3, 1), strict=True)
+            )
+            lines.append(f"{at:>10.2f} {count:>6} {psnr:>21} {mae:>24} {relative:>20}")
         inside, outside = self.agreement()
         lines += [
-            f"within limits to {self.reach:.2f} m: on average, depth errors up to "
+            f"the median view is within limits to {self.reach:.2f} m: depth errors up to "
             f"{self.max_depth_error:.0%} and PSNR up to {self.max_psnr_drop:g} dB lower",
             f"trusted views: those seen to {1 - self.unseen_limit:.0%} or more; {inside:.0%} of "
             f"them keep these limits, {outside:.0%} of the others",

@@ -1,25 +1,54 @@
 """From measured errors to how far they can be trusted: monotone fits and where they cross limits.
 
 Errors grow with what drives them (distance from the capture, or the share of a view nobody saw), up
-to noise. So each error is fitted by the non-decreasing function of least squares, and the reach is
-where that function exceeds its limit.
+to noise, and single views that show what nobody saw are wrong by any amount. So medians over views
+are fitted by the non-decreasing function of least squares, and the reach is where that function
+exceeds its limit: one half of the views keep it there.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import isotonic_regression
 
+_MOST_GROUPS = 16
+_PER_GROUP = 5  # samples at least, where x takes more values than there may be groups
+
+
+@dataclass(frozen=True)
+class Band:
+    """Groups of samples of like x, in rising order: their mean x, their number, and the 10th, 50th
+    and 90th percentile of y."""
+
+    at: NDArray[np.float64]
+    counts: NDArray[np.int64]
+    low: NDArray[np.float64]
+    middle: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+
+def band(x: ArrayLike, y: ArrayLike) -> Band:
+    """Groups samples by x: one group for each value if there are at most 16, otherwise up to 16
+    groups of as many samples, at least 5 each."""
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    values, which = np.unique(np.round(x, 6), return_inverse=True)
+    if len(values) <= _MOST_GROUPS:
+        groups = [np.flatnonzero(which == k) for k in range(len(values))]
+    else:
+        count = min(_MOST_GROUPS, max(1, len(x) // _PER_GROUP))
+        groups = np.array_split(np.argsort(x, kind="stable"), count)
+    low, middle, high = np.array([np.percentile(y[group], [10, 50, 90]) for group in groups]).T
+    at = np.array([x[group].mean() for group in groups])
+    return Band(at, np.array([len(group) for group in groups]), low, middle, high)
+
 
 def monotone_fit(x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the distinct values of x in rising order, and there the non-decreasing function that
-    is closest to y in the least-squares sense (pool adjacent violators)."""
-    distinct, inverse, counts = np.unique(
-        np.asarray(x, np.float64), return_inverse=True, return_counts=True
-    )
-    means = np.bincount(inverse, np.asarray(y, np.float64)) / counts
-    return distinct, isotonic_regression(means, weights=counts).x
+    """Returns mean x of the groups of `band`, and there the non-decreasing function that is closest
+    to the medians of y in the least-squares sense (pool adjacent violators)."""
+    found = band(x, y)
+    return found.at, isotonic_regression(found.middle, weights=found.counts).x
 
 
 def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:

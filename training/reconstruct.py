@@ -1,7 +1,7 @@
 """From a capture to a scene folder that can be flown in."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +124,7 @@ def reconstruct(
 ) -> ReconstructSummary:
     """Writes the scene folder `out`; see `run`. `path` says where the capture lies."""
     config.validate()
+    config = _resolved(config, capture)
     every = config.hold_out if config.iterations else 0
     held_out = list(range(0, len(capture), every)) if every else []
     fitted = [i for i in range(len(capture)) if i not in held_out]
@@ -227,6 +228,21 @@ def mean_color(views: ReconstructionViews) -> tuple[float, float, float]:
     return red, green, blue
 
 
+def _starts(capture: Capture) -> dict[str, bool]:
+    """Returns the initializations and whether the capture has them, the best first."""
+    return {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
+
+
+def _resolved(config: ReconstructConfig, capture: Capture) -> ReconstructConfig:
+    """Returns the config with what "auto" means for this capture."""
+    kind, strategy = config.initialization, config.strategy
+    if kind == "auto":
+        kind = next(name for name, there in _starts(capture).items() if there)
+    if strategy == "auto":
+        strategy = "none" if kind == "depth" else "default"
+    return replace(config, initialization=kind, strategy=strategy)
+
+
 def _initial(
     capture: Capture,
     frames: Sequence,
@@ -239,10 +255,7 @@ def _initial(
     Raises:
         ValueError: if the capture lacks what is asked for.
     """
-    has = {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
-    kind = config.initialization
-    if kind == "auto":
-        kind = next(name for name, there in has.items() if there)
+    kind, has = config.initialization, _starts(capture)
     if not has[kind]:
         raise ValueError(
             f"initialization is {kind!r}, but {capture.name} has none; choose "

@@ -9,7 +9,7 @@ from flysplat.training.captures.capture_config import CaptureConfig
 
 REPRESENTATIONS = ("3dgs", "2dgs")
 INITIALIZATIONS = ("auto", "depth", "points", "random")
-STRATEGIES = ("none", "default", "mcmc")
+STRATEGIES = ("auto", "none", "default", "mcmc")
 DISTANCE_FIELDS = ("rendered", "captured")
 DEVICES = ("cpu", "cuda")
 
@@ -61,9 +61,10 @@ class ReconstructConfig:
     sh_degree: int = 0
     """Of the spherical harmonics; 0 gives the same colour in all directions."""
 
-    strategy: str = "none"
+    strategy: str = "auto"
     """How Gaussians are added and removed: "none", "default" (Kerbl et al. 2023) or "mcmc"
-    (Kheradmand et al. 2024)."""
+    (Kheradmand et al. 2024); "auto" is "none" where they start from depth, which puts some on every
+    surface, and "default" elsewhere."""
     refine_start: int = 500
     """Step of the first change."""
     refine_every: int = 100

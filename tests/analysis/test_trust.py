@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from flysplat.analysis.trust import first_crossing, monotone_fit, reach
+from flysplat.analysis.trust import band, first_crossing, monotone_fit, reach
 
 
 def test_fit_pools_violators():
-    """The fit keeps what rises and averages what falls; equal x are averaged first."""
-    x, fit = monotone_fit([3, 0, 1, 2, 2], [4, 0, 3, 1, 3])
+    """The fit keeps what rises and averages what falls; of equal x the median counts."""
+    x, fit = monotone_fit([3, 0, 1, 2, 2, 2, 2], [4, 0, 3, -90, 1, 3, 90])
     np.testing.assert_allclose(x, [0, 1, 2, 3])
-    # At 2 the mean is 2 (twice the weight), below the 3 at 1: pooled to 7/3.
-    np.testing.assert_allclose(fit, [0, 7 / 3, 7 / 3, 4])
+    # At 2 the median is 2 (four times the weight), below the 3 at 1: pooled to 11/5.
+    np.testing.assert_allclose(fit, [0, 2.2, 2.2, 4])
 
 
 def test_reach_is_where_the_fit_crosses():
@@ -19,6 +19,26 @@ def test_reach_is_where_the_fit_crosses():
     rng = np.random.default_rng(0)
     many = rng.uniform(0, 2, 4000)
     assert reach(many, 0.3 * many + rng.normal(0, 0.05, 4000), 0.15) == pytest.approx(0.5, abs=0.08)
+
+
+def test_one_wrong_view_does_not_move_the_reach():
+    """A view that shows what nobody saw, wrong by a thousand times the others, changes nothing."""
+    x = np.repeat(np.linspace(0, 1, 11), 9)
+    y = 0.3 * x
+    y[:1] = 300.0
+    assert reach(x, y, 0.15) == pytest.approx(0.5)
+
+
+def test_bands():
+    """Few values of x are a group each; many are cut into groups of as many samples; both have the
+    percentiles of what is in them."""
+    found = band(np.repeat([0.5, 0.0], 11), np.r_[np.arange(11), np.full(11, 7)])
+    np.testing.assert_allclose(found.at, [0, 0.5])
+    np.testing.assert_allclose([found.low, found.middle, found.high], [[7, 1], [7, 5], [7, 9]])
+    many = band(np.arange(40), 2.0 * np.arange(40))
+    np.testing.assert_array_equal(many.counts, [5] * 8)
+    np.testing.assert_allclose(many.middle, 2 * many.at)
+    assert len(band(np.arange(4000), np.arange(4000)).at) == 16
 
 
 def test_reach_ends_where_nothing_was_measured():

@@ -64,6 +64,22 @@ def test_metric_depth_is_what_places_surfaces(tmp_path, room):
     assert 0 < errors[1] < 0.5 * errors[0]
 
 
+def test_gaussians_are_added_where_depth_puts_none(tmp_path, room):
+    """Left to itself, a reconstruction adds Gaussians where they start at random, but none where
+    they start from depth."""
+    config = replace(CONFIG, initial_gaussians=300, iterations=80, refine_start=5, refine_every=10)
+
+    def count(**changes) -> int:
+        return run(
+            capture=room, out=tmp_path / "scene", config=replace(config, **changes)
+        ).gaussians
+
+    assert count(initialization="random") > 300
+    assert count(initialization="random", strategy="none") == 300
+    config = replace(config, initial_gaussians=3000)
+    assert count() == count(strategy="none")
+
+
 def test_without_depth_from_points(tmp_path, write_room):
     """A capture without depth is reconstructed from points: withheld images come out, and the gains
     of all images are found."""
