@@ -253,7 +253,7 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _posed(
     depths: Iterable[np.ndarray], X_WCs: Sequence[RigidTransform], what: str
 ) -> Iterator[tuple[np.ndarray, RigidTransform]]:
-    """Pairs images, pixels that say nothing set to 0, with poses; checks them and shows progress."""
+    """Pairs images, pixels that say nothing set to 0, with poses; checks and shows progress."""
     shape, count = None, 0
     for depth in tqdm(depths, desc=what, total=len(X_WCs), unit="image", delay=2.0):
         depth = np.asarray(depth, dtype=np.float32)
