@@ -33,7 +33,7 @@ def _tour(options: argparse.Namespace) -> None:
         config.render.up = options.up
     config = load_config(config, overrides=options.overrides)
     tour.run(
-        world=benchmark_scenarios().get(str(options.world), options.world),
+        world=benchmark_scenarios().get(str(options.world)) or options.world,
         out=options.out,
         scene=options.scene,
         config=config,
