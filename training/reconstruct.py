@@ -40,6 +40,7 @@ from flysplat.training.scene_distance_field import (
     fuse,
     rendered_depth,
     unit_of,
+    with_sky,
 )
 
 # Opacity with which Gaussians on surfaces start into the optimisation.
@@ -170,7 +171,7 @@ def reconstruct(
             gains[held_out] = figures.gains
         how = f"{config.representation}, {config.iterations} steps"
 
-    field, difference = _distance_field(capture, fitted, gaussians, factor, config)
+    field, difference = _distance_field(capture, frames, gaussians, factor, config)
     p_WS, p_WG, geodesic, warnings = _start_and_goal(capture, field)
     write_scene_folder(
         out,
@@ -290,7 +291,7 @@ def _perceptual(config: ReconstructConfig) -> Callable[[Tensor, Tensor], Tensor]
 
 def _distance_field(
     capture: Capture,
-    fitted: Sequence[int],
+    frames: ShrunkFrames,
     gaussians: GaussianScene,
     factor: int,
     config: ReconstructConfig,
@@ -316,13 +317,13 @@ def _distance_field(
     if not capture.has_depth:
         return fuse(rendered, voxel_size, max_range), None
     truth = fuse(every, voxel_size, max_range)
-    field = fuse(rendered, voxel_size, max_range, (truth.lower_W, truth.upper_W))
+    field = fuse(with_sky(rendered, frames), voxel_size, max_range, (truth.lower_W, truth.upper_W))
     difference = compare_fields(field, truth)
     if config.distance_field == "rendered":
         return field, difference
     seen = DepthSource(
-        lambda k: capture.registered_depth(fitted[k]),
+        lambda k: capture.registered_depth(frames.numbers[k]),
         capture.K,
-        [capture.X_WCs[i] for i in fitted],
+        [capture.X_WCs[i] for i in frames.numbers],
     )
     return fuse(seen, voxel_size, max_range), difference

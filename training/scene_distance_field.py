@@ -12,6 +12,7 @@ from flysplat.systems.collision.distance_field import FieldState
 from flysplat.systems.collision.esdf import Esdf
 from flysplat.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from flysplat.systems.splats.gaussian_scene import GaussianScene
+from flysplat.training.reconstruction_views import ShrunkFrames
 from flysplat.training.splat_rendering import render
 
 # Rendered depth counts where at least this much of the light is stopped.
@@ -72,6 +73,20 @@ def rendered_depth(
         return torch.where(rendering.alpha > _SOLID, rendering.depth, 0).numpy()
 
     return DepthSource(load, K, X_WCs)
+
+
+def with_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
+    """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
+    number measured nothing within range: there the space before the sky was seen to be free."""
+    places = {number: k for k, number in enumerate(frames.numbers)}
+
+    def load(i: int) -> NDArray[np.float32]:
+        depth = rendered.load(i)
+        if i not in places:
+            return depth
+        return np.where((depth == 0) & np.isinf(frames[places[i]].depth), np.float32(np.inf), depth)
+
+    return DepthSource(load, rendered.K, rendered.X_WCs)
 
 
 def fuse(

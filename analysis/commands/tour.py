@@ -12,7 +12,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         "tour", help="from a mesh to a flight: render a capture, reconstruct it, fly in it"
     )
     tour.set_defaults(verb=_tour)
-    tour.add_argument("world", type=Path, help=".gltf or .obj, or a scenario of a generated world")
+    tour.add_argument(
+        "world", type=Path, help=".gltf or .obj, or a scenario of a generated world: P01 or a file"
+    )
     tour.add_argument("--out", type=Path, required=True, help="folder for capture, scene, flight")
     tour.add_argument("--scene", type=Path, help="scene folder to write (default: OUT/scene)")
     tour.add_argument("--up", choices=("y", "z"), help="axis of the mesh file that points up")
@@ -22,6 +24,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _tour(options: argparse.Namespace) -> None:
     from flysplat.analysis import tour
+    from flysplat.analysis.study import benchmark_scenarios
     from flysplat.diagrams.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
@@ -30,7 +33,7 @@ def _tour(options: argparse.Namespace) -> None:
         config.render.up = options.up
     config = load_config(config, overrides=options.overrides)
     tour.run(
-        world=options.world,
+        world=benchmark_scenarios().get(str(options.world)) or options.world,
         out=options.out,
         scene=options.scene,
         config=config,

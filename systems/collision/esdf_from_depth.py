@@ -41,8 +41,9 @@ def esdf_from_depth_images(
     `truncation` behind an edge counts as occupied until another image clears it, which is safe.
 
     Args:
-      depths: images (H, W) float [m], planar depth along the optical axis; 0, infinite, NaN and
-        negative pixels say nothing. One at a time is held in memory.
+      depths: images (H, W) float [m], planar depth along the optical axis; 0, NaN and negative
+        pixels say nothing, infinite ones that nothing stands in the way, as before the sky. One at
+        a time is held in memory.
       K: (3, 3) intrinsics [px]; pixel (row i, column j) is centred at (j + 0.5, i + 0.5).
       X_WCs: the camera's pose of each image (x right, y down, z forward).
       lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
@@ -89,7 +90,7 @@ def bounds_of_depth_images(
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     for depth, X_WC in _posed(depths, X_WCs, "bounding depth"):
         row, column = np.mgrid[0 : depth.shape[0] : 4, 0 : depth.shape[1] : 4]
-        z = depth[::4, ::4]
+        z = np.where(np.isfinite(depth), depth, 0.0)[::4, ::4]
         x, y = (column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1]
         ray = np.stack([x, y, np.ones_like(x)], -1)
         reach = np.minimum(z, max_range / np.linalg.norm(ray, axis=-1))
@@ -198,7 +199,7 @@ class _Fusion:
         size = np.maximum(right - left, bottom - top)
         level_of = np.ceil(np.log2(np.maximum(size, 1.0))).astype(int)
         seen = np.zeros(len(possible), dtype=bool)
-        farthest = np.where(np.isfinite(depth), depth, 0.0)
+        farthest = depth
         for level in range(int(level_of.max(initial=0)) + 1):
             of_level = np.flatnonzero(level_of == level)
             last_row, last_column = farthest.shape[0] - 1, farthest.shape[1] - 1
@@ -252,7 +253,7 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _posed(
     depths: Iterable[np.ndarray], X_WCs: Sequence[RigidTransform], what: str
 ) -> Iterator[tuple[np.ndarray, RigidTransform]]:
-    """Pairs images, pixels without depth set to 0, with poses; checks them and shows progress."""
+    """Pairs images, pixels that say nothing set to 0, with poses; checks and shows progress."""
     shape, count = None, 0
     for depth in tqdm(depths, desc=what, total=len(X_WCs), unit="image", delay=2.0):
         depth = np.asarray(depth, dtype=np.float32)
@@ -263,7 +264,7 @@ def _posed(
                 f"images (the first has {shape})."
             )
         if count < len(X_WCs):
-            yield np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0)), X_WCs[count]
+            yield np.where(depth > 0.0, depth, np.float32(0.0)), X_WCs[count]
         count += 1
     if count != len(X_WCs) or count == 0:
         raise ValueError(

@@ -122,8 +122,12 @@ class Box:
     def distances(
         p: np.ndarray, center: np.ndarray, rotation: np.ndarray, half: np.ndarray
     ) -> np.ndarray:
-        beyond = np.abs(_to_local(p - center, rotation)) - half
-        return _norm(np.maximum(beyond, 0.0)) + np.minimum(beyond.max(axis=-1), 0.0)
+        # By component: numpy is several times slower along a last axis of three.
+        d = [p[..., i] - center[..., i] for i in range(3)]
+        along = [sum(d[j] * rotation[..., j, i] for j in range(3)) for i in range(3)]
+        x, y, z = (np.abs(along[i]) - half[..., i] for i in range(3))
+        outside = sum(np.maximum(beyond, 0.0) ** 2 for beyond in (x, y, z))
+        return np.sqrt(outside) + np.minimum(np.maximum(np.maximum(x, y), z), 0.0)
 
     @staticmethod
     def gradients(

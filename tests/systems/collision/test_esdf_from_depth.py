@@ -155,10 +155,10 @@ def test_a_wall_is_measured_along_its_normal(slope):
 
 
 def test_pixels_without_depth_say_nothing():
-    """0, NaN, infinite and negative pixels leave everything unknown, beside valid ones too."""
+    """0, NaN and negative pixels leave everything unknown, beside valid ones too."""
     box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
     clean = wall(1.5)
-    for nothing in (0.0, np.nan, np.inf, -1.0):
+    for nothing in (0.0, np.nan, -1.0):
         depth = clean.copy()
         depth[:, :60] = nothing
         field = esdf_from_depth_images([depth], K, [RigidTransform()], *box, 0.05)
@@ -169,6 +169,23 @@ def test_pixels_without_depth_say_nothing():
             [np.full_like(depth, nothing)], K, [RigidTransform()], *box, 0.05
         )
         assert (blind.states == UNKNOWN).all()
+
+
+def test_the_sky_clears_the_space_before_it():
+    """Infinite depth frees its pixel's space up to the range, moves no surface that another view
+    measures, and does not widen the bounds."""
+    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
+    half_sky = wall(1.5)
+    half_sky[:, :60] = np.inf
+    field = esdf_from_depth_images([half_sky], K, [RigidTransform()], *box, 0.05, max_range=2.0)
+    sample = field.query([[-0.2, 0.0, 0.5], [-0.2, 0.0, 1.7], [-0.2, 0.0, 2.2], [0.2, 0.0, 1.6]])
+    np.testing.assert_array_equal(sample.state, [FREE, FREE, UNKNOWN, OCCUPIED])
+    both = [half_sky, wall(1.5)], K, [RigidTransform()] * 2
+    field = esdf_from_depth_images(*both, *box, 0.05)
+    assert (field.query([[-0.2, 0.0, 1.56], [0.2, 0.0, 1.56]]).state == OCCUPIED).all()
+    np.testing.assert_allclose(
+        bounds_of_depth_images([half_sky], K, [RigidTransform()])[1][2], 1.7, atol=1e-6
+    )
 
 
 def test_a_wall_out_of_range_clears_the_space_before_it():

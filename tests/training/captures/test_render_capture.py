@@ -7,6 +7,8 @@ import pytest
 import trimesh
 
 from flysplat.analysis.cli import main
+from flysplat.diagrams.worlds.make_world import make_blueprint
+from flysplat.diagrams.worlds.room import RoomConfig
 from flysplat.training.captures.read_capture import read_capture
 from flysplat.training.captures.render_capture import (
     RenderConfig,
@@ -102,15 +104,12 @@ def test_interrupted_rendering_goes_on(opengl, room, tmp_path):
 def test_generated_world_is_rendered_where_it_is(opengl, tmp_path):
     """A scenario's generated world is exported with the capture, and all depth seen inside its
     volume lies on the world's surfaces."""
-    from flysplat.diagrams.worlds.make_world import make_blueprint
-    from flysplat.diagrams.worlds.walls import WallsConfig
-
-    scenario = tmp_path / "slalom.yaml"
-    scenario.write_text("world: !WallsConfig {length: 12, walls: 1, height: 3}\n")
-    config = RenderConfig(width=64, height=48, path=[[2.0, 0, 1.5]], yaws=[0.0, 120.0])
+    scenario = tmp_path / "room.yaml"
+    scenario.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
+    config = RenderConfig(width=64, height=48, path=[[1.5, 0.4, 1.5]], yaws=[0.0, 120.0])
     run(world=scenario, out=tmp_path / "capture", config=config, seed=4)
     capture = read_capture(tmp_path / "capture")
-    blueprint = make_blueprint(WallsConfig(length=12, walls=1, height=3), 4)
+    blueprint = make_blueprint(RoomConfig(length=6, width=4, height=2.6, items=1), 4)
     for frame in capture.frames():
         v, u = np.mgrid[:48, :64] + 0.5
         p_CQ = frame.back_project(u, v, frame.depth)[np.isfinite(frame.depth)]
