@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from flysplat.analysis import measure_scene
 from flysplat.diagrams import fly
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.make_world import SceneConfig
@@ -50,5 +51,6 @@ def run(
         print(f"{scene}: is reconstructed already")
     else:
         reconstruct.run(capture=capture, out=scene, config=config.reconstruct)
+        measure_scene.run(scene)
     config.flight.world = SceneConfig(path=str(scene.absolute()))
     return fly.run(scenario=config.flight, out=out / "flight")
