@@ -188,11 +188,11 @@ class _Fusion:
             spread_x = K[0, 0] * reach * np.sqrt(1.0 + (x / z) ** 2)
             spread_y = K[1, 1] * reach * np.sqrt(1.0 + (y / z) ** 2)
             column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        around = near <= 0.0
-        left = np.where(around, 0.0, np.clip(column - spread_x, 0.0, width))
-        right = np.where(around, width, np.clip(column + spread_x, 0.0, width))
-        top = np.where(around, 0.0, np.clip(row - spread_y, 0.0, height))
-        bottom = np.where(around, height, np.clip(row + spread_y, 0.0, height))
+            around = near <= 0.0
+            left = np.where(around, 0.0, np.clip(column - spread_x, 0.0, width))
+            right = np.where(around, width, np.clip(column + spread_x, 0.0, width))
+            top = np.where(around, 0.0, np.clip(row - spread_y, 0.0, height))
+            bottom = np.where(around, height, np.clip(row + spread_y, 0.0, height))
         in_view = (right > left) & (bottom > top)
         possible, near = possible[in_view], near[in_view]
         left, right, top, bottom = (side[in_view] for side in (left, right, top, bottom))

@@ -38,9 +38,6 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
         assert metadata.held_out == [0, 8]
         assert float(row["psnr_db"]) > 5 and row["lpips"] == ""
         assert f"{float(row['psnr_db']):.2f}" in printed
-    # Depth-started arms know the room; points carry its geometry too, but large and faint.
-    errors = {row["arm"]: float(row["depth_mae_m"]) for row in rows[:4]}
-    assert errors["3dgs_depth"] < errors["3dgs"]
     assert np.shape(cv2.imread(str(place.folder / "room.png")))[1] > 5 * 64
 
     def fail(*args, **kwargs):
