@@ -19,9 +19,10 @@ class TourConfig:
     """How each stage of a tour is done."""
 
     render: RenderConfig = field(default_factory=lambda: RenderConfig(spacing=0.8, apart=4.0))
-    # Places through which one flies are larger than those that one looks at.
+    # Places through which one flies are larger than those that one looks at: more Gaussians, and
+    # voxels of which the planner can search a whole hall in seconds.
     reconstruct: ReconstructConfig = field(
-        default_factory=lambda: ReconstructConfig(initial_gaussians=120_000)
+        default_factory=lambda: ReconstructConfig(initial_gaussians=120_000, voxel_size=0.1)
     )
     flight: Scenario = field(default_factory=Scenario)  # its world is the reconstruction
 
