@@ -35,10 +35,10 @@ from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfi
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from flysplat.training.policies.courses import CourseSelection, training_fields, validation_fields
 from flysplat.training.policies.fields import STARTS, Fields
-from flysplat.training.policies.flight import BodyRate
-from flysplat.training.policies.flights import FlightConditions, Vehicle, fly_courses, look
+from flysplat.training.policies.flight import BodyRate, Vehicle
+from flysplat.training.policies.flights import FlightConditions, fly_courses, look
 from flysplat.training.policies.network import TrajectoryModule
-from flysplat.training.policies.observation import ObservationNoise, target_velocity
+from flysplat.training.policies.observation import Observation, ObservationNoise, target_velocity
 from flysplat.training.policies.primitives import PinholeGrid
 from flysplat.training.policies.train import Schedule
 
@@ -105,31 +105,21 @@ class AgilePilot:
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, 0, device=self._device)
 
-    def observe(
-        self, depth: Tensor, vehicle: Vehicle, R_WB: Tensor, p_WG: Tensor, speed: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
         """Images (N, 24, 32) and states (N, 18)."""
-        spec = self.network.spec
-        image = 1.0 / depth.clamp(NEAREST, FARTHEST)
+        spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.R_WB
+        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
         rates = vehicle.state[:, 10:13] if isinstance(vehicle, BodyRate) else 0.0 * vehicle.v
-        rows = torch.stack([vehicle.v, target_velocity(vehicle.p, p_WG, speed)], 1) @ R_WB
+        v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
+        rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
         state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
         return image.reshape(-1, spec.image_height, spec.image_width), state
 
-    def decide(
-        self,
-        depth: Tensor,
-        vehicle: Vehicle,
-        R_WB: Tensor,
-        R_WH: Tensor,
-        p_WG: Tensor,
-        speed: Tensor,
-        memory: Tensor,
-    ) -> tuple[Tensor, None, Tensor]:
-        waypoints, costs = self.network(*self.observe(depth, vehicle, R_WB, p_WG, speed))
+    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
+        waypoints, costs = self.network(*self.observe(seen))
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
-        p_WR = vehicle.p + (R_WB @ best[:, _LOOKAHEAD, :, None])[:, :, 0]
-        return _reaching(p_WR, vehicle), None, memory
+        p_WR = seen.vehicle.p + (seen.R_WB @ best[:, _LOOKAHEAD, :, None])[:, :, 0]
+        return _reaching(p_WR, seen.vehicle), None, memory
 
 
 class AgileTrainee:
@@ -234,13 +224,14 @@ class AgileTrainee:
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
                 distances, _ = primitives.near(vehicle.p)
             depth, R_WB = look(vehicle, primitives, self._pilot.grid, distances)
+            seen = Observation(depth, vehicle, R_WB, p_WG, speed)
             asked = step % config.ask_every == 0
             if asked:
                 valid, experts, costs = self._ask(vehicle, world, which)
                 best = experts[:, 0] @ R_WB.mT + vehicle.p[:, None]
                 hold = best[:, -1:].expand(-1, config.ask_every, -1)
                 tracked = torch.where(valid[:, None, None], torch.cat([best, hold], 1), tracked)
-                _, state = self._pilot.observe(depth, vehicle, R_WB, p_WG, speed)
+                _, state = self._pilot.observe(seen)
                 worse = costs - costs[:, :1]
                 sample = {
                     "depth": depth.half(),
@@ -256,10 +247,8 @@ class AgileTrainee:
             along = _LOOKAHEAD + (step % config.ask_every) * 2.0 / 3.0
             i, part = int(along), along - int(along)
             p_WR = (1.0 - part) * tracked[:, i] + part * tracked[:, i + 1]
-            noisy = config.noise.disturbed(depth, self._generator)
-            of_student, _, _ = self._pilot.decide(
-                noisy, vehicle, R_WB, R_WB, p_WG, speed, self._pilot.initial_memory(N)
-            )
+            noisy = seen._replace(depth=config.noise.disturbed(depth, self._generator))
+            of_student, _, _ = self._pilot.decide(noisy, self._pilot.initial_memory(N))
             a_cmd = torch.where(by_student[:, None], of_student, _reaching(p_WR, vehicle))
             vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE, control)
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}

@@ -32,8 +32,8 @@ from flysplat.systems.policies.depthnav_policy import (
 from flysplat.systems.vehicle.quadrotor_dynamics import GRAVITY
 from flysplat.training.policies import observation
 from flysplat.training.policies.flight_trainee import FlightTraining
-from flysplat.training.policies.flights import Vehicle
 from flysplat.training.policies.network import TrainableNetwork
+from flysplat.training.policies.observation import Observation
 from flysplat.training.policies.primitives import PinholeGrid
 from flysplat.training.policies.through_dynamics import FlightSchool, Moment
 from flysplat.training.policies.train import Schedule
@@ -95,22 +95,13 @@ class DepthNavLearner:
         memory[:, -1] = torch.nan
         return memory
 
-    def decide(
-        self,
-        depth: Tensor,
-        vehicle: Vehicle,
-        R_WB: Tensor,
-        R_WH: Tensor,
-        p_WG: Tensor,
-        speed: Tensor,
-        memory: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        spec = self.network.spec
+    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        spec, vehicle, speed = self.network.spec, seen.vehicle, seen.speed
         start_yaw = torch.where(memory[:, -1].isnan(), vehicle.yaw, memory[:, -1]).detach()
         R_WS = observation.heading_frame(start_yaw)
-        image = 1.0 / depth.clamp(NEAREST, FARTHEST)
-        v_target = observation.target_velocity(vehicle.p, p_WG, speed)
-        q_SB = quaternion_of(R_WS.mT @ R_WB)
+        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
+        v_target = observation.target_velocity(vehicle.p, seen.p_WG, speed)
+        q_SB = quaternion_of(R_WS.mT @ seen.R_WB)
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)
         output, hidden = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]

@@ -31,8 +31,8 @@ from flysplat.systems.policies.diffaero_policy import (
 )
 from flysplat.training.policies import observation
 from flysplat.training.policies.flight_trainee import FlightTraining
-from flysplat.training.policies.flights import Vehicle
 from flysplat.training.policies.network import TrainableNetwork
+from flysplat.training.policies.observation import Observation
 from flysplat.training.policies.primitives import PinholeGrid
 from flysplat.training.policies.through_dynamics import Moment
 
@@ -77,19 +77,11 @@ class DiffAeroLearner:
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, self.network.spec.hidden_size, device=self._limits.device)
 
-    def decide(
-        self,
-        depth: Tensor,
-        vehicle: Vehicle,
-        R_WB: Tensor,
-        R_WH: Tensor,
-        p_WG: Tensor,
-        speed: Tensor,
-        memory: Tensor,
-    ) -> tuple[Tensor, None, Tensor]:
+    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         spec = self.network.spec
-        image = observation.inverse_depth(depth, NEAREST, FARTHEST)
-        state = observation.heading_observation(R_WB, R_WH, vehicle.p, vehicle.v, p_WG, speed)
+        R_WH = observation.heading_frame(seen.vehicle.yaw)
+        image = observation.inverse_depth(seen.depth, NEAREST, FARTHEST)
+        state = observation.heading_observation(seen, R_WH)
         output, memory = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory
         )

@@ -116,6 +116,9 @@ class BodyRate(NamedTuple):
         return BodyRate(state, (state[:, 3:6] - before[:, 3:6]) * (count / dt))
 
 
+Vehicle = PointMass | BodyRate
+
+
 def flatness_command(
     state: Tensor,
     a_WB: Tensor,

@@ -9,14 +9,12 @@ from torch import Tensor
 from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from flysplat.training.policies.fields import Fields
-from flysplat.training.policies.flight import BodyRate, PointMass
-from flysplat.training.policies.observation import ObservationNoise, heading_frame
+from flysplat.training.policies.flight import BodyRate, PointMass, Vehicle
+from flysplat.training.policies.observation import Observation, ObservationNoise
 from flysplat.training.policies.primitives import PinholeGrid, Primitives
 
 CAMERA_AHEAD = 0.1
 """[m], of the camera before the vehicle's centre, along body x."""
-
-Vehicle = PointMass | BodyRate
 
 
 class Pilot(Protocol):
@@ -29,20 +27,8 @@ class Pilot(Protocol):
         """What N vehicles remember at first, (N, ...)."""
         ...
 
-    def decide(
-        self,
-        depth: Tensor,
-        vehicle: Vehicle,
-        R_WB: Tensor,
-        R_WH: Tensor,
-        p_WG: Tensor,
-        speed: Tensor,
-        memory: Tensor,
-    ) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Accelerations (N, 3) [m/s^2] in W, headings (N,) [rad] or None, and the memory after.
-
-        depth: (N, R) [m], planar, inf beyond; p_WG: (N, 3); speed: (N,) [m/s].
-        """
+    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
+        """Accelerations (N, 3) [m/s^2] in W, headings (N,) [rad] or None, and the memory after."""
         ...
 
 
@@ -150,10 +136,8 @@ def fly_courses(
         depth, R_WB = look(vehicle, primitives, pilot.grid, distances)
         if noise is not None:
             depth = noise.disturbed(depth, generator)
-        R_WH = heading_frame(vehicle.yaw)
-        a_cmd, heading, memory = pilot.decide(
-            depth, vehicle, R_WB, R_WH, p_WG[flying], speed[flying], memory
-        )
+        seen = Observation(depth, vehicle, R_WB, p_WG[flying], speed[flying])
+        a_cmd, heading, memory = pilot.decide(seen, memory)
         before = vehicle.p
         vehicle = vehicle.step(a_cmd, dt, control, heading)
         path[flying] += (vehicle.p - before).norm(dim=1)

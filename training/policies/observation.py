@@ -1,9 +1,22 @@
 """What depth policies are told, in torch; see `systems.policies.observation` for each formula."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from flysplat.training.policies.flight import Vehicle
+
+
+class Observation(NamedTuple):
+    """What N vehicles know at one moment."""
+
+    depth: Tensor  # (N, R) [m], planar, inf beyond
+    vehicle: Vehicle
+    R_WB: Tensor  # (N, 3, 3), the vehicle's attitude
+    p_WG: Tensor  # (N, 3) [m]
+    speed: Tensor  # (N,) [m/s], asked for
 
 
 @dataclass
@@ -44,11 +57,10 @@ def heading_frame(yaw: Tensor) -> Tensor:
     return torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], 1).reshape(-1, 3, 3)
 
 
-def heading_observation(
-    R_WB: Tensor, R_WH: Tensor, p: Tensor, v: Tensor, p_WG: Tensor, speed: Tensor
-) -> Tensor:
+def heading_observation(seen: Observation, R_WH: Tensor) -> Tensor:
     """(N, 9) target velocity, velocity and the body's z axis in the heading frame."""
-    rows = torch.stack([target_velocity(p, p_WG, speed), v, R_WB[:, :, 2]], 1)
+    v_target = target_velocity(seen.vehicle.p, seen.p_WG, seen.speed)
+    rows = torch.stack([v_target, seen.vehicle.v, seen.R_WB[:, :, 2]], 1)
     return (rows @ R_WH).flatten(1)
 
 

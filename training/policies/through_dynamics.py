@@ -12,7 +12,7 @@ from flysplat.training.policies.fields import STARTS, Fields
 from flysplat.training.policies.flight import PointMass
 from flysplat.training.policies.flights import Pilot, look
 from flysplat.training.policies.network import TrainableNetwork
-from flysplat.training.policies.observation import ObservationNoise, heading_frame
+from flysplat.training.policies.observation import Observation, ObservationNoise
 
 NEAREST = 4
 """Obstacles that the loss looks at, the nearest ones of each moment."""
@@ -180,10 +180,8 @@ class School:
         for _ in range(config.steps):
             depth, R_WB = look(vehicle, self._primitives, learner.grid, distances)
             depth = config.noise.disturbed(depth, self.generator)
-            R_WH = heading_frame(vehicle.yaw)
-            a_cmd, heading, memory = learner.decide(
-                depth, vehicle, R_WB, R_WH, self._p_WG, speed, memory
-            )
+            seen = Observation(depth, vehicle, R_WB, self._p_WG, speed)
+            a_cmd, heading, memory = learner.decide(seen, memory)
             before = vehicle
             vehicle = vehicle.decayed(keep).step(a_cmd, dt, self._control, heading)
             v_mean = v_mean + forget * (vehicle.v - v_mean)

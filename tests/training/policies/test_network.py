@@ -13,7 +13,7 @@ from flysplat.training.policies.depthnav import DepthNavLearner, DepthNavLoss, q
 from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
 from flysplat.training.policies.flight import BodyRate
 from flysplat.training.policies.network import TrajectoryModule
-from flysplat.training.policies.observation import ObservationNoise, heading_frame
+from flysplat.training.policies.observation import Observation, ObservationNoise
 
 P_WG = np.array([9.0, 2.0, 1.5])
 
@@ -27,6 +27,16 @@ def vehicle() -> BodyRate:
     state = rng.normal(size=(1, 13))
     state[0, 6:10] = RollPitchYaw(0.3, -0.2, 2.0).ToQuaternion().wxyz()
     return BodyRate(torch.tensor(state, dtype=torch.float32), torch.zeros(1, 3))
+
+
+def observed(depth: np.ndarray, body: BodyRate) -> Observation:
+    return Observation(
+        torch.tensor(depth).reshape(1, -1),
+        body,
+        body.attitude(),
+        torch.tensor(P_WG, dtype=torch.float32)[None],
+        torch.tensor([2.0]),
+    )
 
 
 def pose(state: np.ndarray) -> RigidTransform:
@@ -53,17 +63,8 @@ def test_what_flies_is_what_was_trained(name):
         rng = np.random.default_rng(seed)
         depth = rng.uniform(0.0, 25.0, (spec.image_height, spec.image_width)).astype(np.float32)
         depth[0, 0], depth[1, 1] = 0.0, np.inf
-        R_WB = body.attitude()
         with torch.no_grad():
-            a_cmd, heading, memory = learner.decide(
-                torch.tensor(depth).reshape(1, -1),
-                body,
-                R_WB,
-                heading_frame(body.yaw),
-                torch.tensor(P_WG, dtype=torch.float32)[None],
-                torch.tensor([2.0]),
-                memory,
-            )
+            a_cmd, heading, memory = learner.decide(observed(depth, body), memory)
         fine = depth.repeat(4, axis=0).repeat(4, axis=1)  # pooled back to the same
         if name == "diffaero":
             a_WB, hidden = policy.decide(network, fine, pose(state), state[3:6], P_WG, 2.0, hidden)
@@ -88,12 +89,8 @@ def test_trajectories_that_fly_are_those_trained():
     body = vehicle()
     state = body.state[0].double().numpy()
     depth = np.random.default_rng(0).uniform(0.0, 25.0, (24, 32)).astype(np.float32)
-    p_WG = torch.tensor(P_WG, dtype=torch.float32)[None]
     with torch.no_grad():
-        observed = pilot.observe(
-            torch.tensor(depth).reshape(1, -1), body, body.attitude(), p_WG, torch.tensor([2.0])
-        )
-        waypoints, costs = module(*observed)
+        waypoints, costs = module(*pilot.observe(observed(depth, body)))
     found = agile_policy.plan(network, 1.0, depth, pose(state), state, P_WG, 2.0, None)
     assert found.waypoints_B.shape == (3, NUM_WAYPOINTS, 3)
     np.testing.assert_allclose(found.waypoints_B, waypoints[0].numpy(), atol=1e-4)
