@@ -39,7 +39,7 @@ from flysplat.training.policies.flight import BodyRate, Vehicle
 from flysplat.training.policies.flights import FlightConditions, fly_courses, look
 from flysplat.training.policies.network import TrajectoryModule
 from flysplat.training.policies.observation import Observation, ObservationNoise, target_velocity
-from flysplat.training.policies.primitives import PinholeGrid
+from flysplat.training.policies.ray_casting import PinholeGrid
 from flysplat.training.policies.train import Schedule
 
 EPSILON = 0.05

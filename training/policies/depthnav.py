@@ -34,7 +34,7 @@ from flysplat.training.policies import observation
 from flysplat.training.policies.flight_trainee import FlightTraining
 from flysplat.training.policies.network import TrainableNetwork
 from flysplat.training.policies.observation import Observation
-from flysplat.training.policies.primitives import PinholeGrid
+from flysplat.training.policies.ray_casting import PinholeGrid
 from flysplat.training.policies.through_dynamics import FlightSchool, Moment
 from flysplat.training.policies.train import Schedule
 

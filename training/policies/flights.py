@@ -11,7 +11,8 @@ from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from flysplat.training.policies.fields import Fields
 from flysplat.training.policies.flight import BodyRate, PointMass, Vehicle
 from flysplat.training.policies.observation import Observation, ObservationNoise
-from flysplat.training.policies.primitives import PinholeGrid, Primitives
+from flysplat.training.policies.primitives import Primitives
+from flysplat.training.policies.ray_casting import PinholeGrid
 
 CAMERA_AHEAD = 0.1
 """[m], of the camera before the vehicle's centre, along body x."""

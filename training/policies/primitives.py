@@ -5,54 +5,27 @@ what the benchmark's worlds are made of. Nothing here is differentiable: images 
 and the gradient of a distance is the normal that is returned with it.
 """
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from flysplat.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+from flysplat.training.policies.ray_casting import (
+    MISS,
+    PinholeGrid,
+    cast_boxes,
+    cast_cylinders,
+    cast_planes,
+    cast_spheres,
+)
 
 _FAR = 1e4
 """[m], where the shapes lie that fill a batch up to equal numbers."""
 
 _HELD = 0.5
 """[m], ends of capsules further than this from the volume are left out: they end out of sight."""
-
-_GRAZE, _MISS = 1e-4, 1e6
-"""[m], a shorter way through a shape counts as a miss, whose depth is at least this."""
-
-_PARALLEL = 1e-9
-"""Added to cosines that are divided by: 1 / 0 - 1 / 0 is not a number."""
-
-
-class PinholeGrid(NamedTuple):
-    """The rays of a small depth camera that looks along body x."""
-
-    directions_C: Tensor  # (R, 3), camera frame, z = 1, row by row
-    half_pixel: float  # half the width of a pixel at depth 1; of oblong ones, of their mean width
-
-    @classmethod
-    def of(
-        cls,
-        width: int,
-        height: int,
-        fov_x: float,
-        device: torch.device | str = "cpu",
-        cell_aspect: float = 1.0,
-    ) -> "PinholeGrid":
-        """The camera of `width` x `height` pixels, `cell_aspect` times as high as wide.
-
-        `fov_x` is the horizontal field of view [deg].
-        """
-        half = math.tan(math.radians(0.5 * fov_x)) / width
-        x = half * (2 * torch.arange(width, device=device) + 1 - width)
-        y = half * cell_aspect * (2 * torch.arange(height, device=device) + 1 - height)
-        y, x = torch.meshgrid(y, x, indexing="ij")
-        directions = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
-        return cls(directions, 0.5 * half * (1.0 + cell_aspect))
 
 
 class Primitives:
@@ -143,9 +116,7 @@ class Primitives:
     ) -> Tensor:
         """Planar depth (N, R) [m], infinite where nothing is: the nearest surface in each pixel.
 
-        A pixel sees what any part of it sees, as in the least of a finer image: shapes are hit
-        by rays that pass within half a pixel, at the depth where the widened shape begins plus what
-        it was widened by.
+        A pixel sees what any part of it sees; see `ray_casting`.
 
         Args:
           p_WC, R_WC: (N, 3), (N, 3, 3), the cameras; row n is in world n.
@@ -156,7 +127,7 @@ class Primitives:
         rays = R_WC @ grid.directions_C.mT  # (N, 3, R)
         depth = torch.full(rays[:, 0].shape, torch.inf, device=rays.device)
         begin = 0
-        casts = _cast_spheres, _cast_cylinders, _cast_boxes, _cast_planes
+        casts = cast_spheres, cast_cylinders, cast_boxes, cast_planes
         for cast, kind, has in zip(casts, self.tensors(), self._has.unbind(1), strict=True):
             near = distances[:, begin : begin + kind.shape[2]]
             begin += kind.shape[2]
@@ -166,7 +137,7 @@ class Primitives:
                 kind = _in_front(kind[rows], near[rows], p, R[:, :, 2], nearest)
                 seen = cast(p, R, rays[rows], kind, grid.half_pixel)
                 depth[rows] = torch.minimum(depth[rows], seen)
-        return torch.where(depth < _MISS, depth, torch.inf)
+        return torch.where(depth < MISS, depth, torch.inf)
 
 
 def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
@@ -266,82 +237,3 @@ def _in_front(kind: Tensor, near: Tensor, p: Tensor, forward: Tensor, count: int
     score = torch.where(ahead + reach > 0.0, near, torch.inf)
     chosen = score.topk(count, dim=1, largest=False, sorted=False).indices
     return kind.gather(2, chosen[:, None].expand(-1, kind.shape[1], -1))
-
-
-def _footprint(away: Tensor, forward: Tensor, half_pixel: float) -> Tensor:
-    """Half the width of a pixel (N, M) [m] across the way to points `away` (N, 3, M)."""
-    planar = (away * forward[:, :, None]).sum(1).clamp(min=0.0)
-    return half_pixel * planar.square() / away.square().sum(1).sqrt().clamp(min=1e-3)
-
-
-# Casts work on arrays (N, M, R), a ray's step from one number to the next: that is fastest on CPUs.
-
-
-def _cast_spheres(p: Tensor, R: Tensor, rays: Tensor, spheres: Tensor, half_pixel: float) -> Tensor:
-    m = p[:, :, None] - spheres[:, :3]  # (N, 3, M)
-    extra = _footprint(-m, R[:, :, 2], half_pixel)
-    c = m.square().sum(1) - (spheres[:, 3] + extra).square()  # (N, M)
-    a = rays.square().sum(1, keepdim=True)  # (N, 1, R)
-    b = torch.bmm(m.mT, rays)  # (N, M, R)
-    root = torch.addcmul(b.square(), a, c[:, :, None], value=-1.0).clamp_(min=0.0).sqrt_()
-    leave = (root - b).clamp_(min=0.0)
-    enter = root.add_(b).neg_().clamp_(min=0.0)
-    return _nearest(enter, leave, enter / a, extra)
-
-
-def _cast_cylinders(
-    p: Tensor, R: Tensor, rays: Tensor, cylinders: Tensor, half_pixel: float
-) -> Tensor:
-    axis, half, radius = cylinders[:, 3:6], cylinders[:, 6], cylinders[:, 7]
-    m = p[:, :, None] - cylinders[:, :3]
-    along = (m * axis).sum(1)  # (N, M)
-    across = m - along[:, None] * axis
-    nearest = across + (along - torch.minimum(torch.maximum(along, -half), half))[:, None] * axis
-    extra = _footprint(-nearest, R[:, :, 2], half_pixel)
-    # Between the flat ends...
-    slope = torch.bmm(axis.mT, rays)  # (N, M, R)
-    a = torch.addcmul(rays.square().sum(1, keepdim=True), slope, slope, value=-1.0)
-    slope.add_(_PARALLEL).reciprocal_()
-    middle = along[:, :, None] * slope
-    width = slope.abs_().mul_((half + extra)[:, :, None])
-    # ... and inside the endless cylinder.
-    b = torch.bmm(across.mT, rays)
-    c = across.square().sum(1) - (radius + extra).square()
-    root = torch.addcmul(b.square(), a, c[:, :, None], value=-1.0).clamp_(min=0.0).sqrt_()
-    a.reciprocal_()
-    leave = torch.minimum((root - b).mul_(a), width - middle)
-    enter = torch.maximum(root.add_(b).neg_().mul_(a), width.add_(middle).neg_()).clamp_(min=0.0)
-    return _nearest(enter, leave, enter, extra)
-
-
-def _cast_boxes(p: Tensor, R: Tensor, rays: Tensor, boxes: Tensor, half_pixel: float) -> Tensor:
-    N, _, M = boxes.shape
-    rotation = boxes[:, 3:12].reshape(N, 3, 3, M)
-    m = p[:, :, None] - boxes[:, :3]
-    local = (m[:, :, None] * rotation).sum(1)  # (N, 3, M)
-    beyond = local - torch.minimum(torch.maximum(local, -boxes[:, 12:15]), boxes[:, 12:15])
-    nearest = (rotation * beyond[:, None]).sum(2)
-    extra = _footprint(-nearest, R[:, :, 2], half_pixel)
-    enter = torch.zeros(N, M, rays.shape[2], device=p.device)
-    leave = torch.full_like(enter, torch.inf)
-    for axis in range(3):
-        slope = torch.bmm(rotation[:, :, axis].mT, rays).add_(_PARALLEL).reciprocal_()
-        middle = local[:, axis, :, None] * slope
-        width = slope.abs_().mul_((boxes[:, 12 + axis] + extra)[:, :, None])
-        torch.minimum(leave, width - middle, out=leave)
-        torch.maximum(enter, width.add_(middle).neg_(), out=enter)
-    return _nearest(enter, leave, enter, extra)
-
-
-def _cast_planes(p: Tensor, R: Tensor, rays: Tensor, planes: Tensor, half_pixel: float) -> Tensor:
-    normal = planes[:, :3]
-    height = (p[:, :, None] * normal).sum(1) - planes[:, 3]  # (N, M)
-    tilt = torch.bmm(normal.mT, R[:, :, :2]).abs().sum(2)  # a pixel's corner looks further down
-    fall = half_pixel * tilt[:, :, None] - torch.bmm(normal.mT, rays)
-    return torch.where(fall > 1e-6, height.clamp(min=0.0)[:, :, None] / fall, torch.inf).amin(1)
-
-
-def _nearest(enter: Tensor, leave: Tensor, depth: Tensor, extra: Tensor) -> Tensor:
-    """The least depth (N, R), of rays that enter a shape before they leave it; large otherwise."""
-    missed = (enter - leave).add_(_GRAZE).clamp_(min=0.0)
-    return missed.mul_(_MISS / _GRAZE).add_(depth).add_(extra[:, :, None]).amin(1)

@@ -1,0 +1,126 @@
+"""Rays of small depth cameras cast at batches of shapes, in torch.
+
+A pixel sees what any part of it sees, as in the least of a finer image: shapes are hit by rays that
+pass within half a pixel, at the depth where the widened shape begins plus what it was widened by.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_GRAZE, MISS = 1e-4, 1e6
+"""[m], a shorter way through a shape counts as a miss, whose depth is at least this."""
+
+_PARALLEL = 1e-9
+"""Added to cosines that are divided by: 1 / 0 - 1 / 0 is not a number."""
+
+
+class PinholeGrid(NamedTuple):
+    """The rays of a small depth camera that looks along body x."""
+
+    directions_C: Tensor  # (R, 3), camera frame, z = 1, row by row
+    half_pixel: float  # half the width of a pixel at depth 1; of oblong ones, of their mean width
+
+    @classmethod
+    def of(
+        cls,
+        width: int,
+        height: int,
+        fov_x: float,
+        device: torch.device | str = "cpu",
+        cell_aspect: float = 1.0,
+    ) -> "PinholeGrid":
+        """The camera of `width` x `height` pixels, `cell_aspect` times as high as wide.
+
+        `fov_x` is the horizontal field of view [deg].
+        """
+        half = math.tan(math.radians(0.5 * fov_x)) / width
+        x = half * (2 * torch.arange(width, device=device) + 1 - width)
+        y = half * cell_aspect * (2 * torch.arange(height, device=device) + 1 - height)
+        y, x = torch.meshgrid(y, x, indexing="ij")
+        directions = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
+        return cls(directions, 0.5 * half * (1.0 + cell_aspect))
+
+
+def _footprint(away: Tensor, forward: Tensor, half_pixel: float) -> Tensor:
+    """Half the width of a pixel (N, M) [m] across the way to points `away` (N, 3, M)."""
+    planar = (away * forward[:, :, None]).sum(1).clamp(min=0.0)
+    return half_pixel * planar.square() / away.square().sum(1).sqrt().clamp(min=1e-3)
+
+
+# Casts take cameras at p (N, 3) [m] with axes R (N, 3, 3), rays (N, 3, R) of depth 1 in W, shapes
+# (N, P, M) as `Primitives` has them, and half the width of a pixel at depth 1; they return depth
+# (N, R) [m], from MISS on where nothing is hit. They work on arrays (N, M, R), a ray's step from
+# one number to the next: that is fastest on CPUs.
+
+
+def cast_spheres(p: Tensor, R: Tensor, rays: Tensor, spheres: Tensor, half_pixel: float) -> Tensor:
+    m = p[:, :, None] - spheres[:, :3]  # (N, 3, M)
+    extra = _footprint(-m, R[:, :, 2], half_pixel)
+    c = m.square().sum(1) - (spheres[:, 3] + extra).square()  # (N, M)
+    a = rays.square().sum(1, keepdim=True)  # (N, 1, R)
+    b = torch.bmm(m.mT, rays)  # (N, M, R)
+    root = torch.addcmul(b.square(), a, c[:, :, None], value=-1.0).clamp_(min=0.0).sqrt_()
+    leave = (root - b).clamp_(min=0.0)
+    enter = root.add_(b).neg_().clamp_(min=0.0)
+    return _nearest(enter, leave, enter / a, extra)
+
+
+def cast_cylinders(
+    p: Tensor, R: Tensor, rays: Tensor, cylinders: Tensor, half_pixel: float
+) -> Tensor:
+    axis, half, radius = cylinders[:, 3:6], cylinders[:, 6], cylinders[:, 7]
+    m = p[:, :, None] - cylinders[:, :3]
+    along = (m * axis).sum(1)  # (N, M)
+    across = m - along[:, None] * axis
+    nearest = across + (along - torch.minimum(torch.maximum(along, -half), half))[:, None] * axis
+    extra = _footprint(-nearest, R[:, :, 2], half_pixel)
+    # Between the flat ends...
+    slope = torch.bmm(axis.mT, rays)  # (N, M, R)
+    a = torch.addcmul(rays.square().sum(1, keepdim=True), slope, slope, value=-1.0)
+    slope.add_(_PARALLEL).reciprocal_()
+    middle = along[:, :, None] * slope
+    width = slope.abs_().mul_((half + extra)[:, :, None])
+    # ... and inside the endless cylinder.
+    b = torch.bmm(across.mT, rays)
+    c = across.square().sum(1) - (radius + extra).square()
+    root = torch.addcmul(b.square(), a, c[:, :, None], value=-1.0).clamp_(min=0.0).sqrt_()
+    a.reciprocal_()
+    leave = torch.minimum((root - b).mul_(a), width - middle)
+    enter = torch.maximum(root.add_(b).neg_().mul_(a), width.add_(middle).neg_()).clamp_(min=0.0)
+    return _nearest(enter, leave, enter, extra)
+
+
+def cast_boxes(p: Tensor, R: Tensor, rays: Tensor, boxes: Tensor, half_pixel: float) -> Tensor:
+    N, _, M = boxes.shape
+    rotation = boxes[:, 3:12].reshape(N, 3, 3, M)
+    m = p[:, :, None] - boxes[:, :3]
+    local = (m[:, :, None] * rotation).sum(1)  # (N, 3, M)
+    beyond = local - torch.minimum(torch.maximum(local, -boxes[:, 12:15]), boxes[:, 12:15])
+    nearest = (rotation * beyond[:, None]).sum(2)
+    extra = _footprint(-nearest, R[:, :, 2], half_pixel)
+    enter = torch.zeros(N, M, rays.shape[2], device=p.device)
+    leave = torch.full_like(enter, torch.inf)
+    for axis in range(3):
+        slope = torch.bmm(rotation[:, :, axis].mT, rays).add_(_PARALLEL).reciprocal_()
+        middle = local[:, axis, :, None] * slope
+        width = slope.abs_().mul_((boxes[:, 12 + axis] + extra)[:, :, None])
+        torch.minimum(leave, width - middle, out=leave)
+        torch.maximum(enter, width.add_(middle).neg_(), out=enter)
+    return _nearest(enter, leave, enter, extra)
+
+
+def cast_planes(p: Tensor, R: Tensor, rays: Tensor, planes: Tensor, half_pixel: float) -> Tensor:
+    normal = planes[:, :3]
+    height = (p[:, :, None] * normal).sum(1) - planes[:, 3]  # (N, M)
+    tilt = torch.bmm(normal.mT, R[:, :, :2]).abs().sum(2)  # a pixel's corner looks further down
+    fall = half_pixel * tilt[:, :, None] - torch.bmm(normal.mT, rays)
+    return torch.where(fall > 1e-6, height.clamp(min=0.0)[:, :, None] / fall, torch.inf).amin(1)
+
+
+def _nearest(enter: Tensor, leave: Tensor, depth: Tensor, extra: Tensor) -> Tensor:
+    """The least depth (N, R), of rays that enter a shape before they leave it; large otherwise."""
+    missed = (enter - leave).add_(_GRAZE).clamp_(min=0.0)
+    return missed.mul_(MISS / _GRAZE).add_(depth).add_(extra[:, :, None]).amin(1)
