@@ -13,12 +13,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import skfmm
 from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
+from flysplat.analysis.ways import (
+    SPACING,
+    cell_of,
+    inside,
+    march,
+    path_length,
+    resampled,
+    shortest_path,
+)
 from flysplat.diagrams.configuration import load_config
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.worlds.feasibility import conservative_distance, grid_distances
@@ -30,9 +38,6 @@ from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SENSING_RANGE = 4.0
 """[m], of FlightBench's measures."""
-
-SPACING = 0.2
-"""[m], of the grid on which ways are searched."""
 
 SCENARIOS = Path(__file__).parent.parent / "diagrams" / "scenarios"
 
@@ -129,8 +134,8 @@ def traversability_obstacle(field: DistanceField, path: NDArray) -> float:
     while True:
         centers = points[row] + offsets
         clearance = np.full(len(centers), -np.inf)
-        inside = _inside(field, centers)
-        clearance[inside] = conservative_distance(field, centers[inside]) - VEHICLE_RADIUS
+        within = inside(field, centers)
+        clearance[within] = conservative_distance(field, centers[within]) - VEHICLE_RADIUS
         best = int(np.argmax(clearance))
         radii.append(float(np.clip(clearance[best], 0.05, SENSING_RANGE)))
         away = np.linalg.norm(points[row + 1 :] - centers[best], axis=1) >= radii[-1]
@@ -167,7 +172,7 @@ def view_obstacle(field: DistanceField, path: NDArray) -> float:
         for ray in rays if angle > middles[-1] else [*rays, ahead]:
             way = march(field, points[:-1], ray, 0.0, SENSING_RANGE)
             ends = points[:-1] + way[:, None] * ray
-            solid = (way < SENSING_RANGE) & _inside(field, ends)
+            solid = (way < SENSING_RANGE) & inside(field, ends)
             nearest = np.minimum(nearest, np.where(solid, np.maximum(way, 0.05), np.inf))
         total += weight * SENSING_RANGE / nearest
     return float(total.mean())
@@ -185,7 +190,7 @@ def angle_over_length(path: NDArray) -> float:
 def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> float:
     """Largest clearance [m], beyond the vehicle's radius, that some way on the grid keeps
     everywhere; found by bisection to 1 cm. The grid may miss the middle of a gap by half a cell."""
-    ends = [_cell(field, grid, p) for p in (p_WS, p_WG)]
+    ends = [cell_of(field, grid, p) for p in (p_WS, p_WG)]
     low, high = 0.0, float(min(grid[end] for end in ends))
     while high - low > 0.01:
         middle = (low + high) / 2
@@ -193,101 +198,6 @@ def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray
         joined = part[ends[0]] == part[ends[1]] > 0
         low, high = (middle, high) if joined else (low, middle)
     return low - VEHICLE_RADIUS
-
-
-def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> NDArray:
-    """Points (K, 3) [m] of a shortest way for the vehicle: down the solution of the eikonal
-    equation on the grid of distances, then pulled straight where the exact field allows it.
-
-    Raises:
-        ValueError: if there is none on the grid.
-    """
-    shape, goal = grid.shape, _cell(field, grid, p_WG)
-    front = np.ones(shape)
-    front[goal] = -1.0
-    blocked = grid < VEHICLE_RADIUS + 0.02
-    blocked[goal] = False
-    marched = skfmm.distance(np.ma.MaskedArray(front, mask=blocked), dx=SPACING)
-    length = np.where(np.ma.getmaskarray(marched), np.inf, np.ma.getdata(marched))
-    cell = _cell(field, grid, p_WS)
-    if not np.isfinite(length[cell]):
-        raise ValueError("no way from start to goal was found on a grid of 0.2 m")
-    offsets = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1
-    cells = [cell]
-    while cells[-1] != goal:
-        near = np.array(cells[-1]) + offsets
-        near = near[((near >= 0) & (near < shape)).all(axis=1)]
-        slope = (length[tuple(near.T)] - length[cells[-1]]) / np.linalg.norm(
-            near - cells[-1], axis=1
-        )
-        best = int(np.argmin(slope))
-        if not slope[best] < 0:
-            break
-        cells.append(tuple(int(c) for c in near[best]))
-    centers = field.lower_W + SPACING * (np.array(cells[1:-1]).reshape(-1, 3) + 0.5)
-    return _pulled(field, np.concatenate([p_WS[None], centers, p_WG[None]]))
-
-
-def _pulled(field: DistanceField, points: NDArray) -> NDArray:
-    """Leaves out points (K, 3) that straight, free segments make needless."""
-    kept, here = [0], 0
-    while here < len(points) - 1:
-        step = 1
-        while here + 2 * step < len(points) and _free(field, points[here], points[here + 2 * step]):
-            step *= 2
-        low, high = step, min(2 * step, len(points) - 1 - here)
-        while low < high:  # the furthest that is seen, if seeing is monotonic between these
-            middle = (low + high + 1) // 2
-            if _free(field, points[here], points[here + middle]):
-                low = middle
-            else:
-                high = middle - 1
-        here += low
-        kept.append(here)
-    return points[kept]
-
-
-def _free(field: DistanceField, p_A: NDArray, p_B: NDArray) -> bool:
-    points = np.linspace(p_A, p_B, max(int(np.linalg.norm(p_B - p_A) / 0.05), 2))
-    return bool((conservative_distance(field, points) > VEHICLE_RADIUS).all())
-
-
-def march(
-    field: DistanceField, p_W: NDArray, way: NDArray, radius: float, longest: float
-) -> NDArray:
-    """How far (N,) [m] a ball of `radius` flies from p_W (N, 3) along the unit vectors `way` (N, 3)
-    until it touches a surface or leaves the bounds, at most `longest`, by sphere tracing."""
-    flown, going = np.zeros(len(p_W)), np.arange(len(p_W))
-    for _ in range(200):
-        p = p_W[going] + flown[going, None] * way[going]
-        room = np.where(_inside(field, p), field.distance(p), -np.inf) - radius
-        going, room = going[room > 0.01], room[room > 0.01]
-        flown[going] = np.minimum(flown[going] + room, longest)
-        going = going[flown[going] < longest]
-        if not len(going):
-            break
-    return flown
-
-
-def path_length(path: NDArray) -> float:
-    """Length [m] of the path (K, 3) [m]."""
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-
-
-def resampled(path: NDArray, step: float) -> NDArray:
-    """Points (N, 3) on the path (K, 3), about `step` [m] apart, both ends included."""
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    s = np.linspace(0.0, at[-1], max(int(np.ceil(at[-1] / step)), 1) + 1)
-    return np.column_stack([np.interp(s, at, path[:, k]) for k in range(3)])
-
-
-def _inside(field: DistanceField, p_W: NDArray) -> NDArray[np.bool_]:
-    return ((p_W >= field.lower_W) & (p_W <= field.upper_W)).all(axis=-1)
-
-
-def _cell(field: DistanceField, grid: NDArray, p_W: NDArray) -> tuple[int, ...]:
-    cell = np.clip(((p_W - field.lower_W) / SPACING).astype(int), 0, np.array(grid.shape) - 1)
-    return tuple(int(c) for c in cell)
 
 
 def _known(world: World) -> DistanceField:

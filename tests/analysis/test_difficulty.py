@@ -5,21 +5,17 @@ import pytest
 from pydrake.math import RigidTransform
 
 from flysplat.analysis.difficulty import (
-    SPACING,
     angle_over_length,
     bottleneck,
     difficulty,
-    march,
-    path_length,
     relative_gap_size,
-    resampled,
     run,
     scenario_file,
-    shortest_path,
     traversability,
     traversability_obstacle,
     view_obstacle,
 )
+from flysplat.analysis.ways import SPACING, path_length, resampled, shortest_path
 from flysplat.diagrams.worlds.feasibility import grid_distances
 from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
 from flysplat.systems.collision.shapes import Box, Capsule
@@ -65,23 +61,6 @@ def test_bottleneck_is_half_the_gap(gap):
     field = AnalyticDistanceField([wall(-4.0, -gap / 2), wall(gap / 2, 4.0)], LOWER, UPPER)
     found = bottleneck(field, grid_distances(field, SPACING), START, GOAL)
     assert gap / 2 - R - SPACING / 2 - 0.02 < found <= gap / 2 - R
-
-
-def test_no_way_is_an_error():
-    """A closed wall leaves none."""
-    field = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
-    with pytest.raises(ValueError, match="no way"):
-        shortest_path(field, grid_distances(field, SPACING), START, GOAL)
-
-
-def test_march_stops_at_walls_and_bounds():
-    """A ball stops at its radius before a wall; a point at the bounds; nothing flies on longer."""
-    field = AnalyticDistanceField([wall(-4.5, 4.5)], LOWER, UPPER)
-    x = np.array([[1.0, 0.0, 0.0]])
-    start = np.array([[1.0, 0.0, 2.0]])
-    assert march(field, start, x, R, 99.0) == pytest.approx([4.9 - R], abs=0.011)
-    assert march(field, start, -x, 0.0, 99.0) == pytest.approx([1.0], abs=6.0)
-    assert march(field, start, x, R, 2.0) == [2.0]
 
 
 def test_traversability_falls_with_obstacles_and_scales():
