@@ -23,7 +23,6 @@ from torch import Tensor
 from flysplat.systems.policies.agile_policy import (
     AGILE_NETWORK,
     FARTHEST,
-    FOV_X,
     MODES,
     NEAREST,
     RATE,
@@ -33,19 +32,18 @@ from flysplat.systems.policies.privileged_planner import plan
 from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from flysplat.training.policies.agile_pilot import LOOKAHEAD, AgilePilot, reaching
 from flysplat.training.policies.courses import CourseSelection, training_fields, validation_fields
 from flysplat.training.policies.fields import STARTS, Fields
-from flysplat.training.policies.flight import BodyRate, Vehicle
+from flysplat.training.policies.flight import BodyRate
 from flysplat.training.policies.flights import FlightConditions, fly_courses, look
 from flysplat.training.policies.network import TrajectoryModule
-from flysplat.training.policies.observation import Observation, ObservationNoise, target_velocity
-from flysplat.training.policies.ray_casting import PinholeGrid
+from flysplat.training.policies.observation import Observation, ObservationNoise
 from flysplat.training.policies.train import Schedule
 
 EPSILON = 0.05
 """Part of an expert's pull on the hypotheses that are not the closest to it."""
 
-_LOOKAHEAD = 3  # the waypoint that is tracked: at 0.4 s, as the controller's lookahead
 _WORSE = 1.5  # [s] of cost by which an expert's trajectory may be worse than its best
 
 
@@ -89,37 +87,6 @@ class AgileTraining:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
         if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
             raise ValueError(f"speeds is {self.speeds}; give one or more of 0.1 to 10 m/s")
-
-
-class AgilePilot:
-    """Flies by the cheapest hypothesis, as `HypothesisSelector` and `FlatnessController` do."""
-
-    rate = RATE
-
-    def __init__(self, network: TrajectoryModule, device: torch.device | str = "cpu") -> None:
-        spec = network.spec
-        self.network = network
-        self.grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X, device)
-        self._device = device
-
-    def initial_memory(self, count: int) -> Tensor:
-        return torch.zeros(count, 0, device=self._device)
-
-    def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
-        """Images (N, 24, 32) and states (N, 18)."""
-        spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.R_WB
-        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
-        rates = vehicle.state[:, 10:13] if isinstance(vehicle, BodyRate) else 0.0 * vehicle.v
-        v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
-        rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
-        state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
-        return image.reshape(-1, spec.image_height, spec.image_width), state
-
-    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        waypoints, costs = self.network(*self.observe(seen))
-        best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
-        p_WR = seen.vehicle.p + (seen.R_WB @ best[:, _LOOKAHEAD, :, None])[:, :, 0]
-        return _reaching(p_WR, seen.vehicle), None, memory
 
 
 class AgileTrainee:
@@ -244,12 +211,12 @@ class AgileTrainee:
                 }
                 rows.append({name: values[valid] for name, values in sample.items()})
             # The time since the plan, in waypoints of 0.1 s; 1/15 s are two thirds of one.
-            along = _LOOKAHEAD + (step % config.ask_every) * 2.0 / 3.0
+            along = LOOKAHEAD + (step % config.ask_every) * 2.0 / 3.0
             i, part = int(along), along - int(along)
             p_WR = (1.0 - part) * tracked[:, i] + part * tracked[:, i + 1]
             noisy = seen._replace(depth=config.noise.disturbed(depth, self._generator))
             of_student, _, _ = self._pilot.decide(noisy, self._pilot.initial_memory(N))
-            a_cmd = torch.where(by_student[:, None], of_student, _reaching(p_WR, vehicle))
+            a_cmd = torch.where(by_student[:, None], of_student, reaching(p_WR, vehicle))
             vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE, control)
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
@@ -289,9 +256,3 @@ def collision_cost(clearance: Tensor) -> Tensor:
     inner = 4.0 - 2.0 * d.clamp(min=0.0).square() / 0.09
     outer = 2.0 * (0.8 - d) / 0.5
     return torch.where(d < 0.3, inner, outer.clamp(min=0.0))
-
-
-def _reaching(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
-    """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
-    T = FlatnessControllerConfig.lookahead
-    return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2

@@ -1,9 +1,5 @@
 """Training runs: any policy, resumable, with all that was done written beside the weights."""
 
-import csv
-import io
-import json
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,9 +9,8 @@ from typing import Any, Protocol
 import torch
 from tqdm import tqdm
 
-from flysplat.diagrams.configuration import dump_config, load_config
-from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from flysplat.systems.files import written_atomically
+from flysplat.training.policies.run_folder import RunFolder
 from flysplat.training.policies.through_dynamics import NotFiniteError
 
 
@@ -133,11 +128,7 @@ def run[Config: TrainingConfig](
         OSError: if `out` cannot be written.
     """
     config.validate()
-    require_writable_folder(out)
-    text = dump_config(config)
-    _check_same(out / "config.yaml", text, config)
-    with written_atomically(out / "config.yaml") as path:
-        path.write_text(text)
+    folder = RunFolder.claimed(out, config)
     schedule = config.schedule
     torch.set_num_threads(1)  # Sums of several threads would depend on their number.
     started = time.process_time()
@@ -147,7 +138,6 @@ def run[Config: TrainingConfig](
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
     )
-    revision = git_revision()
     progress = _Progress()
     checkpoint = out / "checkpoint.pt"
     if checkpoint.exists():
@@ -167,8 +157,7 @@ def run[Config: TrainingConfig](
                 },
                 path,
             )
-        with written_atomically(out / "curves.csv") as path:
-            path.write_text(_table(progress.curves))
+        folder.write_curves(progress.curves)
 
     bar = tqdm(
         total=schedule.updates, initial=progress.update, desc=trainee.policy, unit="update",
@@ -202,7 +191,7 @@ def run[Config: TrainingConfig](
                         writer.add_scalar(name, value, progress.update)
                 if measured["success"] >= progress.best.get("success", -1.0):
                     progress.best = {"update": progress.update, **measured}
-                    _export(out, trainee, text, revision, progress)
+                    folder.write_weights(trainee.policy, trainee.spec, network, progress.best)
             if due or progress.update % schedule.checkpoint_every == 0:
                 save()
     save()
@@ -213,10 +202,7 @@ def run[Config: TrainingConfig](
         "cpu_minutes": round(progress.cpu_seconds / 60.0, 2),
         "best": progress.best,
     }
-    with written_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
-    with written_atomically(out / f"{trainee.policy}.md") as path:
-        path.write_text(model_card(summary, text, revision))
+    folder.write_summary(summary)
     print(
         f"{trainee.policy}: success {progress.best['success']:.0%} on held-out courses after "
         f"{progress.best['update']} of {progress.update} updates, "
@@ -249,65 +235,6 @@ def descend(
     return {name: float(term.detach()) for name, term in terms.items()}
 
 
-def model_card(summary: dict[str, Any], config: str, revision: str) -> str:
-    """What there is to know of trained weights, as Markdown."""
-    policy, best = summary["policy"], summary["best"]
-    measures = "\n".join(
-        f"| {name} | {value:.2f} |" for name, value in best.items() if name != "update"
-    )
-    return f"""# {policy}
-
-Made by `flysplat train {policy} --out DIR --config CONFIG` with the configuration below at revision
-{revision} of the source, in {summary["cpu_minutes"]:.1f} minutes of one core; {summary["updates"]}
-updates, of which the weights after {best["update"]} did best on held-out courses.
-
-| on held-out courses, simulated as in training | |
-|---|---|
-{measures}
-
-`success` is the part that reached the goal; `collisions` and `left` (the volume) are the failures
-that are not for lack of time; a scenario's name stands before the success in worlds of its kind.
-
-```yaml
-{config}```
-"""
-
-
-def git_revision() -> str:
-    """The revision of the source this runs from, with `-dirty` if it was changed; or unknown."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return answer.stdout.strip()
-
-
-def _export(out: Path, trainee: Trainee, config: str, revision: str, progress: _Progress) -> None:
-    weights = {name: w.detach().cpu().numpy() for name, w in trainee.network.state_dict().items()}
-    provenance = {
-        "command": f"flysplat train {trainee.policy}",
-        "config": config,
-        "revision": revision,
-        "torch": torch.__version__,
-        "best": progress.best,
-    }
-    PolicyCheckpoint(trainee.policy, trainee.spec, weights, provenance).save(
-        out / f"{trainee.policy}.npz"
-    )
-
-
-def _check_same(path: Path, text: str, config: TrainingConfig) -> None:
-    """Raises ValueError if `path` is the configuration of another run."""
-    if not path.exists():
-        return
-    if dump_config(load_config(type(config)(), path)) != text:
-        raise ValueError(
-            f"{path} is of a run with another configuration; choose another --out, or the same "
-            "configuration to go on with that run"
-        )
-
-
 def _resumed(path: Path, trainee: Trainee, optimizer: torch.optim.Optimizer) -> _Progress:
     try:
         saved = torch.load(path, weights_only=True)
@@ -320,15 +247,6 @@ def _resumed(path: Path, trainee: Trainee, optimizer: torch.optim.Optimizer) -> 
         raise ValueError(
             f"{path} is no checkpoint to go on from ({reason}); delete it to begin anew"
         ) from None
-
-
-def _table(rows: list[dict[str, float]]) -> str:
-    text = io.StringIO()
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    table = csv.DictWriter(text, names, lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    return text.getvalue()
 
 
 def _tensorboard(out: Path) -> Any:

@@ -1,0 +1,51 @@
+"""How Agile Autonomy's policy flies, many vehicles at once in torch."""
+
+import torch
+from torch import Tensor
+
+from flysplat.systems.policies.agile_policy import FARTHEST, FOV_X, NEAREST, RATE
+from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from flysplat.training.policies.flight import BodyRate, Vehicle
+from flysplat.training.policies.network import TrajectoryModule
+from flysplat.training.policies.observation import Observation, target_velocity
+from flysplat.training.policies.ray_casting import PinholeGrid
+
+LOOKAHEAD = 3
+"""The waypoint that is tracked: at 0.4 s, as the controller's lookahead."""
+
+
+class AgilePilot:
+    """Flies by the cheapest hypothesis, as `HypothesisSelector` and `FlatnessController` do."""
+
+    rate = RATE
+
+    def __init__(self, network: TrajectoryModule, device: torch.device | str = "cpu") -> None:
+        spec = network.spec
+        self.network = network
+        self.grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X, device)
+        self._device = device
+
+    def initial_memory(self, count: int) -> Tensor:
+        return torch.zeros(count, 0, device=self._device)
+
+    def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
+        """Images (N, 24, 32) and states (N, 18)."""
+        spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.R_WB
+        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
+        rates = vehicle.state[:, 10:13] if isinstance(vehicle, BodyRate) else 0.0 * vehicle.v
+        v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
+        rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
+        state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
+        return image.reshape(-1, spec.image_height, spec.image_width), state
+
+    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
+        waypoints, costs = self.network(*self.observe(seen))
+        best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
+        p_WR = seen.vehicle.p + (seen.R_WB @ best[:, LOOKAHEAD, :, None])[:, :, 0]
+        return reaching(p_WR, seen.vehicle), None, memory
+
+
+def reaching(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+    """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
+    T = FlatnessControllerConfig.lookahead
+    return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2

@@ -1,0 +1,109 @@
+"""The folder of a training run: what people read of it, and the weights that fly."""
+
+import csv
+import io
+import json
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+
+from flysplat.diagrams.configuration import dump_config, load_config
+from flysplat.systems.files import require_writable_folder, written_atomically
+from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder that is one run's own."""
+
+    path: Path
+    config: str
+    """The run's configuration, as YAML."""
+    revision: str
+    """Of the source this runs from, with `-dirty` if it was changed; or unknown."""
+
+    @classmethod
+    def claimed(cls, path: Path, config: Any) -> Self:
+        """Makes `path` the folder of a run of `config`, which it may be already.
+
+        Raises:
+            ValueError: if it is of a run of another configuration.
+            OSError: if it cannot be written.
+        """
+        require_writable_folder(path)
+        text, file = dump_config(config), path / "config.yaml"
+        if file.exists() and dump_config(load_config(type(config)(), file)) != text:
+            raise ValueError(
+                f"{file} is of a run with another configuration; choose another --out, or the same "
+                "configuration to go on with that run"
+            )
+        folder = cls(path, text, _git_revision())
+        folder._write("config.yaml", text)
+        return folder
+
+    def write_weights(
+        self, policy: str, spec: Any, network: torch.nn.Module, best: dict[str, Any]
+    ) -> None:
+        """Writes `POLICY.npz`; `best` is what was measured of these weights."""
+        weights = {name: w.detach().cpu().numpy() for name, w in network.state_dict().items()}
+        provenance = {
+            "command": f"flysplat train {policy}",
+            "config": self.config,
+            "revision": self.revision,
+            "torch": torch.__version__,
+            "best": best,
+        }
+        PolicyCheckpoint(policy, spec, weights, provenance).save(self.path / f"{policy}.npz")
+
+    def write_curves(self, rows: list[dict[str, float]]) -> None:
+        """Writes `curves.csv`; a row may lack columns."""
+        text = io.StringIO()
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        table = csv.DictWriter(text, names, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+        self._write("curves.csv", text.getvalue())
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Writes `summary.json` and the model card `POLICY.md`."""
+        self._write("summary.json", json.dumps(summary, indent=2) + "\n")
+        self._write(f"{summary['policy']}.md", self._model_card(summary))
+
+    def _model_card(self, summary: dict[str, Any]) -> str:
+        """What there is to know of trained weights, as Markdown."""
+        policy, best, minutes = summary["policy"], summary["best"], summary["cpu_minutes"]
+        measures = "\n".join(
+            f"| {name} | {value:.2f} |" for name, value in best.items() if name != "update"
+        )
+        return f"""# {policy}
+
+Made by `flysplat train {policy} --out DIR --config CONFIG` with the configuration below at revision
+{self.revision} of the source, in {minutes:.1f} minutes of one core; {summary["updates"]}
+updates, of which the weights after {best["update"]} did best on held-out courses.
+
+| on held-out courses, simulated as in training | |
+|---|---|
+{measures}
+
+`success` is the part that reached the goal; `collisions` and `left` (the volume) are the failures
+that are not for lack of time; a scenario's name stands before the success in worlds of its kind.
+
+```yaml
+{self.config}```
+"""
+
+    def _write(self, name: str, text: str) -> None:
+        with written_atomically(self.path / name) as path:
+            path.write_text(text)
+
+
+def _git_revision() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return answer.stdout.strip()
