@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from flysplat.diagrams.worlds import forest_surroundings
 from flysplat.diagrams.worlds.illumination import Illumination, Lamplight, Sunlight
 from flysplat.diagrams.worlds.light import Daylight
-from flysplat.diagrams.worlds.materials import SIGN
+from flysplat.diagrams.worlds.patterns import SIGN
 from flysplat.diagrams.worlds.plot import Plot
 from flysplat.diagrams.worlds.solid import Solid
 from flysplat.systems.collision.esdf import Esdf

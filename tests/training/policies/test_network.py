@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from flysplat.systems.policies import agile_policy, depthnav_policy, diffaero_policy
 from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS
 from flysplat.systems.policies.recurrent_network import RecurrentNetwork
-from flysplat.training.policies.agile_autonomy import AgilePilot
+from flysplat.training.policies.agile_pilot import AgilePilot
 from flysplat.training.policies.depthnav import DepthNavLearner, DepthNavLoss, quaternion_of
 from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
 from flysplat.training.policies.flight import BodyRate
