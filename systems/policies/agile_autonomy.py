@@ -18,46 +18,24 @@ from flysplat.systems.policies.agile_policy import (
     load_network,
     plan,
 )
+from flysplat.systems.policies.depth_policy_config import DepthPolicyConfig
 from flysplat.systems.policies.hypotheses import Hypotheses, unplanned
-from flysplat.systems.policies.observation import require_poolable
 from flysplat.systems.policies.onboard_camera import OnboardCamera
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
-class AgileAutonomyConfig:
-    """The policy's weights, and what it is asked for."""
+class AgileAutonomyConfig(DepthPolicyConfig):
+    """The policy's weights, and what it is asked for; its camera's pixels are pooled to 32x24."""
 
-    # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
-    speed: float = 2.0
-    # File of weights, as `flysplat train agile_autonomy` writes them; those that ship where empty.
-    weights: str = ""
-    # What it sees through: pixels are pooled to 32x24, so give multiples of these.
+    network = AGILE_NETWORK
+    rate = RATE
+
     camera: OnboardCamera = field(
         default_factory=lambda: OnboardCamera(
             width=IMAGE_SIZE[0], height=IMAGE_SIZE[1], fov_x=FOV_X, max_depth=FARTHEST
         )
     )
-
-    @property
-    def rate(self) -> float:
-        """[Hz], that the policy was trained at."""
-        return RATE
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.1 <= self.speed <= 10.0:
-            raise ValueError(
-                f"AgileAutonomyConfig.speed is {self.speed} m/s but must be 0.1 to 10; the default "
-                f"is {AgileAutonomyConfig.speed}"
-            )
-        self.camera.validate()
-        require_poolable(
-            self.camera.height,
-            self.camera.width,
-            AGILE_NETWORK.image_height,
-            AGILE_NETWORK.image_width,
-        )
 
 
 class AgileAutonomy(LeafSystem):

@@ -8,6 +8,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
+from flysplat.systems.policies.depth_policy_config import DepthPolicyConfig
 from flysplat.systems.policies.depthnav_policy import (
     DEPTHNAV_NETWORK,
     FARTHEST,
@@ -17,46 +18,23 @@ from flysplat.systems.policies.depthnav_policy import (
     decide,
     yaw_of,
 )
-from flysplat.systems.policies.observation import require_poolable
 from flysplat.systems.policies.onboard_camera import OnboardCamera
 from flysplat.systems.policies.recurrent_network import load_network
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
-class DepthNavConfig:
-    """The policy's weights, and what it is asked for."""
+class DepthNavConfig(DepthPolicyConfig):
+    """The policy's weights, and what it is asked for; its camera's pixels are pooled to 16x12."""
 
-    # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
-    speed: float = 2.0
-    # File of weights, as `flysplat train depthnav` writes them; those that ship where left empty.
-    weights: str = ""
-    # What it sees through: pixels are pooled to 16x12, so give multiples of these.
+    network = DEPTHNAV_NETWORK
+    rate = RATE
+
     camera: OnboardCamera = field(
         default_factory=lambda: OnboardCamera(
             width=IMAGE_SIZE[0], height=IMAGE_SIZE[1], fov_x=FOV_X, max_depth=FARTHEST
         )
     )
-
-    @property
-    def rate(self) -> float:
-        """[Hz], that the policy was trained at."""
-        return RATE
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.1 <= self.speed <= 10.0:
-            raise ValueError(
-                f"DepthNavConfig.speed is {self.speed} m/s but must be 0.1 to 10; the default is "
-                f"{DepthNavConfig.speed}"
-            )
-        self.camera.validate()
-        require_poolable(
-            self.camera.height,
-            self.camera.width,
-            DEPTHNAV_NETWORK.image_height,
-            DEPTHNAV_NETWORK.image_width,
-        )
 
 
 class DepthNav(LeafSystem):

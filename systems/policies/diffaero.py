@@ -8,45 +8,23 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
+from flysplat.systems.policies.depth_policy_config import DepthPolicyConfig
 from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK, FOV_X, RATE, decide
-from flysplat.systems.policies.observation import require_poolable
 from flysplat.systems.policies.onboard_camera import OnboardCamera
 from flysplat.systems.policies.recurrent_network import load_network
 from flysplat.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
-class DiffAeroConfig:
-    """The policy's weights, and what it is asked for."""
+class DiffAeroConfig(DepthPolicyConfig):
+    """The policy's weights, and what it is asked for; its camera's pixels are pooled to 16x9."""
 
-    # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
-    speed: float = 2.0
-    # File of weights, as `flysplat train diffaero` writes them; those that ship where left empty.
-    weights: str = ""
-    # What it sees through: pixels are pooled to 16x9, so give multiples of these.
+    network = DIFFAERO_NETWORK
+    rate = RATE
+
     camera: OnboardCamera = field(
         default_factory=lambda: OnboardCamera(width=64, height=36, fov_x=FOV_X, max_depth=20.0)
     )
-
-    @property
-    def rate(self) -> float:
-        """[Hz], that the policy was trained at."""
-        return RATE
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.1 <= self.speed <= 10.0:
-            raise ValueError(
-                f"DiffAeroConfig.speed is {self.speed} m/s but must be 0.1 to 10; the default is "
-                f"{DiffAeroConfig.speed}"
-            )
-        self.camera.validate()
-        require_poolable(
-            self.camera.height,
-            self.camera.width,
-            DIFFAERO_NETWORK.image_height,
-            DIFFAERO_NETWORK.image_width,
-        )
 
 
 class DiffAero(LeafSystem):

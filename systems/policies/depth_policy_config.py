@@ -1,0 +1,41 @@
+"""What the configurations of learned depth policies have in common."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from flysplat.systems.policies.agile_policy import TrajectoryNetworkSpec
+from flysplat.systems.policies.observation import require_poolable
+from flysplat.systems.policies.onboard_camera import OnboardCamera
+from flysplat.systems.policies.recurrent_network import NetworkSpec
+
+
+@dataclass
+class DepthPolicyConfig:
+    """The policy's weights, and what it is asked for."""
+
+    network: ClassVar[NetworkSpec | TrajectoryNetworkSpec]
+    """Architecture of the policy."""
+    rate: ClassVar[float]
+    """[Hz], that the policy was trained at."""
+
+    # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
+    speed: float = 2.0
+    # File of weights, as `flysplat train` writes them; those that ship where left empty.
+    weights: str = ""
+    # What it sees through: its pixels are pooled to the network's, so give multiples of these.
+    camera: OnboardCamera = field(default_factory=OnboardCamera)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        if not 0.1 <= self.speed <= 10.0:
+            raise ValueError(
+                f"{type(self).__name__}.speed is {self.speed} m/s but must be 0.1 to 10; the "
+                f"default is {type(self).speed}"
+            )
+        self.camera.validate()
+        require_poolable(
+            self.camera.height,
+            self.camera.width,
+            self.network.image_height,
+            self.network.image_width,
+        )
