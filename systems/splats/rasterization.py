@@ -19,6 +19,7 @@ from flysplat.systems.splats.rasterization_autograd import (
 )
 from flysplat.systems.splats.rasterization_checks import (
     CHANNELS,
+    by_name,
     check_device,
     check_render_mode,
     check_shapes,
@@ -126,21 +127,8 @@ def rasterize(
         NotImplementedError: tensors are on a GPU and the cameras are distorted.
         ImportError: tensors are on a GPU and gsplat is not installed.
     """
-    tensors = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "Ks": Ks,
-    }
-    if backgrounds is not None:
-        tensors["backgrounds"] = backgrounds
-    if radial_coeffs is not None:
-        tensors["radial_coeffs"] = radial_coeffs
-    if tangential_coeffs is not None:
-        tensors["tangential_coeffs"] = tangential_coeffs
+    scene = (means, quats, scales, opacities, colors, viewmats)
+    tensors = by_name(*scene, Ks, backgrounds, radial_coeffs, tangential_coeffs)
     check_camera_model(camera_model, tangential_coeffs, max_angle)
     unscented = camera_model != "pinhole" or not (radial_coeffs is tangential_coeffs is None)
     check_render_mode(render_mode)
@@ -155,12 +143,7 @@ def rasterize(
                 "distorted cameras are rendered on the CPU alone; move the tensors with .cpu()"
             )
         return import_gsplat().rasterization(
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
-            viewmats,
+            *scene,
             Ks,
             width,
             height,
@@ -202,7 +185,6 @@ def rasterize(
         expected_depth="ED" in render_mode,
         absgrad=absgrad,
     )
-    scene = (means, quats, scales, opacities, colors, viewmats)
     wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
     if unscented:
         cameras = camera_projections(camera_model, Ks, radial_coeffs, tangential_coeffs, max_angle)

@@ -12,6 +12,13 @@ from flysplat import _native
 TILE_SIZE = 16  # [px]
 CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
 SCENE = ("means", "quats", "scales", "opacities", "colors")
+TENSORS = (*SCENE, "viewmats", "Ks", "backgrounds", "radial_coeffs", "tangential_coeffs")
+
+
+def by_name(*tensors: Tensor | None) -> dict[str, Tensor]:
+    """The first of `TENSORS` by their names, less those that are None."""
+    given = zip(TENSORS, tensors, strict=False)
+    return {name: tensor for name, tensor in given if tensor is not None}
 
 
 def check_shapes(

@@ -11,6 +11,7 @@ from flysplat.systems.splats.baked_scene import check_camera, create_renderer
 from flysplat.systems.splats.depth_normals import depth_to_normals
 from flysplat.systems.splats.rasterization_autograd import joined
 from flysplat.systems.splats.rasterization_checks import (
+    by_name,
     check_device,
     check_render_mode,
     check_shapes,
@@ -87,27 +88,13 @@ def rasterize_surfels(
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it).
         ImportError: tensors are on a GPU and gsplat is not installed.
     """
-    tensors = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "Ks": Ks,
-    }
-    if backgrounds is not None:
-        tensors["backgrounds"] = backgrounds
+    scene = (means, quats, scales, opacities, colors, viewmats)
+    tensors = by_name(*scene, Ks, backgrounds)
     _check_options(render_mode, depth_mode, distloss, radius_clip)
     check_shapes(tensors, sh_degree)
     if means.device.type == "cuda":
         return import_gsplat().rasterization_2dgs(
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
-            viewmats,
+            *scene,
             Ks,
             width,
             height,
@@ -142,9 +129,7 @@ def rasterize_surfels(
     arrays = {k: np.ascontiguousarray(t.detach().numpy()) for k, t in tensors.items()}
     # The third scale is not read; whatever it is, it is no error.
     check_values(arrays, frames.renderers[0], scale_axes=2)
-    color, normal, depth, alpha, median, distort = _Rasterize.apply(
-        means, quats, scales, opacities, colors, viewmats, view, frames
-    )
+    color, normal, depth, alpha, median, distort = _Rasterize.apply(*scene, view, frames)
 
     parts, surface = [], None
     if "RGB" in render_mode:
