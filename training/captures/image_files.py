@@ -20,10 +20,7 @@ def image_size(file: Path) -> tuple[int, int]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is empty, no image or cut short.
     """
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: the file is missing")
-    if file.stat().st_size == 0:
-        raise ValueError(f"{file}: the file is empty; copy it again")
+    _require_content(file)
     try:
         with Image.open(file) as image:
             size, kind = image.size, image.format
@@ -46,10 +43,7 @@ def array_shape(file: Path) -> tuple[int, ...]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is empty, no array or cut short.
     """
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: the file is missing")
-    if file.stat().st_size == 0:
-        raise ValueError(f"{file}: the file is empty; copy it again")
+    _require_content(file)
     try:
         return np.load(file, mmap_mode="r", allow_pickle=False).shape
     except (ValueError, EOFError, OSError) as error:
@@ -143,6 +137,13 @@ def _decoded(file: Path, flags: int) -> NDArray:
     if image is None:
         raise ValueError(f"{file}: not a readable image; copy it again")
     return image
+
+
+def _require_content(file: Path) -> None:
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: the file is missing")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{file}: the file is empty; copy it again")
 
 
 def _reason(error: Exception) -> str:
