@@ -6,6 +6,7 @@ has a gradient: the truth is data.
 """
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -45,7 +46,9 @@ def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2)
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight is {ssim_weight}; it must lie between 0 and 1")
     if _is_native(rendered):
-        return _Photometric.apply(rendered, target, ssim_weight)  # pyright: ignore[reportReturnType]
+        shape, native = (-1, *rendered.shape[-3:]), _native.photometric_loss
+        loss = _Fused.apply(rendered, native, shape, target, ssim_weight)
+        return loss  # pyright: ignore[reportReturnType]
     return photometric_loss_torch(rendered, target, ssim_weight)
 
 
@@ -83,7 +86,8 @@ def log_depth_loss(
     if not 0 < epsilon < far:
         raise ValueError(f"depth range is {epsilon} to {far} m; it must satisfy 0 < epsilon < far")
     if _is_native(rendered):
-        loss = _LogDepth.apply(rendered, depth, weights, epsilon, far)
+        native = _native.log_depth_loss
+        loss = _Fused.apply(rendered, native, (-1,), depth, weights, epsilon, far)
         return loss  # pyright: ignore[reportReturnType]
     return log_depth_loss_torch(rendered, depth, weights, epsilon, far)
 
@@ -174,54 +178,26 @@ def log_depth_loss_torch(
     return (loss + (rendered - rendered).detach()).sum() / max(depth.numel(), 1)
 
 
-class _Photometric(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, rendered: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        shape = (-1, *rendered.shape[-3:])
-        gradient = torch.empty(rendered.shape) if ctx.needs_input_grad[0] else None
-        value = _native.photometric_loss(
-            rendered.detach().contiguous().view(shape).numpy(),
-            target.contiguous().view(shape).numpy(),
-            ssim_weight,
-            None if gradient is None else gradient.view(shape).numpy(),
-            os.environ.get("FLYSPLAT_SIMD", ""),
-        )
-        ctx.gradient = gradient
-        return rendered.new_tensor(value)
+class _Fused(torch.autograd.Function):
+    """A loss of native code, which makes the gradient by the first tensor with the value."""
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_value: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return ctx.gradient * grad_value, None, None
-
-
-class _LogDepth(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        rendered: Tensor,
-        depth: Tensor,
-        weights: Tensor | None,
-        epsilon: float,
-        far: float,
+        ctx: Any, rendered: Tensor, loss: Callable[..., float], shape: tuple[int, ...], *data: Any
     ) -> Tensor:
+        def argument(x: Any) -> Any:
+            return x.detach().contiguous().view(shape).numpy() if isinstance(x, Tensor) else x
+
         gradient = torch.empty(rendered.shape) if ctx.needs_input_grad[0] else None
-        value = _native.log_depth_loss(
-            rendered.detach().contiguous().view(-1).numpy(),
-            depth.contiguous().view(-1).numpy(),
-            None if weights is None else weights.contiguous().view(-1).numpy(),
-            epsilon,
-            far,
-            None if gradient is None else gradient.view(-1).numpy(),
-            os.environ.get("FLYSPLAT_SIMD", ""),
-        )
+        simd = os.environ.get("FLYSPLAT_SIMD", "")
+        value = loss(*map(argument, (rendered, *data, gradient)), simd)
         ctx.gradient = gradient
         return rendered.new_tensor(value)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_value: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return ctx.gradient * grad_value, None, None, None, None
+        return ctx.gradient * grad_value, *(None for _ in ctx.needs_input_grad[1:])
 
 
 def _is_native(rendered: Tensor) -> bool:

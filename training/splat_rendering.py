@@ -50,33 +50,18 @@ def render(
         distortion: whether surfels render it.
         threads: of the CPU.
     """
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians[4].shape[1]]
-    mode = f"RGB+{depth_mode}"
+    scene = *gaussians, viewmat, K, width, height
+    options: dict[str, Any] = {
+        "sh_degree": {1: 0, 4: 1, 9: 2, 16: 3}[gaussians[4].shape[1]],
+        "backgrounds": background,
+        "render_mode": f"RGB+{depth_mode}",
+        "threads": threads,
+    }
     if representation == "3dgs":
-        image, alpha, meta = rasterize(
-            *gaussians,
-            viewmat,
-            K,
-            width,
-            height,
-            sh_degree=degree,
-            backgrounds=background,
-            render_mode=mode,
-            absgrad=absgrad,
-            threads=threads,
-        )
+        image, alpha, meta = rasterize(*scene, **options, absgrad=absgrad)
         return Rendering(image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0], meta)
     image, alpha, normals, surface_normals, distort, _, meta = rasterize_surfels(
-        *gaussians,
-        viewmat,
-        K,
-        width,
-        height,
-        sh_degree=degree,
-        backgrounds=background,
-        render_mode=mode,
-        distloss=distortion,
-        threads=threads,
+        *scene, **options, distloss=distortion
     )
     return Rendering(
         image[0, ..., :3],
