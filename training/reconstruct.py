@@ -1,7 +1,7 @@
 """From a capture to a scene folder that can be flown in."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +21,10 @@ from flysplat.training.captures.capture import Capture
 from flysplat.training.captures.read_capture import read_capture
 from flysplat.training.checkpoint import Checkpoint
 from flysplat.training.held_out import HeldOutFigures
-from flysplat.training.initial_gaussians import (
-    Detail,
-    gaussians_from_depth,
-    gaussians_from_points,
-    random_points,
-)
+from flysplat.training.initial_gaussians import gaussians_from_depth
+from flysplat.training.initialization import detail_of, first_gaussians, resolved
 from flysplat.training.lpips import Lpips
-from flysplat.training.optimize import Optimization, extent_of_cameras, one_torch_thread
+from flysplat.training.optimize import Optimization, one_torch_thread
 from flysplat.training.overlap import View
 from flysplat.training.photometry import Photometry, estimate_photometry
 from flysplat.training.reconstruct_config import ReconstructConfig
@@ -42,11 +38,6 @@ from flysplat.training.scene_distance_field import (
     unit_of,
     with_sky,
 )
-
-# Opacity with which Gaussians on surfaces start into the optimisation.
-_FIRST_OPACITY = 0.7
-# Depth of random Gaussians, in extents of the cameras.
-_RANDOM_DEPTH = (0.1, 10.0)
 
 
 @dataclass(frozen=True)
@@ -125,7 +116,7 @@ def reconstruct(
 ) -> ReconstructSummary:
     """Writes the scene folder `out`; see `run`. `path` says where the capture lies."""
     config.validate()
-    config = _resolved(config, capture)
+    config = resolved(config, capture)
     every = config.hold_out if config.iterations else 0
     held_out = list(range(0, len(capture), every)) if every else []
     fitted = [i for i in range(len(capture)) if i not in held_out]
@@ -140,7 +131,7 @@ def reconstruct(
     figures = None
     if config.iterations == 0:
         gains[fitted] = photometry.gains
-        gaussians, background = gaussians_from_depth(frames, photometry, _detail(config))
+        gaussians, background = gaussians_from_depth(frames, photometry, detail_of(config))
         how = "depth back-projected"
     else:
         views = ReconstructionViews(frames, photometry)
@@ -157,7 +148,7 @@ def reconstruct(
             views,
             withheld,
             background,
-            lambda: _initial(capture, frames, photometry, views, config),
+            lambda: first_gaussians(capture, frames, photometry, views, config),
             checkpoint,
             _perceptual(config),
             fit_gains=not capture.has_depth,
@@ -227,62 +218,6 @@ def mean_color(views: ReconstructionViews) -> tuple[float, float, float]:
     means = torch.stack([views.target(k).mean(dim=(0, 1)) for k in range(len(views))])
     red, green, blue = means.mean(dim=0).clamp(0, 1).tolist()
     return red, green, blue
-
-
-def _starts(capture: Capture) -> dict[str, bool]:
-    """Returns the initializations and whether the capture has them, the best first."""
-    return {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
-
-
-def _resolved(config: ReconstructConfig, capture: Capture) -> ReconstructConfig:
-    """Returns the config with what "auto" means for this capture."""
-    kind, strategy = config.initialization, config.strategy
-    if kind == "auto":
-        kind = next(name for name, there in _starts(capture).items() if there)
-    if strategy == "auto":
-        strategy = "none" if kind == "depth" else "default"
-    return replace(config, initialization=kind, strategy=strategy)
-
-
-def _initial(
-    capture: Capture,
-    frames: Sequence,
-    photometry: Photometry,
-    views: ReconstructionViews,
-    config: ReconstructConfig,
-) -> GaussianScene:
-    """Returns the Gaussians to start from.
-
-    Raises:
-        ValueError: if the capture lacks what is asked for.
-    """
-    kind, has = config.initialization, _starts(capture)
-    if not has[kind]:
-        raise ValueError(
-            f"initialization is {kind!r}, but {capture.name} has none; choose "
-            + " or ".join(repr(name) for name, there in has.items() if there)
-        )
-    if kind == "depth":
-        return gaussians_from_depth(frames, photometry, _detail(config))[0]
-    if capture.points is not None and kind == "points":
-        points = capture.points
-        return gaussians_from_points(points.p_WQ, points.colors)
-    _, extent = extent_of_cameras(views)
-    near, far = (extent * depth for depth in _RANDOM_DEPTH)
-    count = config.initial_gaussians
-    return gaussians_from_points(*random_points(frames, count, near, far, config.seed))
-
-
-def _detail(config: ReconstructConfig) -> Detail:
-    optimized = config.iterations > 0
-    return Detail(
-        max_gaussians=config.initial_gaussians if optimized else config.max_gaussians,
-        contrast=config.contrast,
-        max_cell=config.max_cell,
-        max_extent=config.max_extent,
-        opacity=_FIRST_OPACITY if optimized else config.opacity,
-        optimized=optimized,
-    )
 
 
 def _perceptual(config: ReconstructConfig) -> Callable[[Tensor, Tensor], Tensor] | None:
