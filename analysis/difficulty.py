@@ -10,7 +10,6 @@ a sensing range of 4 m and a field of view of 72 degrees.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from tqdm import tqdm
 
 from flysplat.analysis.ways import (
     SPACING,
-    cell_of,
     inside,
     march,
     path_length,
@@ -29,7 +27,13 @@ from flysplat.analysis.ways import (
 )
 from flysplat.diagrams.configuration import load_config
 from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.feasibility import conservative_distance, grid_distances
+from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
+from flysplat.diagrams.worlds.feasibility import (
+    cell_of,
+    conservative_distance,
+    grid_distances,
+    joined,
+)
 from flysplat.diagrams.worlds.make_world import make_world
 from flysplat.diagrams.worlds.world import World
 from flysplat.systems.collision.distance_field import DistanceField
@@ -38,8 +42,6 @@ from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SENSING_RANGE = 4.0
 """[m], of FlightBench's measures."""
-
-SCENARIOS = Path(__file__).parent.parent / "diagrams" / "scenarios"
 
 _RINGS = np.pi / np.array([5.0, 6.0, 8.0, 12.0])
 """[rad], outer half angles of the rings about the heading; the last one is a full cone."""
@@ -190,13 +192,11 @@ def angle_over_length(path: NDArray) -> float:
 def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> float:
     """Largest clearance [m], beyond the vehicle's radius, that some way on the grid keeps
     everywhere; found by bisection to 1 cm. The grid may miss the middle of a gap by half a cell."""
-    ends = [cell_of(field, grid, p) for p in (p_WS, p_WG)]
+    ends = [cell_of(field, grid, SPACING, p) for p in (p_WS, p_WG)]
     low, high = 0.0, float(min(grid[end] for end in ends))
     while high - low > 0.01:
         middle = (low + high) / 2
-        part = np.asarray(label(grid >= middle)[0])  # pyright: ignore[reportIndexIssue]
-        joined = part[ends[0]] == part[ends[1]] > 0
-        low, high = (middle, high) if joined else (low, middle)
+        low, high = (middle, high) if joined(grid >= middle, *ends) else (low, middle)
     return low - VEHICLE_RADIUS
 
 
@@ -204,19 +204,6 @@ def _known(world: World) -> DistanceField:
     """The exact field of a generated world; of others the grid, unknown space counting as full."""
     field = world.distance_field
     return field.conservative() if isinstance(field, Esdf) else field
-
-
-def scenario_file(name: str) -> Path:
-    """The file of a scenario that comes with the program, by its id, or of a path.
-
-    Raises:
-        FileNotFoundError: if there is none; the message lists those there are.
-    """
-    for path in (SCENARIOS / f"{name}.yaml", Path(name)):
-        if path.is_file():
-            return path
-    known = ", ".join(sorted(path.stem for path in SCENARIOS.glob("*.yaml")))
-    raise FileNotFoundError(f"{name}: there is no such scenario; there are {known}, or give a file")
 
 
 def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
@@ -231,7 +218,7 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
     Raises:
         ValueError, FileNotFoundError: for a scenario that does not exist or cannot be made.
     """
-    files = [scenario_file(name) for name in scenarios] or sorted(SCENARIOS.glob("*.yaml"))
+    files = [scenario_file(name) for name in scenarios or benchmark_scenarios()]
     names = ("trav", "gap", "TO", "VO", "AOL", "detour", "neck m")
     head = f"{'scenario':<10}{'feasible':>10}{'CPU s':>7}" + "".join(f"{n:>8}" for n in names)
     lines = [head]

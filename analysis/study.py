@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flysplat import diagrams
 from flysplat.diagrams.add_policy import POLICIES, policy_named
 from flysplat.diagrams.configuration import load_config
 from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
 
 MAX_SEEDS = 1_000_000
 """Seeds from here on are for training: nothing is judged where it was trained."""
@@ -99,27 +99,3 @@ class StudyConfig:
 def scenario_of(spec: RolloutSpec, scenario: Scenario) -> Scenario:
     """The scenario of one flight: with its policy, speed and seed."""
     return replace(scenario, policy=policy_named(spec.policy, spec.speed), seed=spec.seed)
-
-
-def benchmark_scenarios() -> dict[str, Path]:
-    """The files of the benchmark's scenarios by name."""
-    folder = Path(diagrams.__file__).parent / "scenarios"
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-
-
-def scenario_file(scenario: str) -> Path:
-    """
-    The file of a scenario, given by its name in the benchmark or as a path.
-
-    Raises:
-        ValueError: if it is neither.
-    """
-    known = benchmark_scenarios()
-    if scenario in known:
-        return known[scenario]
-    if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
-        return Path(scenario)
-    raise ValueError(
-        f"there is no scenario {scenario!r}; the benchmark's are {', '.join(known)}, others are "
-        "given as YAML files"
-    )

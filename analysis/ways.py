@@ -4,7 +4,7 @@ import numpy as np
 import skfmm
 from numpy.typing import NDArray
 
-from flysplat.diagrams.worlds.feasibility import conservative_distance
+from flysplat.diagrams.worlds.feasibility import cell_of, conservative_distance
 from flysplat.systems.collision.distance_field import DistanceField
 from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -19,14 +19,14 @@ def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDAr
     Raises:
         ValueError: if there is none on the grid.
     """
-    shape, goal = grid.shape, cell_of(field, grid, p_WG)
+    shape, goal = grid.shape, cell_of(field, grid, SPACING, p_WG)
     front = np.ones(shape)
     front[goal] = -1.0
     blocked = grid < VEHICLE_RADIUS + 0.02
     blocked[goal] = False
     marched = skfmm.distance(np.ma.MaskedArray(front, mask=blocked), dx=SPACING)
     length = np.where(np.ma.getmaskarray(marched), np.inf, np.ma.getdata(marched))
-    cell = cell_of(field, grid, p_WS)
+    cell = cell_of(field, grid, SPACING, p_WS)
     if not np.isfinite(length[cell]):
         raise ValueError("no way from start to goal was found on a grid of 0.2 m")
     offsets = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1
@@ -101,9 +101,3 @@ def resampled(path: NDArray, step: float) -> NDArray:
 def inside(field: DistanceField, p_W: NDArray) -> NDArray[np.bool_]:
     """Whether p_W (..., 3) [m] lie in the field's bounds: (...,)."""
     return ((p_W >= field.lower_W) & (p_W <= field.upper_W)).all(axis=-1)
-
-
-def cell_of(field: DistanceField, grid: NDArray, p_W: NDArray) -> tuple[int, ...]:
-    """The cell of a grid of `SPACING` that p_W (3,) [m] lies in."""
-    cell = np.clip(((p_W - field.lower_W) / SPACING).astype(int), 0, np.array(grid.shape) - 1)
-    return tuple(int(c) for c in cell)

@@ -32,11 +32,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _fly(options: argparse.Namespace) -> None:
-    from flysplat.analysis.study import scenario_file
     from flysplat.diagrams import fly
     from flysplat.diagrams.add_policy import policy_named
     from flysplat.diagrams.configuration import load_config
     from flysplat.diagrams.scenario import Scenario
+    from flysplat.diagrams.scenario_files import scenario_file
     from flysplat.diagrams.worlds.make_world import SceneConfig
 
     logging.getLogger("drake").setLevel(logging.WARNING)

@@ -24,8 +24,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _tour(options: argparse.Namespace) -> None:
     from flysplat.analysis import tour
-    from flysplat.analysis.study import benchmark_scenarios
     from flysplat.diagrams.configuration import load_config
+    from flysplat.diagrams.scenario_files import benchmark_scenarios
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     config = tour.TourConfig()

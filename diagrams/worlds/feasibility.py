@@ -71,12 +71,19 @@ def connects(
     """
     grid = grid_distances(field, spacing)
     free = grid > radius + spacing / 2
-    cells = [
-        tuple(np.clip(((p - field.lower_W) / spacing).astype(int), 0, np.array(free.shape) - 1))
-        for p in (p_WS, p_WG)
-    ]
+    return joined(free, *(cell_of(field, grid, spacing, p) for p in (p_WS, p_WG)))
+
+
+def cell_of(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
+    """The cell of `grid_distances` that p_W (3,) [m] lies in."""
+    cell = np.clip(((p_W - field.lower_W) / spacing).astype(int), 0, np.array(grid.shape) - 1)
+    return tuple(int(c) for c in cell)
+
+
+def joined(free: NDArray, a: tuple[int, ...], b: tuple[int, ...]) -> bool:
+    """Whether steps along the axes lead from cell a to cell b of a grid, all of them `free`."""
     part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
-    return bool(part[cells[0]] == part[cells[1]] > 0)
+    return bool(part[a] == part[b] > 0)
 
 
 def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:

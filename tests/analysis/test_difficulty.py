@@ -10,7 +10,6 @@ from flysplat.analysis.difficulty import (
     difficulty,
     relative_gap_size,
     run,
-    scenario_file,
     traversability,
     traversability_obstacle,
     view_obstacle,
@@ -109,9 +108,3 @@ def test_table_says_what_was_not_run(tmp_path, monkeypatch, capsys):
     lines = run(scenarios=[str(small), "R13"], seeds=1)
     assert "1/1" in lines[1]
     assert "not run" in lines[2] and "TartanAir" in lines[2] and str(tmp_path) in lines[2]
-
-
-def test_unknown_scenario_lists_those_there_are():
-    """An id that does not exist is an error with the ids that do."""
-    with pytest.raises(FileNotFoundError, match=r"P99: .*P01, P02"):
-        scenario_file("P99")

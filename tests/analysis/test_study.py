@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 
 from flysplat.analysis.rollout import chunks
-from flysplat.analysis.study import RolloutSpec, StudyConfig, benchmark_scenarios, scenario_of
+from flysplat.analysis.study import RolloutSpec, StudyConfig, scenario_of
 from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.scenario_files import benchmark_scenarios
 
 
 def test_rollouts_are_all_combinations(short_scenario):

@@ -1,25 +1,23 @@
 """The courses that policies train in: of the benchmark's kinds, of seeds that it never uses."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import cast
 
 import torch
 
 from flysplat.diagrams.configuration import load_config
 from flysplat.diagrams.scenario import Scenario
+from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
 from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
 from flysplat.training.policies.fields import Course, Fields
-
-_SCENARIOS = Path(__file__).parents[2] / "diagrams" / "scenarios"
 
 VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
 """Worlds of the seeds from here on choose among checkpoints and are not trained in either."""
 
 _LARGEST_RUN = 1000  # courses of one training seed
 
-PROCEDURAL = tuple(sorted(path.stem for path in _SCENARIOS.glob("P*.yaml")))
+PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
 """The scenarios whose worlds are made from seeds."""
 
 
@@ -51,7 +49,7 @@ class CourseSelection:
 
 def make_course(kind: str, seed: int) -> Course:
     """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
-    world = load_config(Scenario(), _SCENARIOS / f"{kind}.yaml").world
+    world = load_config(Scenario(), scenario_file(kind)).world
     plan = make_blueprint(cast(ProceduralConfig, world), seed)
     shapes = [solid.shape for solid in plan.solids]
     return Course(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
