@@ -61,7 +61,7 @@ class DepthNavLoss:
 class DepthNavTraining(FlightTraining):
     """A training run."""
 
-    schedule: Schedule = field(default_factory=lambda: Schedule(updates=600))
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=4000, validate_every=500))
     school: FlightSchool = field(
         default_factory=lambda: FlightSchool(
             environments=32, steps=40, gradient_decay=0.12, averaging=2.0
