@@ -58,11 +58,11 @@ class AgileTraining:
     # Where the tensors live: cpu, or cuda.
     device: str = "cpu"
     schedule: Schedule = field(
-        default_factory=lambda: Schedule(updates=20_000, validate_every=1000, checkpoint_every=1000)
+        default_factory=lambda: Schedule(updates=14_000, validate_every=1000, checkpoint_every=1000)
     )
     courses: CourseSelection = field(default_factory=CourseSelection)
     # [-] Rounds of data: in the first the expert flies, then the student more and more.
-    rounds: int = 12
+    rounds: int = 8
     # [-] Updates between rounds.
     round_updates: int = 1000
     # [-] Vehicles in flight at once, each in a world of its own, and steps of 1/15 s that they fly
