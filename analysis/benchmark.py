@@ -8,6 +8,7 @@ from tqdm import tqdm
 
 from flysplat.analysis.provenance import program
 from flysplat.analysis.report import write_report
+from flysplat.analysis.rollout import Rollout
 from flysplat.analysis.study import RolloutSpec, StudyConfig
 from flysplat.analysis.study_folder import StudyFolder
 from flysplat.analysis.tables import format_table, policy_table
@@ -61,7 +62,8 @@ def run(
         print(f"{len(specs) - len(missing)} of {len(specs)} flights are there already.")
     kept = {name: dump_config(folder.scenario(name)) for name in flyable}
     done = [folder.read(spec)[0] for spec in specs if spec not in set(missing)]
-    _fly(folder, missing, kept, done, len(specs), jobs or default_jobs(), cluster)
+    flights = fly_all(missing, kept, jobs or default_jobs(), cluster, folder.weights())
+    _keep(folder, flights, done, len(specs))
 
     rows = [folder.read(spec)[0] for spec in specs]
     timings = [folder.read_timing(spec.id) for spec in specs]
@@ -116,18 +118,13 @@ def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
             )
 
 
-def _fly(
-    folder: StudyFolder,
-    specs: list[RolloutSpec],
-    scenarios: dict[str, str],
-    done: Iterable[dict[str, Any]],
-    total: int,
-    jobs: int,
-    cluster: str | None,
+def _keep(
+    folder: StudyFolder, flights: Iterable[Rollout], done: list[dict[str, Any]], total: int
 ) -> None:
+    """Writes flights as they end; `done` are the rows of those that were there."""
     successes = [row["success"] for row in done]
     with tqdm(total=total, initial=len(successes), desc="flying", unit="flight") as bar:
-        for rollout in fly_all(specs, scenarios, jobs, cluster):
+        for rollout in flights:
             folder.write(rollout)
             successes.append(rollout.row["success"])
             bar.set_postfix_str(f"{sum(successes) / len(successes):.0%} success", refresh=False)

@@ -48,7 +48,7 @@ def run(
     row, recorded = folder.read(spec)
     if row["outcome"] == ERROR:
         raise ValueError(f"{id} ended in an error and cannot be compared: {row['error']}")
-    scenario = scenario_of(spec, folder.scenario(spec.scenario))
+    scenario = scenario_of(spec, folder.scenario(spec.scenario), folder.weights())
     world = study_world(scenario)
     out = out or study / "replays" / id
     if meshcat or video:

@@ -63,7 +63,7 @@ def write_report(
         damaged: files that were flown again in this run.
     """
     table = policy_table(rows, config, len(absent))
-    figure = draw_success_against_speed(table, config.policies)
+    figure = draw_success_against_speed(table, config.policy_names)
     success_png = save_png(figure, folder.path / "success_against_speed.png")
     sections = [
         f"<h1>Navigation benchmark</h1><p>{_scope(config, rows)}</p>",
@@ -163,7 +163,7 @@ def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[
     header = ["policy", "decision [ms]", "render [ms]", "real-time factor"]
     names = "policy_ms", "render_ms", "real_time_factor"
     lines = []
-    for policy in config.policies:
+    for policy in config.policy_names:
         times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
         lines.append([escape(policy), *(_number(mean_of(times, name), ".1f") for name in names)])
     return "<p>Mean times, of this machine and its load:</p>" + _html_table(header, lines)
@@ -198,7 +198,7 @@ def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
 def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
     lines = []
     for speed in config.speeds:
-        for first, second in combinations(config.policies, 2):
+        for first, second in combinations(config.policy_names, 2):
             result = compare(rows, first, second, speed)
             p = f"{result.p_value:.3f}" if result.p_value >= 0.001 else f"{result.p_value:.0e}"
             pair = f"{escape(first)} and {escape(second)}"
@@ -210,7 +210,7 @@ def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
 
 
 def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]) -> str:
-    columns = [(policy, speed) for policy in config.policies for speed in config.speeds]
+    columns = [(policy, speed) for policy in config.policy_names for speed in config.speeds]
     header = ["scenario", *(f"{escape(policy)}<br>{speed:g} m/s" for policy, speed in columns)]
     names = list(dict.fromkeys(spec.scenario for spec in config.rollouts()))
     lines = []
@@ -227,17 +227,17 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str,
     spec = _telling_flight(rows)
     if spec is None:
         return "<p>Nothing was flown.</p>"
-    scenario = scenario_of(spec, folder.scenario(spec.scenario))
+    scenario = scenario_of(spec, folder.scenario(spec.scenario), folder.weights())
     world = make_world(scenario.world, scenario.seed)
     flights = {}
-    for policy in config.policies:
+    for policy in config.policy_names:
         row, arrays = folder.read(spec._replace(policy=policy))
         if arrays:
             flights[policy] = arrays["states"][:, :3], row["outcome"]
     p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
     figure = draw_trajectories(
-        world, flights, p_WS, goal_of(scenario, world), config.policies, title
+        world, flights, p_WS, goal_of(scenario, world), config.policy_names, title
     )
     png = save_png(figure, folder.path / "trajectories.png")
     note = (

@@ -42,19 +42,22 @@ class Rollout(NamedTuple):
     """How long it took, and where."""
 
 
-def fly_rollouts(specs: list[RolloutSpec], scenario: str) -> list[Rollout]:
+def fly_rollouts(specs: list[RolloutSpec], scenario: str, weights: dict[str, str]) -> list[Rollout]:
     """Flies some flights of one scenario, given as YAML, in this process.
 
     Configurations of Drake's own do not pickle, and so scenarios travel between processes as text.
     """
     parsed = parse_config(Scenario(), scenario, f"scenario {specs[0].scenario}")
-    return [fly_rollout(spec, parsed) for spec in specs]
+    return [fly_rollout(spec, parsed, weights) for spec in specs]
 
 
-def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
-    """Flies one flight of a study: `scenario` with the policy, speed and seed of `spec`."""
+def fly_rollout(
+    spec: RolloutSpec, scenario: Scenario, weights: dict[str, str] | None = None
+) -> Rollout:
+    """Flies one flight of a study: `scenario` with the policy, speed and seed of `spec`; `weights`
+    as for `scenario_of`."""
     started, cpu_started = time.perf_counter(), time.process_time()
-    flown = scenario_of(spec, scenario)
+    flown = scenario_of(spec, scenario, weights)
     timing: dict[str, Any] = {"id": spec.id}
     try:
         world = study_world(flown)

@@ -2,6 +2,7 @@
 again."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +36,7 @@ class StudyConfig:
 
     # Names of the benchmark's scenarios, or YAML files of others.
     scenarios: list[str] = field(default_factory=lambda: list(benchmark_scenarios()))
+    # Names of policies, or files of weights (.npz), whose policies are named after the file.
     policies: list[str] = field(default_factory=lambda: list(POLICIES))
     # [m/s] Nominal speeds.
     speeds: list[float] = field(default_factory=lambda: [2.0])
@@ -43,6 +45,11 @@ class StudyConfig:
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
 
+    @property
+    def policy_names(self) -> list[str]:
+        """The policies by the names that their flights bear."""
+        return [Path(policy).stem for policy in self.policies]
+
     def rollouts(self) -> list[RolloutSpec]:
         """All flights; those through the same place stand together."""
         return [
@@ -50,7 +57,7 @@ class StudyConfig:
             for scenario in self.scenarios
             for seed in range(self.seeds)
             for speed in self.speeds
-            for policy in self.policies
+            for policy in self.policy_names
         ]
 
     def load_scenarios(self) -> dict[str, Scenario]:
@@ -65,20 +72,22 @@ class StudyConfig:
             raise ValueError(f"seeds is {self.seeds}; it must be 1 to {MAX_SEEDS}")
         names = [Path(scenario).stem for scenario in self.scenarios]
         given: dict[str, list[Any]]
-        given = {"scenario": names, "policy": self.policies, "speed": self.speeds}
+        given = {"scenario": names, "policy": self.policy_names, "speed": self.speeds}
         for what, values in given.items():
             if not values:
                 raise ValueError(f"the study has no {what}; name at least one")
             twice = [value for value in values if values.count(value) > 1]
             if twice:
-                raise ValueError(f"the {what} {twice[0]} is given twice; give it once")
+                raise ValueError(
+                    f"the {what} {twice[0]} is given twice; give it once, or rename the file"
+                )
         for override in self.overrides:
             field = override.partition("=")[0].partition(".")[0]
             if field in ("policy", "seed"):
                 raise ValueError(
                     f"the override {override!r} has no place in a study: each of its flights has "
-                    "its own policy, speed and seed; name them with --policies, --speeds and "
-                    "--seeds"
+                    "its own policy, speed and seed; name them with --policies (also files of "
+                    "weights), --speeds and --seeds"
                 )
         for speed in self.speeds:
             if not 0.0 < speed < math.inf:
@@ -96,6 +105,15 @@ class StudyConfig:
         return scenarios
 
 
-def scenario_of(spec: RolloutSpec, scenario: Scenario) -> Scenario:
-    """The scenario of one flight: with its policy, speed and seed."""
-    return replace(scenario, policy=policy_named(spec.policy, spec.speed), seed=spec.seed)
+def scenario_of(
+    spec: RolloutSpec, scenario: Scenario, weights: Mapping[str, str] | None = None
+) -> Scenario:
+    """The scenario of one flight: with its policy, speed and seed.
+
+    Args:
+        spec: the flight.
+        scenario: without these.
+        weights: files of weights by the names of their policies; others fly as they ship.
+    """
+    policy = (weights or {}).get(spec.policy, spec.policy)
+    return replace(scenario, policy=policy_named(policy, spec.speed), seed=spec.seed)

@@ -3,6 +3,7 @@
     study.yaml       what is flown, and the program that flies it
     scenarios/       the scenarios, every field written out
     scenes/          the reconstructed scenes they fly in
+    weights/         of policies that were given as files
     rollouts/        a trajectory and its measures for each flight
     timings/         how long each took, and where: all that differs between two runs of a study
     rollouts.csv, timings.csv, table.csv, report.html
@@ -68,8 +69,11 @@ class StudyFolder:
                 f"{self.path} is not empty and holds no study; choose another folder with --out"
             )
         require_writable_folder(self.path)
-        for folder in ("scenarios", "scenes", "rollouts", "timings"):
+        for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
             (self.path / folder).mkdir(exist_ok=True)
+        for policy in config.policies:
+            if policy.endswith(".npz"):
+                self._keep_weights(Path(policy))
         for name, scenario in scenarios.items():
             self._keep_scenario(name, scenario)
         if not (self.path / "study.yaml").is_file():
@@ -113,6 +117,19 @@ class StudyFolder:
                 shutil.copyfile(scene, partial)
             partial.rename(kept)
         world.path = f"scenes/{kept.name}"
+
+    def _keep_weights(self, file: Path) -> None:
+        kept = self.path / "weights" / file.name
+        if kept.is_file() and kept.read_bytes() != file.read_bytes():
+            raise ValueError(
+                f"{file} has changed since {self.path} was begun; choose another folder with --out"
+            )
+        with written_atomically(kept) as path:
+            shutil.copyfile(file, path)
+
+    def weights(self) -> dict[str, str]:
+        """The files of the policies that were given as files, by name."""
+        return {file.stem: str(file.absolute()) for file in self.path.glob("weights/*.npz")}
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"

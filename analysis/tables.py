@@ -74,7 +74,7 @@ def policy_table(
     """A row for each policy and speed: `success_summary`, the flights that were not run because
     `absent` scenarios have no scene here, and the means of `MEASURES`."""
     table = []
-    for policy in config.policies:
+    for policy in config.policy_names:
         for speed in config.speeds:
             flown = select(rows, policy=policy, speed=speed)
             table.append(

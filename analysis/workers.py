@@ -13,9 +13,16 @@ CONNECT_TIMEOUT = 10.0
 _CHUNK = 6
 """Most flights through one place handed out together: what of a kill is flown again."""
 
+_Work = tuple[list[RolloutSpec], str, dict[str, str]]
+"""Arguments of `fly_rollouts`."""
+
 
 def fly_all(
-    specs: list[RolloutSpec], scenarios: dict[str, str], jobs: int, cluster: str | None = None
+    specs: list[RolloutSpec],
+    scenarios: dict[str, str],
+    jobs: int,
+    cluster: str | None = None,
+    weights: dict[str, str] | None = None,
 ) -> Iterator[Rollout]:
     """
     Flies rollouts in worker processes and yields them as they end, in any order.
@@ -25,20 +32,20 @@ def fly_all(
         scenarios: by name, as YAML, without policy, speed and seed.
         jobs: worker processes on this machine, 1 or more.
         cluster: address of a dask scheduler, whose workers fly instead.
+        weights: files of weights by the names of their policies; others fly as they ship.
 
     Raises:
         OSError: if a worker process dies, or the cluster cannot be reached; all that was yielded
             before is good.
     """
-    work = list(chunks(specs, _CHUNK))
-    texts = [scenarios[chunk[0].scenario] for chunk in work]
+    work = [(chunk, scenarios[chunk[0].scenario], weights or {}) for chunk in chunks(specs, _CHUNK)]
     if cluster is not None:
-        yield from _on_cluster(work, texts, cluster)
+        yield from _on_cluster(work, cluster)
         return
-    yield from _in_processes(work, texts, jobs)
+    yield from _in_processes(work, jobs)
 
 
-def _in_processes(work: list[list[RolloutSpec]], texts: list[str], jobs: int) -> Iterator[Rollout]:
+def _in_processes(work: list[_Work], jobs: int) -> Iterator[Rollout]:
     from joblib import Parallel, delayed
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -47,7 +54,7 @@ def _in_processes(work: list[list[RolloutSpec]], texts: list[str], jobs: int) ->
     parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
     fly = delayed(fly_rollouts)
     try:
-        for rollouts in parallel(fly(*pair) for pair in zip(work, texts, strict=True)):
+        for rollouts in parallel(fly(*part) for part in work):
             yield from rollouts
     except TerminatedWorkerError as error:
         raise OSError(
@@ -59,7 +66,7 @@ def _in_processes(work: list[list[RolloutSpec]], texts: list[str], jobs: int) ->
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
-def _on_cluster(work: list[list[RolloutSpec]], texts: list[str], address: str) -> Iterator[Rollout]:
+def _on_cluster(work: list[_Work], address: str) -> Iterator[Rollout]:
     try:
         from distributed import Client, as_completed
         from distributed.scheduler import KilledWorker
@@ -74,7 +81,7 @@ def _on_cluster(work: list[list[RolloutSpec]], texts: list[str], address: str) -
         ) from None
     with client:
         # A chunk whose worker dies is given to another; flights are pure, so that costs only time.
-        futures = client.map(fly_rollouts, work, texts, pure=False, retries=3)
+        futures = client.map(fly_rollouts, *zip(*work, strict=True), pure=False, retries=3)
         try:
             for _, rollouts in as_completed(futures, with_results=True):
                 yield from rollouts

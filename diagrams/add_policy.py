@@ -1,6 +1,7 @@
 """All policies: their configurations, their names, and how each becomes part of a diagram."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from pydrake.systems.framework import DiagramBuilder, System
 
@@ -8,6 +9,7 @@ from flysplat.diagrams.worlds.world import World
 from flysplat.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from flysplat.systems.policies.depthnav import DepthNav, DepthNavConfig
 from flysplat.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from flysplat.systems.policies.policy_checkpoint import policy_of
 from flysplat.systems.policies.privileged_planner import PrivilegedPlanner, PrivilegedPlannerConfig
 from flysplat.systems.policies.reactive import Reactive
 from flysplat.systems.policies.reactive_planner import ReactiveConfig
@@ -38,14 +40,27 @@ POLICIES: dict[str, Callable[[float], PolicyConfig]] = {
 
 
 def policy_named(name: str, speed: float = 2.0) -> PolicyConfig:
-    """The configuration of the policy `name` for a nominal speed [m/s].
+    """The configuration of a policy for a nominal speed [m/s].
+
+    Args:
+        name: of the policy, or a file of weights (.npz) that one was trained to.
+        speed: [m/s].
 
     Raises:
-        ValueError: if there is no such policy, or it does not fly at this speed.
+        FileNotFoundError: if there is no such file.
+        ValueError: if there is no such policy, the file holds none, or it does not fly at this
+            speed.
     """
-    if name not in POLICIES:
-        raise ValueError(f"there is no policy {name!r}; the policies are {', '.join(POLICIES)}")
-    config = POLICIES[name](speed)
+    weights = name if name.endswith(".npz") else ""
+    policy = policy_of(weights) if weights else name
+    if policy not in POLICIES:
+        raise ValueError(
+            f"there is no policy {policy!r}; the policies are {', '.join(POLICIES)}, and files of "
+            "weights (.npz)"
+        )
+    config = POLICIES[policy](speed)
+    if weights:
+        config = replace(config, weights=weights)  # pyright: ignore[reportCallIssue]
     config.validate()
     return config
 

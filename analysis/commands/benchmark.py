@@ -26,7 +26,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         help=f"a few minutes: {', '.join(QUICK_SCENARIOS)}, {', '.join(QUICK_POLICIES)}, "
         f"{QUICK_SEEDS} seeds, unless other ones are named",
     )
-    benchmark.add_argument("--policies", type=_names, metavar="A,B", help="default: all")
+    benchmark.add_argument(
+        "--policies", type=_names, metavar="A,B.npz", help="names or files of weights; default: all"
+    )
     benchmark.add_argument(
         "--scenarios", type=_names, metavar="P02,FILE.yaml", help="default: all of the benchmark"
     )

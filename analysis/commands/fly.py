@@ -15,7 +15,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         metavar="P02|FILE.yaml",
         help="the scenario to fly: the benchmark's, or a file",
     )
-    fly.add_argument("--policy", metavar="NAME", help="who flies, by its name in the benchmark")
+    fly.add_argument(
+        "--policy",
+        metavar="NAME",
+        help="who flies, by its name in the benchmark, or a file of weights",
+    )
     fly.add_argument(
         "--scene",
         type=Path,

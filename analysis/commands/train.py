@@ -19,17 +19,35 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         help="folder to write; an interrupted run of the same configuration goes on there",
     )
     train.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
+    train.add_argument(
+        "--fly",
+        metavar="P02,P03",
+        help="scenarios of the benchmark to fly when trained, five seeds of each",
+    )
     add_overrides(train, "schedule.updates=2000")
 
 
 def _train(options: argparse.Namespace) -> None:
+    from flysplat.analysis import benchmark
+    from flysplat.analysis.study import StudyConfig
     from flysplat.diagrams.configuration import load_config
+    from flysplat.diagrams.scenario_files import scenario_file
     from flysplat.training.policies.registry import RECIPES
     from flysplat.training.policies.train import run
 
+    scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
+    for name in scenarios:
+        scenario_file(name)  # before the training, not after it
     recipe = RECIPES[options.policy]
     run(
         config=load_config(recipe.config(), options.config, options.overrides),
         out=options.out,
         make=recipe.make,
     )
+    if scenarios:
+        study = StudyConfig(
+            scenarios=scenarios,
+            policies=[str(options.out / f"{options.policy}.npz")],
+            seeds=5,
+        )
+        benchmark.run(config=study, out=options.out / "benchmark")

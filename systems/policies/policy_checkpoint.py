@@ -81,6 +81,23 @@ class PolicyCheckpoint:
         return cls(policy, spec, weights, provenance)
 
 
+def policy_of(path: str | Path) -> str:
+    """The name of the policy that a file holds weights of.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it holds no weights.
+    """
+    remedy = "train some with: flysplat train POLICY --out DIR"
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there are no weights at {path}; {remedy}")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return json.loads(str(file["about"]))["policy"]
+    except Exception as error:
+        raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None
+
+
 def check_weights(
     weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, np.ndarray]:

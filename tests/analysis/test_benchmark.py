@@ -18,6 +18,8 @@ from flysplat.analysis import benchmark, replay
 from flysplat.analysis.cli import main
 from flysplat.analysis.study import StudyConfig
 from flysplat.analysis.study_folder import StudyFolder
+from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK
+from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +191,35 @@ def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
     assert not result.exact
     assert result.deviation == pytest.approx(0.001, rel=0.01)
     assert "THE REPLAY DIFFERS" in capsys.readouterr().out
+
+
+def test_weights_of_ones_own_fly_in_a_study_that_keeps_them(short_scenario, tmp_path):
+    """A policy given as a file of weights is named after it, flies by them and not by those that
+    ship, replays without the file, and the study is refused when the file changes.
+    """
+    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+
+    def write(thrust: float) -> None:
+        weights = {**shipped.weights, "head.weight": 0.0 * shipped.weights["head.weight"]}
+        weights["head.bias"] = np.array([0.0, 0.0, thrust], np.float32)
+        PolicyCheckpoint("diffaero", shipped.spec, weights, {}).save(tmp_path / "mine.npz")
+
+    write(2.0)
+    policies = ["diffaero", str(tmp_path / "mine.npz")]
+    config = StudyConfig([str(short_scenario)], policies, seeds=1)
+    folder = StudyFolder(tmp_path / "out")
+    benchmark.run(config=config, out=folder.path, jobs=1)
+    rows = rows_of(folder.path / "rollouts.csv")
+    assert [row["policy"] for row in rows] == ["diffaero", "mine"]
+    risen = [folder.read(spec)[1]["states"] for spec in config.rollouts()][1]
+    z, v_z = risen[-1, 2] - risen[0, 2], risen[-1, 5]
+    assert z > 1.0 and v_z > 2.0  # straight up, as these weights say
+
+    write(-2.0)
+    with pytest.raises(ValueError, match=r"mine.npz has changed since"):
+        benchmark.run(config=config, out=folder.path, jobs=1)
+    (tmp_path / "mine.npz").unlink()
+    assert replay.run(study=folder.path, id="short-mine-2-000").exact
 
 
 @pytest.mark.parametrize(

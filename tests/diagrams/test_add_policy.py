@@ -8,6 +8,9 @@ from flysplat.diagrams.add_policy import POLICIES, policy_named
 from flysplat.diagrams.flight import Outcome, fly
 from flysplat.diagrams.flight_diagram import BuildFlightDiagram
 from flysplat.diagrams.scenario import Scenario
+from flysplat.systems.policies.depthnav import DepthNavConfig
+from flysplat.systems.policies.depthnav_policy import DEPTHNAV_NETWORK
+from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
 
 
 @pytest.mark.parametrize(
@@ -47,3 +50,16 @@ def test_unknown_policy_and_speed_are_refused():
         policy_named("Planner")
     with pytest.raises(ValueError, match=r"speed is -1"):
         policy_named("planner", -1.0)
+
+
+def test_file_of_weights_is_a_policy(tmp_path):
+    """A file of weights gives the policy it was trained for; one that is absent or holds something
+    else is named."""
+    PolicyCheckpoint("depthnav", DEPTHNAV_NETWORK, {}, {}).save(tmp_path / "mine.npz")
+    config = policy_named(str(tmp_path / "mine.npz"), 1.5)
+    assert config == DepthNavConfig(speed=1.5, weights=str(tmp_path / "mine.npz"))
+    with pytest.raises(FileNotFoundError, match=r"no weights at .*absent.npz"):
+        policy_named(str(tmp_path / "absent.npz"))
+    (tmp_path / "text.npz").write_text("nothing")
+    with pytest.raises(ValueError, match=r"text.npz holds no weights"):
+        policy_named(str(tmp_path / "text.npz"))

@@ -56,16 +56,17 @@ class AgileTraining:
     # Where the tensors live: cpu, or cuda.
     device: str = "cpu"
     schedule: Schedule = field(
-        default_factory=lambda: Schedule(updates=3000, validate_every=500, checkpoint_every=500)
+        default_factory=lambda: Schedule(updates=14_000, validate_every=1000, checkpoint_every=1000)
     )
     courses: CourseSelection = field(default_factory=CourseSelection)
     # [-] Rounds of data: in the first the expert flies, then the student more and more.
-    rounds: int = 5
+    rounds: int = 8
     # [-] Updates between rounds.
-    round_updates: int = 500
-    # [-] Vehicles in flight at once, and steps of 1/15 s that they fly in a round.
-    environments: int = 60
-    steps: int = 300
+    round_updates: int = 1000
+    # [-] Vehicles in flight at once, each in a world of its own, and steps of 1/15 s that they fly
+    # in a round.
+    environments: int = 90
+    steps: int = 450
     # [-] Steps between two questions to the expert.
     ask_every: int = 4
     # [m/s] Speeds that are asked for.
@@ -110,7 +111,7 @@ class AgileTrainee:
         number, within = divmod(update, config.round_updates)
         if within == 0 and number < config.rounds:
             student = number / config.rounds  # part of the vehicles that the student flies
-            new = self._collected(student)
+            new = self._collected(student, first_world=number * config.environments)
             if self._data:
                 new = {name: torch.cat([self._data[name], new[name]]) for name in new}
             self._data = new
@@ -162,11 +163,11 @@ class AgileTrainee:
         return collision_cost(clearance).reshape(N, M, -1).mean(2)
 
     @torch.no_grad()
-    def _collected(self, student: float) -> dict[str, Tensor]:
+    def _collected(self, student: float, first_world: int) -> dict[str, Tensor]:
         """Observations, and what the expert would do, while both fly."""
         config, fields = self._config, self._fields
         N, device = config.environments, config.device
-        world = torch.arange(N, device=device) % len(fields)
+        world = (first_world + torch.arange(N, device=device)) % len(fields)
         primitives, p_WG = fields.primitives.of(world), fields.p_WG[world]
         which = torch.randint(len(config.speeds), (N,), generator=self._generator, device=device)
         speed = torch.tensor(config.speeds, device=device)[which]

@@ -35,6 +35,7 @@ from flysplat.training.policies.network import TrainableNetwork
 from flysplat.training.policies.observation import Observation
 from flysplat.training.policies.ray_casting import PinholeGrid
 from flysplat.training.policies.through_dynamics import Moment
+from flysplat.training.policies.train import Schedule
 
 
 @dataclass
@@ -59,6 +60,7 @@ class DiffAeroLoss:
 class DiffAeroTraining(FlightTraining):
     """A training run."""
 
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=8000, validate_every=500))
     loss: DiffAeroLoss = field(default_factory=DiffAeroLoss)
 
 

@@ -57,18 +57,17 @@ class Outcomes(NamedTuple):
         """Parts of the flights that reached the goal, collided and left; what remains took too
         long. Means of least clearance [m] and speed [m/s]. Flight n is of kind n modulo their
         number, and success is also given for each of `kinds`."""
-        each = {
-            kind: float(self.reached[i :: len(kinds)].float().mean())
-            for i, kind in enumerate(kinds or [])
-            if kinds and i < len(self.reached)
-        }
+        kinds = kinds or []
+        flown: dict[str, list[bool]] = {}
+        for n, reached in enumerate(self.reached.tolist() if kinds else []):
+            flown.setdefault(kinds[n % len(kinds)], []).append(reached)
         return {
             "success": float(self.reached.float().mean()),
             "collisions": float(self.collided.float().mean()),
             "left": float(self.left.float().mean()),
             "least_clearance": float(self.least_clearance.mean()),
             "speed": float(self.mean_speed.mean()),
-            **each,
+            **{kind: sum(reached) / len(reached) for kind, reached in flown.items()},
         }
 
 

@@ -59,7 +59,7 @@ class FlightSchool:
     # [s] Time constant of the moving average of the velocity.
     averaging: float = 0.5
     # [s] A flight ends after this time, wherever it is.
-    longest: float = 30.0
+    longest: float = 15.0
     noise: ObservationNoise = field(default_factory=ObservationNoise)
 
     def validate(self) -> None:
@@ -86,6 +86,7 @@ class Flying(NamedTuple):
     """The flights that go on from one update to the next."""
 
     vehicle: PointMass
+    world: Tensor  # (N,), numbers of the worlds flown in
     v_mean: Tensor  # (N, 3) [m/s]
     memory: Tensor  # (N, H)
     speed: Tensor  # (N,) [m/s]
@@ -97,17 +98,13 @@ class NotFiniteError(ValueError):
 
 
 class School:
-    """Flights in `fields` from which `learner` learns; vehicle n flies in world n modulo W."""
+    """Flights in `fields` from which `learner` learns; each is in a world drawn anew."""
 
     def __init__(
         self, learner: Learner, fields: Fields, config: FlightSchool, generator: torch.Generator
     ) -> None:
         self.learner, self.fields, self.config = learner, fields, config
         self.generator = generator
-        device = fields.p_WG.device
-        self.world = torch.arange(config.environments, device=device) % len(fields)
-        self._primitives = fields.primitives.of(self.world)
-        self._p_WG = fields.p_WG[self.world]
         self._control = FlatnessControllerConfig()
         self.flying = self._fresh()
 
@@ -126,21 +123,25 @@ class School:
         return torch.rand(*size, generator=self.generator, device=self.generator.device)
 
     def _fresh(self) -> Flying:
-        """New flights, from anywhere, in flight towards about where the way leads."""
+        """New flights, anywhere in any world, in flight towards about where the way leads."""
         config, N = self.config, self.config.environments
 
         def between(limits: list[float], *size: int) -> Tensor:
             return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
 
-        start = (self._uniform(N) * STARTS).long().clamp(max=STARTS - 1)
-        p = self.fields.starts_W[self.world, start]
+        def drawn(count: int) -> Tensor:
+            return (self._uniform(N) * count).long().clamp(max=count - 1)
+
+        world = drawn(len(self.fields))
+        p = self.fields.starts_W[world, drawn(STARTS)]
         speed = between(config.speed, N)
-        way = self.fields.way(p, self.world)
+        way = self.fields.way(p, world)
         v = way * (speed * self._uniform(N))[:, None] + 0.3 * (self._uniform(N, 3) - 0.5)
         yaw = torch.atan2(way[:, 1], way[:, 0]) + 1.0 * (self._uniform(N) - 0.5)
         lag = between(config.lag, N, 1)
         return Flying(
             PointMass(p, v, torch.zeros_like(p), yaw, lag),
+            world,
             v,
             self.learner.initial_memory(N),
             speed,
@@ -149,13 +150,13 @@ class School:
 
     def _renewed(self, flying: Flying) -> Flying:
         """Flights that have ended begin anew."""
-        p = flying.vehicle.p
-        clearance = self._primitives.near(p)[0].amin(1) - VEHICLE_RADIUS
-        inside = (p > self.fields.lower_W[self.world]) & (p < self.fields.upper_W[self.world])
+        fields, world, p = self.fields, flying.world, flying.vehicle.p
+        clearance = fields.primitives.of(world).near(p)[0].amin(1) - VEHICLE_RADIUS
+        inside = (p > fields.lower_W[world]) & (p < fields.upper_W[world])
         ended = (
             (clearance < 0.0)
             | ~inside.all(1)
-            | ((p - self._p_WG).norm(dim=1) < 0.5)
+            | ((p - fields.p_WG[world]).norm(dim=1) < 0.5)
             | (flying.age > self.config.longest)
         )
         fresh = self._fresh()
@@ -174,22 +175,23 @@ class School:
         keep = config.gradient_decay**dt
         forget = 1.0 - torch.exp(torch.tensor(-dt / config.averaging))
         with torch.no_grad():
-            vehicle, v_mean, memory, speed, age = self._renewed(self.flying)
+            vehicle, world, v_mean, memory, speed, age = self._renewed(self.flying)
+        primitives, p_WG = fields.primitives.of(world), fields.p_WG[world]
         totals: dict[str, Tensor] = {}
-        distances, normals = self._primitives.near(vehicle.p)
+        distances, normals = primitives.near(vehicle.p)
         for _ in range(config.steps):
-            depth, R_WB = look(vehicle, self._primitives, learner.grid, distances)
+            depth, R_WB = look(vehicle, primitives, learner.grid, distances)
             depth = config.noise.disturbed(depth, self.generator)
-            seen = Observation(depth, vehicle, R_WB, self._p_WG, speed)
+            seen = Observation(depth, vehicle, R_WB, p_WG, speed)
             a_cmd, heading, memory = learner.decide(seen, memory)
             before = vehicle
             vehicle = vehicle.decayed(keep).step(a_cmd, dt, self._control, heading)
             v_mean = v_mean + forget * (vehicle.v - v_mean)
-            distances, normals = self._primitives.near(vehicle.p)
+            distances, normals = primitives.near(vehicle.p)
             clearance, approach = _obstacles(vehicle, distances, normals)
             with torch.no_grad():
-                to_goal = (self._p_WG - vehicle.p).norm(dim=1)
-                way = fields.way(vehicle.p, self.world)
+                to_goal = (p_WG - vehicle.p).norm(dim=1)
+                way = fields.way(vehicle.p, world)
                 v_target = way * torch.minimum(speed, to_goal)[:, None]
             moment = Moment(
                 vehicle.v,
@@ -206,6 +208,7 @@ class School:
                 totals[name] = totals.get(name, 0.0) + term / config.steps
         self.flying = Flying(
             vehicle.detached(),
+            world,
             v_mean.detach(),
             memory.detach(),
             speed,
