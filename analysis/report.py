@@ -110,6 +110,10 @@ def _rate(summary: dict[str, Any]) -> str:
     )
 
 
+def _passed(row: dict[str, Any]) -> str:
+    return f"{row['scenarios_passed']}/{row['scenarios']}"
+
+
 def _scope(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
     speeds = ", ".join(f"{speed:g}" for speed in config.speeds)
     return (
@@ -138,7 +142,8 @@ def _warnings(
 
 def _policies(table: list[dict[str, Any]]) -> str:
     header = ["policy", "speed [m/s]", "flights", "success", "collision", "timeout", "left volume"]
-    header += ["error", "not run", "min. clearance [m]", "velocity [m/s]", "path excess"]
+    header += ["error", "not run", "scenarios passed", "min. clearance [m]"]
+    header += ["velocity [m/s]", "path excess"]
     header += ["jerk [m/s³]", "smoothness"]
     rows = [
         [
@@ -148,6 +153,7 @@ def _policies(table: list[dict[str, Any]]) -> str:
             _rate(row),
             *(str(row[name]) for name in ("collision", "timeout", "left_volume", "error")),
             str(row["not_run"]),
+            _passed(row),
             _number(row["min_clearance_m"], "+.2f"),
             _number(row["mean_speed_m_s"], ".2f"),
             _number(row["path_excess"], ".1%"),
@@ -171,26 +177,33 @@ def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[
 
 def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
     header = ["policy", "method in the paper", "success, paper", "success, here"]
-    header += ["clearance, paper [m]", "here [m]", "velocity, paper [m/s]", "here [m/s]"]
+    header += [
+        "scenarios passed",
+        "clearance, paper [m]",
+        "here [m]",
+        "velocity, paper [m/s]",
+        "here [m/s]",
+    ]
     rows = []
     for policy, paper in PAPER.items():
         there = f"{paper.successes}/{PAPER_FLIGHTS} ({paper.successes / PAPER_FLIGHTS:.0%})"
         clearance, speed = f"{paper.min_clearance_m:+.2f}", f"{paper.mean_speed_m_s:.2f}"
         flown = [row for row in table if row["policy"] == policy]
         if not flown:
-            rows.append([policy, paper.method, there, "–", clearance, "–", speed, "–"])
+            rows.append([policy, paper.method, there, "–", "–", clearance, "–", speed, "–"])
         for row in flown:
             ours = [_number(row[name], form) for name, form in _COMPARED]
             name = f"{policy} at {row['speed']:g} m/s"
-            rows.append([name, paper.method, there, _rate(row), clearance, ours[0], speed, ours[1]])
+            here = [_rate(row), _passed(row)]
+            rows.append([name, paper.method, there, *here, clearance, ours[0], speed, ours[1]])
     for row in table:
         if row["policy"] not in PAPER:
             ours = [_number(row[name], form) for name, form in _COMPARED]
             name = f"{escape(row['policy'])} at {row['speed']:g} m/s"
-            rows.append([name, "–", "–", _rate(row), "–", ours[0], "–", ours[1]])
+            rows.append([name, "–", "–", _rate(row), _passed(row), "–", ours[0], "–", ours[1]])
     note = (
         '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
-        "the scenarios here are others of the same kinds.</p>"
+        "the scenarios here are others of the same kinds, passed where most flights succeed.</p>"
     )
     return _html_table(header, rows) + note
 

@@ -71,8 +71,9 @@ def mean_of(rows: list[dict[str, Any]], name: str) -> float:
 def policy_table(
     rows: list[dict[str, Any]], config: StudyConfig, absent: int = 0
 ) -> list[dict[str, Any]]:
-    """A row for each policy and speed: `success_summary`, the flights that were not run because
-    `absent` scenarios have no scene here, and the means of `MEASURES`."""
+    """A row for each policy and speed: `success_summary`, in how many of the scenarios flown most
+    flights succeed, the flights that were not run because `absent` scenarios have no scene here,
+    and the means of `MEASURES`."""
     table = []
     for policy in config.policy_names:
         for speed in config.speeds:
@@ -80,10 +81,20 @@ def policy_table(
             table.append(
                 {"policy": policy, "speed": speed}
                 | success_summary(flown)
+                | scenarios_passed(flown)
                 | {"not_run": absent * config.seeds}
                 | {name: mean_of(flown, name) for name in MEASURES}
             )
     return table
+
+
+def scenarios_passed(rows: list[dict[str, Any]]) -> dict[str, int]:
+    """How many scenarios the flights are in, and in how many more than half of them succeed."""
+    successes: dict[str, list[bool]] = {}
+    for row in rows:
+        successes.setdefault(row["scenario"], []).append(row["success"])
+    passed = sum(2 * sum(flights) > len(flights) for flights in successes.values())
+    return {"scenarios": len(successes), "scenarios_passed": passed}
 
 
 def compare(rows: list[dict[str, Any]], first: str, second: str, speed: float) -> PairedComparison:
@@ -100,14 +111,15 @@ def compare(rows: list[dict[str, Any]], first: str, second: str, speed: float) -
 def format_table(table: list[dict[str, Any]]) -> str:
     """The table of policies for a terminal."""
     lines = [
-        f"{'policy':<16}{'speed':>6}{'success':>12}{'95 % interval':>16}{'clearance':>11}"
-        f"{'velocity':>10}{'not run':>9}"
+        f"{'policy':<16}{'speed':>6}{'success':>12}{'95 % interval':>16}{'scenarios':>11}"
+        f"{'clearance':>11}{'velocity':>10}{'not run':>9}"
     ]
     for row in table:
         rate = f"{row['successes']}/{row['flights']}"
+        passed = f"{row['scenarios_passed']}/{row['scenarios']}"
         interval = f"{row['wilson_lower']:.0%} to {row['wilson_upper']:.0%}"
         lines.append(
-            f"{row['policy']:<16}{row['speed']:>6g}{rate:>12}{interval:>16}"
+            f"{row['policy']:<16}{row['speed']:>6g}{rate:>12}{interval:>16}{passed:>11}"
             f"{row['min_clearance_m']:>+9.2f} m{row['mean_speed_m_s']:>6.2f} m/s{row['not_run']:>9}"
         )
     return "\n".join(lines)
