@@ -15,7 +15,7 @@ from flysplat.analysis.tables import format_table, policy_table
 from flysplat.analysis.workers import default_jobs, fly_all
 from flysplat.diagrams.configuration import dump_config
 from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
+from flysplat.diagrams.worlds.scene import SceneSource, find_scene
 
 
 def run(
@@ -84,7 +84,7 @@ def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
     """Of the scenarios whose scene is not on this machine: why, and what to do."""
     absent = {}
     for name, scenario in scenarios.items():
-        if isinstance(scenario.world, SceneConfig):
+        if isinstance(scenario.world, SceneSource):
             try:
                 find_scene(scenario.world)
             except FileNotFoundError as error:

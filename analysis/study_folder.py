@@ -26,7 +26,7 @@ from flysplat.analysis.rollout import ARRAYS, Rollout
 from flysplat.analysis.study import RolloutSpec, StudyConfig
 from flysplat.diagrams.configuration import dump_config, load_config
 from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
+from flysplat.diagrams.worlds.scene import SceneSource, find_scene
 from flysplat.systems.files import require_writable_folder, written_atomically
 
 FORMAT_VERSION = 1
@@ -93,7 +93,7 @@ class StudyFolder:
 
     def _keep_scenario(self, name: str, scenario: Scenario) -> None:
         file = self.path / "scenarios" / f"{name}.yaml"
-        if isinstance(scenario.world, SceneConfig):
+        if isinstance(scenario.world, SceneSource):
             self._keep_scene(scenario.world)
         text = dump_config(scenario)
         if file.is_file() and file.read_text() != text:
@@ -104,7 +104,7 @@ class StudyFolder:
         with written_atomically(file) as path:
             path.write_text(text)
 
-    def _keep_scene(self, world: SceneConfig) -> None:
+    def _keep_scene(self, world: SceneSource) -> None:
         """Copies a scene into the study, and lets `world` name the copy."""
         scene = find_scene(world)
         kept = self.path / "scenes" / scene.name
@@ -169,7 +169,7 @@ class StudyFolder:
             FileNotFoundError, ValueError: if it is not there or damaged.
         """
         scenario = load_config(Scenario(), self.path / "scenarios" / f"{name}.yaml")
-        if isinstance(scenario.world, SceneConfig):
+        if isinstance(scenario.world, SceneSource):
             scenario.world.path = str((self.path / scenario.world.path).absolute())
         return scenario
 

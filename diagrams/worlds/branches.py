@@ -8,7 +8,7 @@ from flysplat.diagrams.worlds.blueprint import Blueprint
 from flysplat.diagrams.worlds.feasibility import CLEARANCE, TRIES, is_feasible
 from flysplat.diagrams.worlds.fittings import check_count, check_range, clear_of
 from flysplat.diagrams.worlds.forest import Forest
-from flysplat.diagrams.worlds.forest_config import ForestConfig
+from flysplat.diagrams.worlds.forest_config import TrunksConfig
 from flysplat.diagrams.worlds.forest_layout import BARK
 from flysplat.diagrams.worlds.solid import Solid
 from flysplat.diagrams.worlds.solid_surfels import draw
@@ -19,7 +19,7 @@ from flysplat.systems.splats.gaussian_scene import GaussianScene
 
 
 @dataclass
-class BranchesConfig(ForestConfig):
+class BranchesConfig(TrunksConfig):
     """A forest whose trunks have limbs in the flyable volume, and wires across it."""
 
     spacing: float = 4.0

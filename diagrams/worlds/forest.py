@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flysplat.diagrams.worlds import forest_ground, forest_surroundings, forest_trees
 from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.forest_config import CLEARANCE, INSET, ForestConfig
+from flysplat.diagrams.worlds.forest_config import CLEARANCE, INSET, ForestConfig, TrunksConfig
 from flysplat.diagrams.worlds.forest_layout import MARGIN, ForestLayout, lay_out
 from flysplat.diagrams.worlds.light import Daylight, Sunlit
 from flysplat.diagrams.worlds.surfaces import merged
@@ -30,7 +30,7 @@ def make_forest(config: ForestConfig, seed: int = 0) -> World:
 
     Start and goal face each other across the length. A way between them exists by construction: any
     two trunks are further apart, at every height, than the vehicle is wide, and one trunk alone
-    leaves room beside it (`ForestConfig.validate`). So trunks grown by the vehicle's radius are
+    leaves room beside it (`TrunksConfig.validate`). So trunks grown by the vehicle's radius are
     disjoint and cannot close a line from side to side; rocks and logs end below the flight height,
     and no trunk is near start and goal.
 
@@ -47,7 +47,7 @@ class Forest:
         ValueError: see `make_forest`.
     """
 
-    def __init__(self, config: ForestConfig, seed: int) -> None:
+    def __init__(self, config: TrunksConfig, seed: int) -> None:
         config.validate()
         if seed < 0:
             raise ValueError(f"seed = {seed} must be 0 or more")

@@ -17,8 +17,8 @@ PASSAGE = 2 * VEHICLE_RADIUS + 0.1
 
 
 @dataclass
-class ForestConfig:
-    """A forest; loads from YAML with `pydrake.common.yaml.yaml_load_typed`."""
+class TrunksConfig:
+    """What all forests have."""
 
     length: float = 36.0  # [m] flyable volume along x: from 0 to length
     width: float = 16.0  # [m] along y, centred on 0
@@ -82,3 +82,12 @@ class ForestConfig:
                 f"needs {PASSAGE:.2f} m: use a spacing of at least "
                 f"{self.spacing + PASSAGE - self.narrowest:.2f} m"
             )
+
+
+@dataclass
+class ForestConfig(TrunksConfig):
+    """A forest.
+
+    It is no base of others: written to YAML, their worlds would become plain forests, since Drake
+    takes the first type of a union that a value is an instance of.
+    """

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from flysplat.diagrams.worlds.forest_config import ForestConfig
+from flysplat.diagrams.worlds.forest_config import TrunksConfig
 from flysplat.diagrams.worlds.plot import Plot
 from flysplat.diagrams.worlds.poisson_disk import poisson_disk
 from flysplat.diagrams.worlds.solid import Solid
@@ -105,7 +105,7 @@ class ForestLayout(Plot):
 
 
 def lay_out(
-    config: ForestConfig, rng: np.random.Generator, clear: ArrayLike, clearance: float
+    config: TrunksConfig, rng: np.random.Generator, clear: ArrayLike, clearance: float
 ) -> ForestLayout:
     """Places everything, leaving discs of radius `clearance` [m] about `clear` (K, 2) open."""
     clear = np.asarray(clear)

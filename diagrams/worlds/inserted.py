@@ -11,7 +11,7 @@ from flysplat.diagrams.worlds.blueprint import Blueprint
 from flysplat.diagrams.worlds.feasibility import TRIES
 from flysplat.diagrams.worlds.fittings import check_range
 from flysplat.diagrams.worlds.illumination import Lamplight
-from flysplat.diagrams.worlds.scene import SceneConfig, read_scene_world
+from flysplat.diagrams.worlds.scene import SceneSource, read_scene_world
 from flysplat.diagrams.worlds.solid import Solid, faces_of
 from flysplat.diagrams.worlds.solid_surfels import draw
 from flysplat.diagrams.worlds.start_and_goal import draw_start_and_goal
@@ -32,7 +32,7 @@ _MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
 
 
 @dataclass
-class InsertedConfig(SceneConfig):
+class InsertedConfig(SceneSource):
     """A scene on disk with 3 to 5 solids, hanging or standing in its free space."""
 
     least: int = 3  # [-] solids

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from flysplat.diagrams.worlds.light import Daylight
-from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
+from flysplat.diagrams.worlds.scene import SceneSource, find_scene
 from flysplat.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
 from flysplat.diagrams.worlds.surfaces import COVERAGE, Surfels, colored, perpendicular
 from flysplat.diagrams.worlds.textures import fbm, hash_unit, ramp
@@ -20,7 +20,7 @@ from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 
 @dataclass
-class OctomapConfig(SceneConfig):
+class OctomapConfig(SceneSource):
     """A binary OctoMap (.bt) on disk; `path` is found as that of a scene."""
 
     lower: list[float] | None = None  # [m] lower corner of the part that is flown in

@@ -14,8 +14,8 @@ SCENES = "FLYSPLAT_SCENES"
 
 
 @dataclass
-class SceneConfig:
-    """A scene on disk."""
+class SceneSource:
+    """A place on disk."""
 
     # A scene folder, or a PLY file of Gaussians; one that is not there is looked for in the folder
     # that the environment variable FLYSPLAT_SCENES names, or in `scenes`.
@@ -34,7 +34,12 @@ class SceneConfig:
             raise ValueError("world.path is empty; name a scene folder or a PLY file")
 
 
-def find_scene(config: SceneConfig) -> Path:
+@dataclass
+class SceneConfig(SceneSource):
+    """A scene on disk. It is no base of others, for the reason that `ForestConfig` gives."""
+
+
+def find_scene(config: SceneSource) -> Path:
     """The place of a scene.
 
     Raises:
@@ -53,7 +58,7 @@ def find_scene(config: SceneConfig) -> Path:
     )
 
 
-def read_scene_world(config: SceneConfig, seed: int) -> World:
+def read_scene_world(config: SceneSource, seed: int) -> World:
     """Reads the scene of `config`.
 
     Raises:

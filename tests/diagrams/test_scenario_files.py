@@ -1,8 +1,15 @@
-"""Finding scenarios by name or path."""
+"""Finding scenarios by name or path, and writing them."""
+
+from itertools import permutations
+from typing import get_args
 
 import pytest
 
+from flysplat.diagrams.add_policy import PolicyConfig
+from flysplat.diagrams.configuration import dump_config, load_config, parse_config
+from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
+from flysplat.diagrams.worlds.make_world import WorldConfig
 
 
 def test_names_and_paths_are_found(tmp_path):
@@ -19,3 +26,20 @@ def test_unknown_scenario_lists_those_there_are():
     """An id that does not exist is an error with the ids that do."""
     with pytest.raises(ValueError, match=r"no scenario 'P99'.*P01, P02"):
         scenario_file("P99")
+
+
+@pytest.mark.parametrize("name", benchmark_scenarios())
+def test_scenario_that_was_written_is_the_same(name):
+    """Written to YAML and read again, a scenario has the same world, of the same type."""
+    scenario = load_config(Scenario(), scenario_file(name))
+    again = parse_config(Scenario(), dump_config(scenario), name)
+    assert type(again.world) is type(scenario.world)
+    assert again.world == scenario.world
+
+
+@pytest.mark.parametrize("union", [WorldConfig, PolicyConfig])
+def test_no_configuration_is_another_ones_base(union):
+    """Drake writes a value as the first type of a union that it is an instance of: types in one
+    union may not be derived from each other."""
+    for first, second in permutations(get_args(union), 2):
+        assert not issubclass(first, second), f"{first.__name__} would be a {second.__name__}"
