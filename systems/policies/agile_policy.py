@@ -23,9 +23,13 @@ NEAREST, FARTHEST = 0.3, 20.0  # [m] range of depth
 MODES = 3
 STATE_SIZE = 18
 WAYPOINT_SCALE = 2.0  # [m] that a waypoint of 1 at the network's output means
-NEAR_TIE = 1.05
-"""A hypothesis of a cost up to this factor (and 0.02) above the least may be followed instead, if
-it continues the last."""
+PROGRESS = 0.1
+"""[1/m], what each metre towards the goal takes off a cost: by collisions alone the cheapest way is
+often to stay."""
+
+NEAR_TIE = 0.02
+"""[-], a hypothesis of a cost up to this much above the least is followed instead, if it continues
+the last."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,9 @@ def plan(
 ) -> Hypotheses:
     """The hypotheses of one observation, the one to follow with the least cost.
 
-    Among near-ties the one that continues `last`, the plan before, gets the least cost.
+    A cost is the network's, of collisions, less `PROGRESS` for each metre that the trajectory leads
+    towards the goal. Among near-ties the one that continues `last`, the plan before, gets the least
+    cost.
 
     Args:
         time: [s].
@@ -157,8 +163,10 @@ def plan(
     R_WB = X_WB.rotation().matrix()
     observed = state_observation(R_WB, X_WB.translation(), state[3:6], state[10:13], p_WG, speed)
     waypoints_B, costs = network(image, observed)
-    hypotheses = Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))
-    return _continued(hypotheses, last)
+    v_target_B = observed[-3:]
+    advances = waypoints_B[:, -1] @ v_target_B / max(float(np.linalg.norm(v_target_B)), 1e-6)
+    costs = costs.astype(float) - PROGRESS * advances
+    return _continued(Hypotheses(time, X_WB, waypoints_B.astype(float), costs), last)
 
 
 def _continued(hypotheses: Hypotheses, last: Hypotheses | None) -> Hypotheses:
@@ -166,7 +174,7 @@ def _continued(hypotheses: Hypotheses, last: Hypotheses | None) -> Hypotheses:
         return hypotheses
     costs = hypotheses.costs
     least = costs.min()
-    ties = np.flatnonzero(costs <= least + max((NEAR_TIE - 1.0) * abs(least), 0.02))
+    ties = np.flatnonzero(costs <= least + NEAR_TIE)
     if len(ties) < 2:
         return hypotheses
     before = last.position_W(hypotheses.plan_time + 0.5, last.best)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from flysplat.systems.policies.agile_policy import FARTHEST, FOV_X, NEAREST, RATE
+from flysplat.systems.policies.agile_policy import FARTHEST, FOV_X, NEAREST, PROGRESS, RATE
 from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from flysplat.training.policies.flight import BodyRate, Vehicle
 from flysplat.training.policies.network import TrajectoryModule
@@ -38,8 +38,15 @@ class AgilePilot:
         state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
         return image.reshape(-1, spec.image_height, spec.image_width), state
 
+    def hypotheses(self, seen: Observation) -> tuple[Tensor, Tensor]:
+        """Waypoints (N, 3, 10, 3) [m] in the body frame and costs (N, 3) less the progress made."""
+        image, state = self.observe(seen)
+        waypoints, costs = self.network(image, state)
+        ahead_B = torch.nn.functional.normalize(state[:, -3:], dim=1)
+        return waypoints, costs - PROGRESS * (waypoints[:, :, -1] * ahead_B[:, None]).sum(2)
+
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        waypoints, costs = self.network(*self.observe(seen))
+        waypoints, costs = self.hypotheses(seen)
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
         p_WR = seen.vehicle.p + (seen.R_WB @ best[:, LOOKAHEAD, :, None])[:, :, 0]
         return reaching(p_WR, seen.vehicle), None, memory

@@ -136,6 +136,21 @@ def test_near_ties_continue_the_last_plan(files):
     assert followed([0.100, 0.900, 0.101]) in (0, 2)
 
 
+def test_progress_is_worth_some_cost():
+    """Of hypotheses that cost the same by the network, the one that leads furthest towards the goal
+    is cheapest, by 0.1 a metre."""
+
+    def network(image, state):
+        way = np.linspace(0.1, 1.0, 10)[:, None]
+        return np.stack([0.2 * way * [1, 0, 0], way * [1, 0, 0], way * [-1, 0, 0]]), np.full(3, 0.3)
+
+    network.spec = SPECS["agile_autonomy"]
+    x = hover_state([0, 0, 2])
+    depth = np.full((24, 32), 9.0)
+    plan = agile_policy.plan(network, 0.0, depth, pose_from_state(x), x, [9, 0, 2], 2.0, None)
+    np.testing.assert_allclose(plan.costs, [0.28, 0.2, 0.4])
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_cameras_that_cannot_be_pooled_are_refused(name, files):
     """A camera of 50x30 pixels is refused with the sizes that would do."""

@@ -90,7 +90,7 @@ def test_trajectories_that_fly_are_those_trained():
     state = body.state[0].double().numpy()
     depth = np.random.default_rng(0).uniform(0.0, 25.0, (24, 32)).astype(np.float32)
     with torch.no_grad():
-        waypoints, costs = module(*pilot.observe(observed(depth, body)))
+        waypoints, costs = pilot.hypotheses(observed(depth, body))
     found = agile_policy.plan(network, 1.0, depth, pose(state), state, P_WG, 2.0, None)
     assert found.waypoints_B.shape == (3, NUM_WAYPOINTS, 3)
     np.testing.assert_allclose(found.waypoints_B, waypoints[0].numpy(), atol=1e-4)
