@@ -47,7 +47,7 @@ def main() -> None:
             descend(school.lesson, learner.network, optimizer, 1.0)
 
         def render(school=school, learner=learner, fields=fields) -> None:
-            primitives = fields.primitives.of(school.world)
+            primitives = fields.primitives.of(school.flying.world)
             distances, _ = primitives.near(school.flying.vehicle.p)
             look(school.flying.vehicle, primitives, learner.grid, distances)
 

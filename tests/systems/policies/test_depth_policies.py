@@ -140,11 +140,12 @@ def test_progress_is_worth_some_cost():
     """Of hypotheses that cost the same by the network, the one that leads furthest towards the goal
     is cheapest, by 0.1 a metre."""
 
-    def network(image, state):
-        way = np.linspace(0.1, 1.0, 10)[:, None]
-        return np.stack([0.2 * way * [1, 0, 0], way * [1, 0, 0], way * [-1, 0, 0]]), np.full(3, 0.3)
+    class Equal(agile_policy.TrajectoryNetwork):
+        def __call__(self, image, state):
+            way = np.linspace(0.1, 1.0, 10)[:, None] * [1, 0, 0]
+            return np.stack([0.2 * way, way, -way]), np.full(3, 0.3)
 
-    network.spec = SPECS["agile_autonomy"]
+    network = Equal(SPECS["agile_autonomy"], weights("agile_autonomy"))
     x = hover_state([0, 0, 2])
     depth = np.full((24, 32), 9.0)
     plan = agile_policy.plan(network, 0.0, depth, pose_from_state(x), x, [9, 0, 2], 2.0, None)
