@@ -1,11 +1,11 @@
 """The report of a study: one HTML file that needs nothing else."""
 
-import base64
 import math
 from html import escape
 from itertools import combinations
 from typing import Any
 
+from flysplat.analysis import html_page
 from flysplat.analysis.benchmark_figures import (
     draw_success_against_speed,
     draw_trajectories,
@@ -25,21 +25,6 @@ from flysplat.analysis.tables import (
 from flysplat.diagrams.flight_diagram import goal_of
 from flysplat.diagrams.worlds.make_world import make_world
 from flysplat.systems.files import written_atomically
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1240px; margin: 2em auto;
-       padding: 0 1em; }
-h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .6em 0; }
-th, td { padding: .25em .6em; white-space: nowrap; text-align: right;
-         border-bottom: 1px solid #e3e5e8; }
-th:first-child, td:first-child { text-align: left; }
-th { background: #f4f5f7; font-weight: 600; white-space: normal; }
-img { max-width: 100%; } code { background: #f4f5f7; padding: .1em .3em; font-size: 13px; }
-details { margin: .3em 0; } summary { cursor: pointer; }
-.note { color: #555; } .warn { background: #fff4d6; padding: .5em .8em; border-radius: 4px; }
-"""
-
 
 _COMPARED = ("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")
 
@@ -70,35 +55,16 @@ def write_report(
         _warnings(config, rows, absent, damaged),
         "<h2>Policies</h2>" + _policies(table) + _timing(config, rows, timings),
         "<h2>Beside the paper's Table I</h2>" + _paper(table, config),
-        "<h2>Success against speed</h2>" + _image(success_png, "Success rate against velocity"),
+        "<h2>Success against speed</h2>"
+        + html_page.image(success_png, "Success rate against velocity"),
         "<h2>Trajectories through one field</h2>" + _trajectories(folder, config, rows),
         "<h2>Pairs of policies on the same flights</h2>" + _pairs(config, rows),
         "<h2>Scenarios</h2>" + _scenarios(config, rows, absent),
         "<h2>Flights</h2>" + _flights(folder, config, rows),
         "<h2>Program</h2>" + _program(folder),
     ]
-    body = "\n".join(sections)
-    html = (
-        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Navigation benchmark'
-        f"</title><style>{_STYLE}</style></head><body>{body}</body></html>\n"
-    )
     with written_atomically(folder.path / "report.html") as path:
-        path.write_text(html)
-
-
-def _html_table(header: list[str], rows: list[list[str]]) -> str:
-    head = "".join(f"<th>{cell}</th>" for cell in header)
-    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _image(png: bytes, alt: str) -> str:
-    encoded = base64.b64encode(png).decode()
-    return f'<img src="data:image/png;base64,{encoded}" alt="{escape(alt)}">'
-
-
-def _number(value: float, form: str) -> str:
-    return format(value, form) if math.isfinite(value) else "–"
+        path.write_text(html_page.page("Navigation benchmark", sections))
 
 
 def _rate(summary: dict[str, Any]) -> str:
@@ -154,15 +120,15 @@ def _policies(table: list[dict[str, Any]]) -> str:
             *(str(row[name]) for name in ("collision", "timeout", "left_volume", "error")),
             str(row["not_run"]),
             _passed(row),
-            _number(row["min_clearance_m"], "+.2f"),
-            _number(row["mean_speed_m_s"], ".2f"),
-            _number(row["path_excess"], ".1%"),
-            _number(row["jerk_m_s3"], ".1f"),
-            _number(row["smoothness"], ".1f"),
+            html_page.number(row["min_clearance_m"], "+.2f"),
+            html_page.number(row["mean_speed_m_s"], ".2f"),
+            html_page.number(row["path_excess"], ".1%"),
+            html_page.number(row["jerk_m_s3"], ".1f"),
+            html_page.number(row["smoothness"], ".1f"),
         ]
         for row in table
     ]
-    return _html_table(header, rows)
+    return html_page.table(header, rows)
 
 
 def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> str:
@@ -171,8 +137,10 @@ def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[
     lines = []
     for policy in config.policy_names:
         times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
-        lines.append([escape(policy), *(_number(mean_of(times, name), ".1f") for name in names)])
-    return "<p>Mean times, of this machine and its load:</p>" + _html_table(header, lines)
+        lines.append(
+            [escape(policy), *(html_page.number(mean_of(times, name), ".1f") for name in names)]
+        )
+    return "<p>Mean times, of this machine and its load:</p>" + html_page.table(header, lines)
 
 
 def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
@@ -192,20 +160,20 @@ def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
         if not flown:
             rows.append([policy, paper.method, there, "–", "–", clearance, "–", speed, "–"])
         for row in flown:
-            ours = [_number(row[name], form) for name, form in _COMPARED]
+            ours = [html_page.number(row[name], form) for name, form in _COMPARED]
             name = f"{policy} at {row['speed']:g} m/s"
             here = [_rate(row), _passed(row)]
             rows.append([name, paper.method, there, *here, clearance, ours[0], speed, ours[1]])
     for row in table:
         if row["policy"] not in PAPER:
-            ours = [_number(row[name], form) for name, form in _COMPARED]
+            ours = [html_page.number(row[name], form) for name, form in _COMPARED]
             name = f"{escape(row['policy'])} at {row['speed']:g} m/s"
             rows.append([name, "–", "–", _rate(row), _passed(row), "–", ours[0], "–", ours[1]])
     note = (
         '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
         "the scenarios here are others of the same kinds, passed where most flights succeed.</p>"
     )
-    return _html_table(header, rows) + note
+    return html_page.table(header, rows) + note
 
 
 def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
@@ -219,7 +187,7 @@ def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
     if not lines:
         return "<p>One policy: nothing to compare.</p>"
     header = ["policies", "speed [m/s]", "only the first succeeds", "only the second", "p"]
-    return _html_table(header, lines) + '<p class="note">Exact McNemar tests.</p>'
+    return html_page.table(header, lines) + '<p class="note">Exact McNemar tests.</p>'
 
 
 def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]) -> str:
@@ -233,7 +201,7 @@ def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str
             flown = select(rows, scenario=name, policy=policy, speed=speed)
             cells.append(_rate(success_summary(flown)))
         lines.append([escape(name) + (" <b>(not run)</b>" if name in absent else ""), *cells])
-    return _html_table(header, lines)
+    return html_page.table(header, lines)
 
 
 def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:
@@ -257,7 +225,7 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str,
         '<p class="note">Dark: obstacles at the height of the goal, cut out of the distance field; '
         "light: where the vehicle's centre would touch them.</p>"
     )
-    return _image(png, title) + note
+    return html_page.image(png, title) + note
 
 
 def _telling_flight(rows: list[dict[str, Any]]) -> RolloutSpec | None:
@@ -286,16 +254,16 @@ def _flights(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]
             [
                 escape(row["id"]),
                 escape(row["outcome"]),
-                _number(row.get("flight_time_s", math.nan), ".1f"),
-                _number(row.get("min_clearance_m", math.nan), "+.2f"),
-                _number(row.get("mean_speed_m_s", math.nan), ".2f"),
+                html_page.number(row.get("flight_time_s", math.nan), ".1f"),
+                html_page.number(row.get("min_clearance_m", math.nan), "+.2f"),
+                html_page.number(row.get("mean_speed_m_s", math.nan), ".2f"),
                 f"<code>flysplat replay . {escape(row['id'])} --meshcat</code>",
             ]
             for row in flown
         ]
         sections.append(
             f"<details><summary>{escape(name)}: {len(flown)} flights</summary>"
-            f"{_html_table(header, lines)}</details>"
+            f"{html_page.table(header, lines)}</details>"
         )
     note = "<p>The commands run in the folder that holds this report.</p>"
     return note + "".join(sections)
@@ -303,4 +271,4 @@ def _flights(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]
 
 def _program(folder: StudyFolder) -> str:
     rows = [[escape(name), escape(value)] for name, value in folder.program().items()]
-    return _html_table(["part", "version"], rows)
+    return html_page.table(["part", "version"], rows)

@@ -11,9 +11,7 @@ from flysplat.diagrams.add_policy import POLICIES, policy_named
 from flysplat.diagrams.configuration import load_config
 from flysplat.diagrams.scenario import Scenario
 from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
-
-MAX_SEEDS = 1_000_000
-"""Seeds from here on are for training: nothing is judged where it was trained."""
+from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
 
 
 class RolloutSpec(NamedTuple):
@@ -68,8 +66,8 @@ class StudyConfig:
             ValueError: for an unknown scenario, policy or speed, anything given twice, and values
                 that cannot be flown; the message names it and what there is.
         """
-        if not 1 <= self.seeds <= MAX_SEEDS:
-            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {MAX_SEEDS}")
+        if not 1 <= self.seeds <= TRAINING_SEEDS:
+            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
         names = [Path(scenario).stem for scenario in self.scenarios]
         given: dict[str, list[Any]]
         given = {"scenario": names, "policy": self.policy_names, "speed": self.speeds}

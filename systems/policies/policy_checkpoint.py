@@ -53,16 +53,9 @@ class PolicyCheckpoint:
         """
         path = Path(path) if path else _SHIPPED / f"{policy}.npz"
         remedy = f"train them with: flysplat train {policy} --out DIR"
-        if not path.is_file():
-            raise FileNotFoundError(f"there are no weights at {path}; {remedy}")
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                about = json.loads(str(file["about"]))
-                weights = {name: file[name] for name in file.files if name != "about"}
-            found_format, found_policy = about["format"], about["policy"]
-            found_spec, provenance = about["spec"], about["provenance"]
-        except Exception as error:
-            raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None
+        about, weights = _read(path, remedy)
+        found_format, found_policy = about["format"], about["policy"]
+        found_spec, provenance = about["spec"], about["provenance"]
         if (found_format, found_policy) != (FORMAT, policy):
             raise ValueError(
                 f"{path} holds weights of the policy {found_policy!r} in format {found_format}, "
@@ -88,14 +81,23 @@ def policy_of(path: str | Path) -> str:
         FileNotFoundError: if there is no such file.
         ValueError: if it holds no weights.
     """
-    remedy = "train some with: flysplat train POLICY --out DIR"
-    if not Path(path).is_file():
+    return _read(Path(path), "train some with: flysplat train POLICY --out DIR")[0]["policy"]
+
+
+def _read(path: Path, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What a file says of itself, and its weights."""
+    if not path.is_file():
         raise FileNotFoundError(f"there are no weights at {path}; {remedy}")
     try:
         with np.load(path, allow_pickle=False) as file:
-            return json.loads(str(file["about"]))["policy"]
+            weights = {name: file[name] for name in file.files if name != "about"}
+            about = json.loads(str(file["about"]))
+        missing = {"format", "policy", "spec", "provenance"} - about.keys()
     except Exception as error:
         raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None
+    if missing:
+        raise ValueError(f"{path} holds no weights of a policy (no {min(missing)}); {remedy}")
+    return about, weights
 
 
 def check_weights(
