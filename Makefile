@@ -3,12 +3,12 @@
 PYTHON ?= $(shell for python in python3.12 python3.13 python3 python; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null && echo $$python && break; done)
 BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
-FLYSPLAT := .venv/bin/flysplat
+SPLATPILOT := .venv/bin/splatpilot
 
 .PHONY: fly test lint sanitize clean
 
 fly: .venv/installed
-	$(FLYSPLAT) fly --out out/fly
+	$(SPLATPILOT) fly --out out/fly
 
 test: lint
 	.venv/bin/python -m pytest

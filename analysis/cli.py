@@ -3,21 +3,21 @@
 import argparse
 import sys
 
-from flysplat.analysis.commands import COMMANDS
+from splatpilot.analysis.commands import COMMANDS
 
 
 def main(arguments: list[str] | None = None) -> int:
     """
-    Runs `flysplat VERB ...`.
+    Runs `splatpilot VERB ...`.
 
     Args:
-        arguments: the words after `flysplat`; those of the process when None.
+        arguments: the words after `splatpilot`; those of the process when None.
 
     Returns:
         The exit status: 0, or 1 after an error that one message on standard error explains.
     """
     parser = argparse.ArgumentParser(
-        prog="flysplat", description="Fly drones by camera inside Gaussian-splat worlds."
+        prog="splatpilot", description="Fly drones by camera inside Gaussian-splat worlds."
     )
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     for command in COMMANDS:
@@ -26,9 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         options.verb(options)
     except (ValueError, OSError) as error:
-        print(f"flysplat: {error}", file=sys.stderr)
+        print(f"splatpilot: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("flysplat: interrupted", file=sys.stderr)
+        print("splatpilot: interrupted", file=sys.stderr)
         return 130
     return 0

@@ -17,7 +17,7 @@ from scipy.ndimage import label
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
-from flysplat.analysis.ways import (
+from splatpilot.analysis.path_lengths import (
     SPACING,
     inside,
     march,
@@ -25,20 +25,20 @@ from flysplat.analysis.ways import (
     resampled,
     shortest_path,
 )
-from flysplat.diagrams.configuration import load_config
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from flysplat.diagrams.worlds.feasibility import (
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
+from splatpilot.diagrams.worlds.feasibility import (
     cell_of,
     conservative_distance,
     grid_distances,
     joined,
 )
-from flysplat.diagrams.worlds.make_world import make_world
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.distance_field import DistanceField
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SENSING_RANGE = 4.0
 """[m], of FlightBench's measures."""

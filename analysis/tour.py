@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flysplat.analysis import measure_scene
-from flysplat.diagrams import fly
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import SceneConfig
-from flysplat.diagrams.worlds.scene_folder import read_scene_metadata
-from flysplat.training import reconstruct
-from flysplat.training.captures import render_capture
-from flysplat.training.captures.render_capture import RenderConfig
-from flysplat.training.reconstruct import ReconstructConfig
+from splatpilot.analysis.reconstruction import measure_scene
+from splatpilot.diagrams import fly
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.make_world import SceneConfig
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.training.captures import render_capture
+from splatpilot.training.captures.render_capture import RenderConfig
+from splatpilot.training.reconstruction import reconstruct
+from splatpilot.training.reconstruction.reconstruct import ReconstructConfig
 
 
 @dataclass

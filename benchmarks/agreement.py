@@ -2,7 +2,7 @@
 
     python benchmarks/agreement.py
 
-On the benchmark's scene, and with FLYSPLAT_DATA set on gsplat's own test scene, the garden, for
+On the benchmark's scene, and with SPLATPILOT_DATA set on gsplat's own test scene, the garden, for
 which scales, orientations and opacities are drawn at random as gsplat's tests do. The comparison
 with gsplat's CUDA kernels says why it is skipped where there is no GPU or no gsplat.
 """
@@ -20,8 +20,8 @@ from pydrake.math import RigidTransform
 from scenes import cameras_of, load_scene, scene_name, tensors_of
 from torch import Tensor
 
-from flysplat.systems.splats import rasterize
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 TESTS = Path(__file__).parents[1] / "tests/systems/splats"
 
@@ -106,12 +106,12 @@ def print_gsplat_agreement() -> None:
         print("\ngsplat on CUDA: skipped, torch finds no GPU")
         return
     if importlib.util.find_spec("gsplat") is None:
-        print("\ngsplat on CUDA: skipped, it is not installed: pip install 'flysplat[cuda]'")
+        print("\ngsplat on CUDA: skipped, it is not installed: pip install 'splatpilot[cuda]'")
         return
-    if "FLYSPLAT_DATA" not in os.environ:
-        print("\ngsplat on CUDA: skipped, FLYSPLAT_DATA is not set: the garden is not here")
+    if "SPLATPILOT_DATA" not in os.environ:
+        print("\ngsplat on CUDA: skipped, SPLATPILOT_DATA is not set: the garden is not here")
         return
-    garden = _load("garden").load_garden(Path(os.environ["FLYSPLAT_DATA"]))
+    garden = _load("garden").load_garden(Path(os.environ["SPLATPILOT_DATA"]))
     size = {"width": garden.width, "height": garden.height, "render_mode": "RGB+D"}
     results = {}
     upstream: Tensor | None = None

@@ -11,15 +11,15 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK, decide
-from flysplat.systems.policies.recurrent_network import RecurrentNetwork
-from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
-from flysplat.training.policies.courses import CourseSelection, training_fields
-from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from flysplat.training.policies.flights import look
-from flysplat.training.policies.through_dynamics import FlightSchool, School
-from flysplat.training.policies.train import descend
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, decide
+from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.training.policies.courses import CourseSelection, training_fields
+from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
+from splatpilot.training.policies.evaluation import look
+from splatpilot.training.policies.through_dynamics import FlightSchool, School
+from splatpilot.training.policies.train import descend
 
 
 def seconds(run: Callable[[], object], repeats: int) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from flysplat import _native
+from splatpilot import _native
 
 REPEATS = 30
 

@@ -10,9 +10,9 @@ from opensplat import build_opensplat, time_opensplat
 from pydrake.math import RigidTransform
 from scenes import cameras_of, tensors_of
 
-from flysplat import _native
-from flysplat.systems.splats import rasterize
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 WIDTH, HEIGHT = 320, 240
 # Vector instructions of the backward pass in the inner loops of native/raster_backward.hpp, counted
@@ -71,7 +71,7 @@ def print_raster_kernel(scene: GaussianScene, X_WC: RigidTransform, opensplat: P
     header("forward raster kernel, 320x240, one thread", "ms")
     ours = {simd: Kernel(scene, X_WC, simd).raster_ms() for simd in _native.simd_levels()}
     for simd, ms in ours.items():
-        row(f"flysplat {simd}", f"{ms:.3f}")
+        row(f"splatpilot {simd}", f"{ms:.3f}")
     if opensplat is None:
         print("OpenSplat: not measured; name a checkout with --opensplat")
         return

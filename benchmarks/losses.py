@@ -16,8 +16,8 @@ from harness import header, machine, milliseconds, row
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from flysplat import _native
-from flysplat.training.losses import (
+from splatpilot import _native
+from splatpilot.training.reconstruction.losses import (
     C1,
     C2,
     SIGMA,

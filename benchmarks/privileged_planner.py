@@ -21,23 +21,23 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from flysplat.systems.collision.shapes import Cylinder, HalfSpace
-from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
-from flysplat.systems.policies.privileged_planner import (
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import Cylinder, HalfSpace
+from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
+from splatpilot.systems.policies.privileged_planner import (
     PrivilegedPlanner,
     PrivilegedPlannerConfig,
     plan,
 )
-from flysplat.systems.policies.time_of_arrival import time_of_arrival
-from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from flysplat.systems.vehicle.flatness_controller import (
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.vehicle.flatness_controller import (
     FlatnessController,
     FlatnessControllerConfig,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
-from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 SIZE = np.array([36.0, 16.0, 6.0])
 START = np.array([1.5, 8.0, 1.5])

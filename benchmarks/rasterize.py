@@ -2,10 +2,10 @@
 
     python benchmarks/rasterize.py [--opensplat PATH]
 
-With FLYSPLAT_DATA set, the scenes are 100,000 and 500,000 points of TartanAir's hospital corridor;
-otherwise a synthetic room of the same size. "forward" is the whole call of `rasterize` on torch
-tensors, with its checks and meta; "+ backward" adds the gradients of all scene tensors and "+ Adam"
-torch's fused optimiser; "baked" is BakedScene.render. Times are CPU milliseconds of the
+With SPLATPILOT_DATA set, the scenes are 100,000 and 500,000 points of TartanAir's hospital
+corridor; otherwise a synthetic room of the same size. "forward" is the whole call of `rasterize` on
+torch tensors, with its checks and meta; "+ backward" adds the gradients of all scene tensors and "+
+Adam" torch's fused optimiser; "baked" is BakedScene.render. Times are CPU milliseconds of the
 process, the least of many calls; those by threads are of the wall clock, and too long on a machine
 that is not idle. PATH is a checkout of OpenSplat,
 whose CPU rasteriser is then built and timed (see opensplat.py).
@@ -24,10 +24,10 @@ from kernels import print_limits, print_raster_kernel
 from pydrake.math import RigidTransform
 from scenes import cameras_of, intrinsics, load_scene, scene_name, tensors_of
 
-from flysplat import _native
-from flysplat.systems.splats import rasterization, rasterize
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot import _native
+from splatpilot.systems.splats import rasterization, rasterize
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 COUNTS = (100_000, 500_000)
 SIZES = ((160, 120), (320, 240), (640, 480))

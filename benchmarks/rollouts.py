@@ -12,14 +12,14 @@ import argparse
 import os
 import time
 
-from flysplat.analysis.study import RolloutSpec
-from flysplat.analysis.workers import fly_all
-from flysplat.diagrams.add_policy import policy_named
-from flysplat.diagrams.configuration import dump_config
-from flysplat.diagrams.flight import fly
-from flysplat.diagrams.flight_diagram import BuildFlightDiagram
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import make_world
+from splatpilot.analysis.benchmark.study import RolloutSpec
+from splatpilot.analysis.benchmark.workers import fly_all
+from splatpilot.diagrams.add_policy import policy_named
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.configuration import dump_config
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

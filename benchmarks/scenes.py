@@ -1,6 +1,6 @@
 """The scenes that the renderer's benchmarks draw.
 
-With FLYSPLAT_DATA set, points of TartanAir's hospital corridor, back-projected from depth;
+With SPLATPILOT_DATA set, points of TartanAir's hospital corridor, back-projected from depth;
 otherwise a synthetic room of the same size.
 """
 
@@ -14,14 +14,14 @@ import torch
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 # Optical axes (x right, y down, z forward) in the forward-right-down body of TartanAir's poses.
 R_BC = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 
 def scene_name() -> str:
-    return "TartanAir hospital" if "FLYSPLAT_DATA" in os.environ else "synthetic room"
+    return "TartanAir hospital" if "SPLATPILOT_DATA" in os.environ else "synthetic room"
 
 
 def hospital(folder: Path, count: int) -> tuple[GaussianScene, RigidTransform]:
@@ -75,7 +75,7 @@ def from_points(means: np.ndarray, scales: np.ndarray, colors: np.ndarray) -> Ga
 
 
 def load_scene(count: int) -> tuple[GaussianScene, RigidTransform]:
-    data = os.environ.get("FLYSPLAT_DATA")
+    data = os.environ.get("SPLATPILOT_DATA")
     return hospital(Path(data) / "tartanair/hospital", count) if data else synthetic_room(count)
 
 

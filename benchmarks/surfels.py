@@ -13,9 +13,9 @@ import torch
 from harness import header, machine, milliseconds, row
 from scenes import cameras_of, load_scene, tensors_of
 
-from flysplat import _native
-from flysplat.systems.splats import rasterize
-from flysplat.systems.splats.surfels import rasterize_surfels
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.surfels import rasterize_surfels
 
 COUNT = 100_000  # surfels
 

@@ -5,17 +5,20 @@ from dataclasses import replace
 
 from pydrake.systems.framework import DiagramBuilder, System
 
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
-from flysplat.systems.policies.depthnav import DepthNav, DepthNavConfig
-from flysplat.systems.policies.diffaero import DiffAero, DiffAeroConfig
-from flysplat.systems.policies.policy_checkpoint import policy_of
-from flysplat.systems.policies.privileged_planner import PrivilegedPlanner, PrivilegedPlannerConfig
-from flysplat.systems.policies.reactive import Reactive
-from flysplat.systems.policies.reactive_planner import ReactiveConfig
-from flysplat.systems.policies.straight import Straight, StraightConfig
-from flysplat.systems.policies.trajectory_lattice import LatticeConfig
-from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
+from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from splatpilot.systems.policies.policy_checkpoint import policy_of
+from splatpilot.systems.policies.privileged_planner import (
+    PrivilegedPlanner,
+    PrivilegedPlannerConfig,
+)
+from splatpilot.systems.policies.reactive import Reactive
+from splatpilot.systems.policies.reactive_planner import ReactiveConfig
+from splatpilot.systems.policies.straight import Straight, StraightConfig
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 PolicyConfig = (
     PrivilegedPlannerConfig
@@ -73,7 +76,7 @@ def AddPolicy(
 
     A policy has the inputs `state` and `goal`, and `depth_image_32f` or `color_image` if it sees
     through the camera `config.camera`; and one of the outputs `hypotheses` (see
-    `flysplat.systems.policies.hypotheses`), `acceleration` (3) and `waypoint` (3); beside
+    `splatpilot.systems.policies.hypotheses`), `acceleration` (3) and `waypoint` (3); beside
     these it may have `heading` (1), where to look.
 
     Args:

@@ -12,11 +12,11 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
-from flysplat.diagrams.flight_diagram import goal_of
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.diagrams.flight_diagram import goal_of
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 
 
 class Outcome(enum.StrEnum):
@@ -38,8 +38,8 @@ class Flight:
     commands: np.ndarray  # (N, 4): thrust [m/s^2], body rates [rad/s]
     # (N,) [m] Distance to the nearest surface less the vehicle's radius; NaN outside the world.
     clearances: np.ndarray
-    # (M, size) One row a plan, its time first; see flysplat.systems.policies.hypotheses. (0, 0) of
-    # policies that return none.
+    # (M, size) One row a plan, its time first; see splatpilot.systems.policies.hypotheses. (0, 0)
+    # of policies that return none.
     hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialisation
 

@@ -8,28 +8,28 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, Syste
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.systems.sensors import CameraInfo
 
-from flysplat.diagrams.add_policy import AddPolicy
-from flysplat.diagrams.observation import AddObservation, camera_of
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.esdf_collision import EsdfCollision
-from flysplat.systems.policies.hypotheses import num_hypotheses_in
-from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.splat_camera import SplatCamera
-from flysplat.systems.vehicle.flatness_controller import FlatnessController
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
-from flysplat.systems.vehicle.state_to_pose import StateToPose
-from flysplat.systems.visualization.camera_visualizer import CameraVisualizer
-from flysplat.systems.visualization.drawing import (
+from splatpilot.diagrams.add_policy import AddPolicy
+from splatpilot.diagrams.observation import AddObservation, camera_of
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_collision import EsdfCollision
+from splatpilot.systems.policies.hypotheses import num_hypotheses_in
+from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.flatness_controller import FlatnessController
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.state_to_pose import StateToPose
+from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer
+from splatpilot.systems.visualization.drawing import (
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
     draw_vehicle,
 )
-from flysplat.systems.visualization.flight_visualizer import FlightVisualizer
-from flysplat.systems.visualization.video_recorder import VideoRecorder
+from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
+from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 LOG_PERIOD = 0.02  # [s]
 
@@ -200,12 +200,16 @@ def _AddMeshcat(
     for end in ("top_color", "bottom_color"):
         meshcat.SetProperty("/Background", end, list(world.background))
     draw_gaussians(
-        meshcat, "/flysplat/scene", world.gaussians, field.lower_W - margin, field.upper_W + margin
+        meshcat,
+        "/splatpilot/scene",
+        world.gaussians,
+        field.lower_W - margin,
+        field.upper_W + margin,
     )
-    draw_goal(meshcat, "/flysplat/goal", p_WG, scenario.goal_radius)
-    draw_vehicle(meshcat, "/flysplat/vehicle", VEHICLE_RADIUS)
-    draw_distance_slice(meshcat, "/flysplat/distance_slice", field, float(p_WG[2]))
-    meshcat.SetProperty("/flysplat/distance_slice", "visible", False)
+    draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
+    draw_vehicle(meshcat, "/splatpilot/vehicle", VEHICLE_RADIUS)
+    draw_distance_slice(meshcat, "/splatpilot/distance_slice", field, float(p_WG[2]))
+    meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
 
     systems = {system.get_name(): system for system in builder.GetMutableSystems()}
     plant, policy = systems["plant"], systems["policy"]

@@ -1,4 +1,4 @@
-"""`flysplat fly`: one flight, with everything a person wants to see of it afterwards."""
+"""`splatpilot fly`: one flight, with everything a person wants to see of it afterwards."""
 
 import contextlib
 import json
@@ -10,16 +10,16 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from tqdm import tqdm
 
-from flysplat.diagrams.configuration import dump_config
-from flysplat.diagrams.flight import Flight, fly, sample_initial_state
-from flysplat.diagrams.flight_diagram import BuildFlightDiagram, goal_of
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import make_world
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.systems.splats.splat_camera import SplatCamera
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
-from flysplat.systems.visualization.video_recorder import VideoRecorder
+from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram, goal_of
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.configuration import dump_config
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 
 def run(

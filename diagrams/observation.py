@@ -2,14 +2,14 @@
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.sensing.color_noise import ColorNoise
-from flysplat.systems.sensing.delayed_pose import DelayedPose
-from flysplat.systems.sensing.depth_noise import DepthNoise
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.splat_camera import SplatCamera
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.sensing.color_noise import ColorNoise
+from splatpilot.systems.sensing.delayed_pose import DelayedPose
+from splatpilot.systems.sensing.depth_noise import DepthNoise
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 def camera_of(scenario: Scenario) -> OnboardCamera | None:

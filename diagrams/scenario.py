@@ -8,13 +8,13 @@ from pydrake.common.schema import Rotation, Transform
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
 
-from flysplat.diagrams.add_policy import PolicyConfig
-from flysplat.diagrams.worlds.forest import ForestConfig
-from flysplat.diagrams.worlds.make_world import WorldConfig
-from flysplat.systems.policies.privileged_planner import PrivilegedPlannerConfig
-from flysplat.systems.sensing.observation_noise import ObservationNoise
-from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
-from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.diagrams.add_policy import PolicyConfig
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import WorldConfig
+from splatpilot.systems.policies.privileged_planner import PrivilegedPlannerConfig
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 _MAX_PIXELS = 4096 * 4096
 

@@ -6,7 +6,7 @@
 #include <limits>
 #include <numeric>
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 constexpr size_t kPack = 16;
@@ -147,4 +147,4 @@ void BakedScene::store_bounds(const GaussianArrays& g, const std::vector<uint32_
   }
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -6,7 +6,7 @@
 
 #include "types.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 // Gaussians in Morton order, so that neighbours in space are neighbours in memory and can be culled
 // together; covariances as lower-triangular factors L with L L^T = R S^2 R^T, computed in double.
@@ -27,4 +27,4 @@ class BakedScene {
   BakedArrays arrays_{};
 };
 
-}  // namespace flysplat
+}  // namespace splatpilot

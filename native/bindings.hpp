@@ -12,7 +12,7 @@
 
 #include "renderer.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 namespace nb = nanobind;
 template <typename... Shape>
@@ -100,4 +100,4 @@ void bind_surfels(nb::module_& m);
 // Adds the rendering of projected Gaussians.
 void bind_projected(nb::module_& m);
 
-}  // namespace flysplat
+}  // namespace splatpilot

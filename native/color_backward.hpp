@@ -4,11 +4,11 @@
 #include "project_arrays.hpp"
 #include "spherical_harmonics_backward.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Adds to rows of dL/dcolors and returns dL/d(p_W - centre), which is zero without spherical
 // harmonics. `color_gradient` is zero where a colour is held at 0.
-FS_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indices, int lanes,
+SP_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indices, int lanes,
                                    const Vector16& d_W, const F16 color_gradient[3],
                                    float* gradients) {
   alignas(64) float soa[48][kLanes];
@@ -36,4 +36,4 @@ FS_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indi
   return {direction[0], direction[1], direction[2]};
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -6,7 +6,7 @@
 #include <cpuid.h>
 #endif
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 #if defined(__x86_64__)
@@ -49,7 +49,7 @@ std::vector<std::string> simd_levels() {
 
 const Kernels& kernels(const std::string& level) {
   const std::vector<const Kernels*> usable = usable_kernels();
-  if (usable.empty()) throw std::invalid_argument("flysplat needs a CPU with SSE 4.2");
+  if (usable.empty()) throw std::invalid_argument("splatpilot needs a CPU with SSE 4.2");
   if (level.empty()) return *usable.front();
   std::string names;
   for (const Kernels* k : usable) {
@@ -57,7 +57,7 @@ const Kernels& kernels(const std::string& level) {
     names += names.empty() ? k->name : std::string(", ") + k->name;
   }
   throw std::invalid_argument("SIMD level '" + level + "' is not available here; choose one of " +
-                              names + " (FLYSPLAT_SIMD or the argument simd)");
+                              names + " (SPLATPILOT_SIMD or the argument simd)");
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -6,7 +6,7 @@
 
 #include "types.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 // Names of the levels that this machine can run, widest first.
 std::vector<std::string> simd_levels();
@@ -15,4 +15,4 @@ std::vector<std::string> simd_levels();
 // level that is unknown or that this machine cannot run.
 const Kernels& kernels(const std::string& level);
 
-}  // namespace flysplat
+}  // namespace splatpilot

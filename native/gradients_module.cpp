@@ -4,7 +4,7 @@
 
 #include "bindings.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 using namespace nb::literals;
@@ -109,4 +109,4 @@ void bind_gradients(nb::module_& m) {
   m.def("project_backward", &project_backward);
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -1,12 +1,12 @@
-// The kernels of one SIMD level; compiled once per level with FLYSPLAT_LEVEL set to its name.
+// The kernels of one SIMD level; compiled once per level with SIMD_LEVEL set to its name.
 #include "project_arrays.hpp"
 #include "project_baked.hpp"
 #include "projection_backward.hpp"
 #include "raster_backward.hpp"
 #include "tiles.hpp"
 
-namespace flysplat {
-namespace FLYSPLAT_LEVEL {
+namespace splatpilot {
+namespace SIMD_LEVEL {
 
 static size_t first_nonfinite(const float* values, size_t count) {
   size_t i = 0;
@@ -61,17 +61,17 @@ static float multiply_add(size_t rounds) {
   return total;
 }
 
-#define FS_STRING_OF(name) #name
-#define FS_STRING(name) FS_STRING_OF(name)
-static const Kernels kTable = {FS_STRING(FLYSPLAT_LEVEL), project_arrays, project_baked,
+#define SP_STRING_OF(name) #name
+#define SP_STRING(name) SP_STRING_OF(name)
+static const Kernels kTable = {SP_STRING(SIMD_LEVEL), project_arrays, project_baked,
                                bin_footprints<SplatFootprint>, raster_tile,
                                raster_tile_backward, gather_gradients, project_backward,
                                first_nonfinite, all_within, all_normalisable, multiply_add};
 
-}  // namespace FLYSPLAT_LEVEL
+}  // namespace SIMD_LEVEL
 
-#define FS_JOIN_OF(a, b) a##b
-#define FS_JOIN(a, b) FS_JOIN_OF(a, b)
-const Kernels& FS_JOIN(kernels_, FLYSPLAT_LEVEL)() { return FLYSPLAT_LEVEL::kTable; }
+#define SP_JOIN_OF(a, b) a##b
+#define SP_JOIN(a, b) SP_JOIN_OF(a, b)
+const Kernels& SP_JOIN(kernels_, SIMD_LEVEL)() { return SIMD_LEVEL::kTable; }
 
-}  // namespace flysplat
+}  // namespace splatpilot

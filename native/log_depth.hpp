@@ -4,7 +4,7 @@
 #include "losses.hpp"
 #include "mathematics.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 static double log_depth(const LogDepthInput& in) {
   size_t valid_count = 0;
@@ -55,4 +55,4 @@ static double log_depth(const LogDepthInput& in) {
   return valid_count ? sum / static_cast<double>(valid_count) : 0.0;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

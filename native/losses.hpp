@@ -4,7 +4,7 @@
 
 #include <cstddef>
 
-namespace flysplat {
+namespace splatpilot {
 
 // One image, rows of width * channels values in [0, 1].
 struct PhotometricInput {
@@ -47,4 +47,4 @@ const LossKernels& loss_kernels_v4();
 const LossKernels& loss_kernels_generic();
 #endif
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -16,7 +16,7 @@
 namespace nb = nanobind;
 using namespace nb::literals;
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 using Images = nb::ndarray<const float, nb::ndim<4>, nb::c_contig, nb::device::cpu>;
@@ -100,4 +100,4 @@ void bind_losses(nb::module_& m) {
         "Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.");
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -2,9 +2,9 @@
 
 #include <nanobind/nanobind.h>
 
-namespace flysplat {
+namespace splatpilot {
 
 // Adds the losses to the module.
 void bind_losses(nanobind::module_& m);
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -3,11 +3,11 @@
 
 #include "simd.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // 2^x for -126 <= x <= 127, relative error below 2e-7 (minimax polynomial on [-1/2, 1/2]). Beyond
 // that range the result is meaningless but raises nothing.
-FS_INLINE F16 exp2(const F16& x) {
+SP_INLINE F16 exp2(const F16& x) {
   // Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
   const F16 shifted = x + F16(12582912.0f);
   const F16 f = x - (shifted - F16(12582912.0f));
@@ -22,7 +22,7 @@ FS_INLINE F16 exp2(const F16& x) {
 
 // log2(x) for normal x > 0, absolute error below 2e-7 times max(1, |log2 x|): the series of atanh
 // about 1 for the mantissa, taken in [sqrt(1/2), sqrt(2)).
-FS_INLINE F16 log2(const F16& x) {
+SP_INLINE F16 log2(const F16& x) {
   const int32_t sqrt_half = 0x3f3504f3;
   const I16 offset = bits_of(x) - sqrt_half;
   const I16 exponent = shift_right(offset, 23);
@@ -39,4 +39,4 @@ FS_INLINE F16 log2(const F16& x) {
   return p * s + to_float(exponent);
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

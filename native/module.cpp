@@ -12,7 +12,7 @@
 #include "dispatch.hpp"
 #include "losses_module.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 namespace {
 
@@ -174,4 +174,4 @@ NB_MODULE(_native, m) {
   bind_projected(m);
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

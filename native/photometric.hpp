@@ -10,7 +10,7 @@
 #include "losses.hpp"
 #include "simd.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 constexpr int kWindowRadius = 5;
 constexpr int kWindow = 2 * kWindowRadius + 1;
@@ -26,7 +26,7 @@ struct RowLayout {
   size_t padded;
 };
 
-FS_INLINE RowLayout row_layout(int width, int channels) {
+SP_INLINE RowLayout row_layout(int width, int channels) {
   RowLayout l;
   l.values = static_cast<size_t>(width) * channels;
   l.blocks = (l.values + kLanes - 1) / kLanes;
@@ -41,7 +41,7 @@ static size_t photometric_scratch(int width, int channels) {
 }
 
 // The first `count` lanes of a, zeros after them.
-FS_INLINE F16 first_lanes(const F16& a, size_t count) {
+SP_INLINE F16 first_lanes(const F16& a, size_t count) {
   if (count >= kLanes) return a;
   float values[kLanes];
   store(values, a);
@@ -50,21 +50,21 @@ FS_INLINE F16 first_lanes(const F16& a, size_t count) {
 }
 
 // The first `count` values at p, zeros after them.
-FS_INLINE F16 load_first(const float* p, size_t count) {
+SP_INLINE F16 load_first(const float* p, size_t count) {
   if (count >= kLanes) return load(p);
   float values[kLanes] = {};
   for (size_t k = 0; k < count; ++k) values[k] = p[k];
   return load(values);
 }
 
-FS_INLINE void store_first(float* p, const F16& a, size_t count) {
+SP_INLINE void store_first(float* p, const F16& a, size_t count) {
   if (count >= kLanes) return store(p, a);
   float values[kLanes];
   store(values, a);
   for (size_t k = 0; k < count; ++k) p[k] = values[k];
 }
 
-FS_INLINE double sum_of(const F16& a) {
+SP_INLINE double sum_of(const F16& a) {
   float values[kLanes];
   store(values, a);
   double sum = 0.0;
@@ -73,7 +73,7 @@ FS_INLINE double sum_of(const F16& a) {
 }
 
 // Windowed means along x of a padded row at p, and of its square.
-FS_INLINE void filter_with_square(const float* p, size_t stride, F16& mean, F16& square) {
+SP_INLINE void filter_with_square(const float* p, size_t stride, F16& mean, F16& square) {
   const F16 centre = load(p);
   mean = F16(kGaussian[0]) * centre;
   square = mean * centre;
@@ -85,7 +85,7 @@ FS_INLINE void filter_with_square(const float* p, size_t stride, F16& mean, F16&
   }
 }
 
-FS_INLINE F16 filter_row(const float* p, size_t stride) {
+SP_INLINE F16 filter_row(const float* p, size_t stride) {
   F16 mean = F16(kGaussian[0]) * load(p);
 #pragma GCC unroll 5
   for (int k = 1; k <= kWindowRadius; ++k) {
@@ -96,7 +96,7 @@ FS_INLINE F16 filter_row(const float* p, size_t stride) {
 
 // Windowed means along y of the packs at `offset` in 11 rows.
 template <int kCount>
-FS_INLINE void filter_columns(const float* const* rows, size_t offset, F16* means) {
+SP_INLINE void filter_columns(const float* const* rows, size_t offset, F16* means) {
 #pragma GCC unroll 4
   for (int i = 0; i < kCount; ++i) {
     means[i] = F16(kGaussian[0]) * load(rows[kWindowRadius] + offset + i * kLanes);
@@ -112,7 +112,7 @@ FS_INLINE void filter_columns(const float* const* rows, size_t offset, F16* mean
 }
 
 // Pointers to the 11 rows about `row` in a ring; zeros for those outside the image.
-FS_INLINE void rows_about(int row, int height, const float* ring, size_t row_size,
+SP_INLINE void rows_about(int row, int height, const float* ring, size_t row_size,
                           const float* zeros, const float** rows) {
   for (int k = -kWindowRadius; k <= kWindowRadius; ++k) {
     const int r = row + k;
@@ -212,4 +212,4 @@ static PhotometricSums photometric(const PhotometricInput& in) {
   return sums;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -4,7 +4,7 @@
 
 #include "projection.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Candidate positions among Gaussians [begin, end); returns how many.
 inline size_t cull_arrays(const GaussianArrays& g, const Camera& camera, size_t begin, size_t end,
@@ -37,7 +37,7 @@ struct GatheredGaussians {
   F16 quat[4], scale[3], opacity;
 };
 
-FS_INLINE GatheredGaussians gather_gaussians(const GaussianArrays& g, const uint32_t* indices) {
+SP_INLINE GatheredGaussians gather_gaussians(const GaussianArrays& g, const uint32_t* indices) {
   alignas(64) float soa[11][kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     const size_t i = indices[lane];
@@ -53,7 +53,7 @@ FS_INLINE GatheredGaussians gather_gaussians(const GaussianArrays& g, const uint
 }
 
 // The columns of R(q) diag(scale), a factor of the covariance, for quaternions of any length.
-FS_INLINE void covariance_factor(const F16 q[4], const F16 scale[3], Vector16 columns[3]) {
+SP_INLINE void covariance_factor(const F16 q[4], const F16 scale[3], Vector16 columns[3]) {
   const F16 two = F16(2.0f) / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   const F16 w = q[0], x = q[1], y = q[2], z = q[3], one = F16(1.0f);
   columns[0] = {scale[0] * (one - two * (y * y + z * z)), scale[0] * (two * (x * y + w * z)),
@@ -64,12 +64,12 @@ FS_INLINE void covariance_factor(const F16 q[4], const F16 scale[3], Vector16 co
                 scale[2] * (one - two * (x * x + y * y))};
 }
 
-FS_INLINE F16 dot(const Vector16& a, const Vector16& b) {
+SP_INLINE F16 dot(const Vector16& a, const Vector16& b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
 // Asks for the first `used` floats of rows that are read soon, all at once.
-FS_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint32_t* indices,
+SP_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint32_t* indices,
                              uint32_t bits) {
   constexpr int kFloatsPerLine = 16;
   if (used <= kFloatsPerLine) return;
@@ -80,7 +80,7 @@ FS_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint
 }
 
 // Gathers the colours of the lanes in `bits` and evaluates them.
-FS_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
+SP_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
                              const Vector16& d_W, F16 color[3]) {
   const int used = g.sh_degree < 0 ? 1 : (g.sh_degree + 1) * (g.sh_degree + 1);
   const int stored = g.sh_degree < 0 ? 1 : g.sh_coefficients;
@@ -133,4 +133,4 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
   return count;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -4,10 +4,10 @@
 
 #include "projection.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Whether boxes of Gaussians may touch the image, for the 16 boxes of one bound group.
-FS_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera, size_t group) {
+SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera, size_t group) {
   const float* bounds = scene.bounds + group * 7 * kLanes;
   const Vector16 p_C = to_camera(
       camera, from_centre(camera, load(bounds), load(bounds + kLanes), load(bounds + 2 * kLanes)));
@@ -36,7 +36,7 @@ FS_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
   return lane_bits(visible);
 }
 
-FS_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
+SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
                                      Splat* splats, uint32_t* depth_bits) {
   const float* geometry = scene.geometry + group * 10 * kLanes;
   const auto field = [&](int f) { return load(geometry + f * kLanes); };
@@ -86,4 +86,4 @@ inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size
   return count;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

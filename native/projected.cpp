@@ -7,7 +7,7 @@
 
 #include "bindings.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 bool place(const ProjectedArrays& in, const Camera& camera, size_t i, Splat& s) {
@@ -99,4 +99,4 @@ void bind_projected(nb::module_& m) {
         "Renders projected Gaussians; returns the factors (ux, uy, vy) of the visible ones.");
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

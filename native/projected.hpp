@@ -3,7 +3,7 @@
 
 #include "types.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 struct ProjectedArrays {
   size_t count;
@@ -19,4 +19,4 @@ struct ProjectedArrays {
 size_t place_splats(const ProjectedArrays& projected, const Camera& camera, size_t begin,
                     size_t end, Splat* splats, uint32_t* depth_bits);
 
-}  // namespace flysplat
+}  // namespace splatpilot

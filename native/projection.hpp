@@ -6,33 +6,33 @@
 #include "spherical_harmonics.hpp"
 #include "types.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 struct Vector16 {
   F16 x, y, z;
 };
 
-FS_INLINE F16 dot(const float n[3], const Vector16& p) {
+SP_INLINE F16 dot(const float n[3], const Vector16& p) {
   return F16(n[0]) * p.x + (F16(n[1]) * p.y + F16(n[2]) * p.z);
 }
 
 // p_W relative to the camera centre, still in world axes.
-FS_INLINE Vector16 from_centre(const Camera& camera, const F16& x, const F16& y, const F16& z) {
+SP_INLINE Vector16 from_centre(const Camera& camera, const F16& x, const F16& y, const F16& z) {
   return {(x - F16(camera.centre_high[0])) - F16(camera.centre_low[0]),
           (y - F16(camera.centre_high[1])) - F16(camera.centre_low[1]),
           (z - F16(camera.centre_high[2])) - F16(camera.centre_low[2])};
 }
 
-FS_INLINE Vector16 to_camera(const Camera& camera, const Vector16& d_W) {
+SP_INLINE Vector16 to_camera(const Camera& camera, const Vector16& d_W) {
   return {dot(camera.R_CW, d_W), dot(camera.R_CW + 3, d_W), dot(camera.R_CW + 6, d_W)};
 }
 
-FS_INLINE Mask16 in_depth_range(const Camera& camera, const F16& z) {
+SP_INLINE Mask16 in_depth_range(const Camera& camera, const F16& z) {
   return (z >= F16(camera.near_plane)) & (z <= F16(camera.far_plane));
 }
 
 // Lanes whose Gaussians may touch the image, judged by position and largest scale alone.
-FS_INLINE Mask16 may_be_visible(const Camera& camera, const Vector16& p_C,
+SP_INLINE Mask16 may_be_visible(const Camera& camera, const Vector16& p_C,
                                 const F16& largest_scale) {
   Mask16 visible = in_depth_range(camera, p_C.z);
   for (int side = 0; side < 4; ++side) {
@@ -44,7 +44,7 @@ FS_INLINE Mask16 may_be_visible(const Camera& camera, const Vector16& p_C,
 
 // The image of the world axes under the projection's Jacobian at p_C: m[i] = J_i R_CW, with the
 // slopes x/z and y/z held within 1.3 times the field of view as in the original method.
-FS_INLINE void projection_rows(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
+SP_INLINE void projection_rows(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                Vector16 m[2]) {
   const F16 slope_x = clamp(p_C.x * inverse_z, F16(camera.min_slope_x), F16(camera.max_slope_x));
   const F16 slope_y = clamp(p_C.y * inverse_z, F16(camera.min_slope_y), F16(camera.max_slope_y));
@@ -62,14 +62,14 @@ struct SplatPack {
   F16 mean_x, mean_y, extent_x, extent_y, ux, uy, vy, log2_opacity, depth, slope_x, slope_y;
 };
 
-FS_INLINE F16 largest_component(const Vector16& a) {
+SP_INLINE F16 largest_component(const Vector16& a) {
   return max(max(max(a.x, -a.x), max(a.y, -a.y)), max(a.z, -a.z));
 }
 
 // Finishes the projection from P (2x3), where P P^T is the 2D covariance before blurring. Working
 // from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
 // of large entries. Returns the lanes that are visible.
-FS_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
+SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                    Vector16 p0, Vector16 p1, F16 log2_opacity,
                                    SplatPack& out) {
   // Scaling by g keeps the squares of huge Gaussians within range; it is exactly 1 for all others.
@@ -123,7 +123,7 @@ FS_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
 }
 
 // Appends the lanes in `bits`, in lane order.
-FS_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t bits,
+SP_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t bits,
                                const uint32_t* indices, Splat* splats, uint32_t* depth_bits) {
   alignas(64) float fields[14][kLanes];
   const F16* packs[14] = {&p.mean_x, &p.mean_y, &p.extent_x, &p.extent_y, &p.ux,
@@ -143,4 +143,4 @@ FS_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t 
   return count;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

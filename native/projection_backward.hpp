@@ -4,16 +4,16 @@
 #include "color_backward.hpp"
 #include "project_arrays.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
-FS_INLINE Vector16 operator*(const F16& s, const Vector16& a) { return {s * a.x, s * a.y, s * a.z}; }
-FS_INLINE Vector16 operator+(const Vector16& a, const Vector16& b) {
+SP_INLINE Vector16 operator*(const F16& s, const Vector16& a) { return {s * a.x, s * a.y, s * a.z}; }
+SP_INLINE Vector16 operator+(const Vector16& a, const Vector16& b) {
   return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
-FS_INLINE Vector16 operator-(const Vector16& a, const Vector16& b) {
+SP_INLINE Vector16 operator-(const Vector16& a, const Vector16& b) {
   return {a.x - b.x, a.y - b.y, a.z - b.z};
 }
-FS_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
+SP_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
 
 // Splats and their gradients, one pack per field.
 struct SplatGradientPack {
@@ -24,7 +24,7 @@ struct SplatGradientPack {
 // dL/dP from the sums over pixels. With W = (ux uy; 0 vy) and A = W P, the covariance's gradient is
 // 2 ln^2 2 W^T (sums of h (u, v)^T (u, v)) W; nothing here is inverted, so needles and giants keep
 // their digits.
-FS_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s, const Vector16& p0,
+SP_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s, const Vector16& p0,
                                const Vector16& p1, Vector16 dp[2]) {
   const float ln2 = 0.69314718056f;
   const Vector16 a0 = s.ux * p0 + s.uy * p1, a1 = s.vy * p1;
@@ -50,7 +50,7 @@ FS_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s,
 }
 
 // Rotation R(q) scale = columns; from dL/dcolumns to dL/dquat and dL/dscale.
-FS_INLINE void covariance_factor_backward(const F16 q[4], const F16 scale[3],
+SP_INLINE void covariance_factor_backward(const F16 q[4], const F16 scale[3],
                                           const Vector16 rotation[3], const Vector16 dcolumns[3],
                                           F16 dq[4], F16 dscale[3]) {
   for (int k = 0; k < 3; ++k) dscale[k] = dot(dcolumns[k], rotation[k]);
@@ -74,7 +74,7 @@ FS_INLINE void covariance_factor_backward(const F16 q[4], const F16 scale[3],
 }
 
 // From dL/dm (rows of J R_CW), dL/dmean and dL/ddepth to dL/dp_C; adds to dL/dR_CW's rows.
-FS_INLINE Vector16 projection_rows_backward(const Camera& camera, const Vector16& p_C,
+SP_INLINE Vector16 projection_rows_backward(const Camera& camera, const Vector16& p_C,
                                             const F16& inverse_z, const Vector16 dm[2],
                                             const SplatGradientPack& s, Vector16 dR[3]) {
   const F16 zero = F16(0.0f);
@@ -104,7 +104,7 @@ struct GaussianGradientPack {
   F16 mean[3], quat[4], scale[3], opacity;
 };
 
-FS_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indices, int lanes,
+SP_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indices, int lanes,
                         const GaussianGradients& out) {
   alignas(64) float soa[11][kLanes];
   for (int k = 0; k < 3; ++k) store(soa[k], pack.mean[k]);
@@ -121,7 +121,7 @@ FS_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indice
 }
 
 // Gathers 16 splats and their gradients; lanes from `lanes` on repeat the first, without gradient.
-FS_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients,
+SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients,
                              const float* means2d, int lanes, bool colors_cut_off,
                              uint32_t* indices, SplatGradientPack& s) {
   alignas(64) float soa[13][kLanes];
@@ -213,4 +213,4 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <array>
 
-namespace flysplat {
+namespace splatpilot {
 
 void radix_sort(std::vector<KeyValue>& items, std::vector<KeyValue>& scratch) {
   if (items.empty()) return;
@@ -32,4 +32,4 @@ void radix_sort(std::vector<KeyValue>& items, std::vector<KeyValue>& scratch) {
   }
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

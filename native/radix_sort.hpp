@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <vector>
 
-namespace flysplat {
+namespace splatpilot {
 
 struct KeyValue {
   uint32_t key, value;
@@ -13,4 +13,4 @@ struct KeyValue {
 // Sorts `items` by key, keeping the order of equal keys; `scratch` is resized as needed.
 void radix_sort(std::vector<KeyValue>& items, std::vector<KeyValue>& scratch);
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -4,7 +4,7 @@
 #include "mathematics.hpp"
 #include "types.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 constexpr int kStageWords = kStageSize / 64;
 
@@ -26,7 +26,7 @@ struct alignas(64) StagedTile {
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
 };
 
-FS_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
+SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
   const float x = s.mean_x - left, y = s.mean_y - top;
   return {s.ux, s.uy, -(s.ux * x + s.uy * y), s.vy, -(s.vy * y),
           s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
@@ -35,7 +35,7 @@ FS_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
 // From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
 // transposed 16 splats at a time: one shifted into the sign shows in the lane bits. `blocks` has
 // room for a multiple of 64.
-FS_INLINE void transpose_blocks(int32_t* blocks, int count,
+SP_INLINE void transpose_blocks(int32_t* blocks, int count,
                                 uint64_t touching[kBlocksPerTile][kStageWords]) {
   for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;
   for (int word = 0; word < (count + 63) / 64; ++word) {
@@ -50,7 +50,7 @@ FS_INLINE void transpose_blocks(int32_t* blocks, int count,
   }
 }
 
-FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float left, float top,
+SP_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float left, float top,
                      StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
   const int count = static_cast<int>(end - begin);
@@ -63,7 +63,7 @@ FS_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float 
   transpose_blocks(blocks, count, staged.touching);
 }
 
-FS_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
+SP_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
   const F16 u = F16(splat.ux) * x + (F16(splat.uy) * y + F16(splat.u0));
   const F16 v = F16(splat.vy) * y + F16(splat.v0);
   const F16 exponent = (F16(splat.log2_opacity) - u * u) - v * v;
@@ -72,7 +72,7 @@ FS_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
 
 // Composites the staged splats of one block; returns whether any pixel is still open.
 template <bool kColor, bool kDepth>
-FS_INLINE bool composite(const StagedTile& staged, int words, int b, const F16& x, const F16& y,
+SP_INLINE bool composite(const StagedTile& staged, int words, int b, const F16& x, const F16& y,
                          BlockState& state) {
   BlockState s = state;
   bool open = true;
@@ -107,7 +107,7 @@ struct BlockPixels {
 };
 
 template <bool kColor, bool kDepth>
-FS_INLINE void finish_block(const Image& image, const BlockState& state, BlockPixels& pixels) {
+SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPixels& pixels) {
   store(pixels.alpha, state.alpha);
   if constexpr (kColor) {
     const F16 rest = F16(1.0f) - state.alpha;
@@ -123,7 +123,7 @@ FS_INLINE void finish_block(const Image& image, const BlockState& state, BlockPi
 
 // Writes the first `columns` pixels of a row of a block; `lane` is the row's first lane.
 template <bool kColor, bool kDepth>
-FS_INLINE void write_row(const Image& image, const BlockPixels& pixels, int lane, size_t pixel,
+SP_INLINE void write_row(const Image& image, const BlockPixels& pixels, int lane, size_t pixel,
                          int columns) {
   for (int i = 0; i < columns; ++i) {
     image.alpha[pixel + i] = pixels.alpha[lane + i];
@@ -138,7 +138,7 @@ FS_INLINE void write_row(const Image& image, const BlockPixels& pixels, int lane
 }
 
 template <bool kColor, bool kDepth>
-FS_INLINE void write_block(const Image& image, const BlockState& state, int width, int height,
+SP_INLINE void write_block(const Image& image, const BlockState& state, int width, int height,
                            int left, int top) {
   BlockPixels pixels;
   finish_block<kColor, kDepth>(image, state, pixels);
@@ -160,7 +160,7 @@ struct LaneCentres {
   F16 x, y;
 };
 
-FS_INLINE LaneCentres lane_centres() {
+SP_INLINE LaneCentres lane_centres() {
   alignas(64) float x[kLanes], y[kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
@@ -170,7 +170,7 @@ FS_INLINE LaneCentres lane_centres() {
 }
 
 // 1 for pixels of block b of the tile that lie inside the image, else 0.
-FS_INLINE F16 ones_inside(const RasterInput& in, const LaneCentres& centres, int left, int top,
+SP_INLINE F16 ones_inside(const RasterInput& in, const LaneCentres& centres, int left, int top,
                           int b) {
   const int columns = in.width - left - kBlockSize * (b % 4);
   const int rows = in.height - top - kBlockSize * (b / 4);
@@ -230,4 +230,4 @@ inline void raster_tile(const RasterInput& in, int tile) {
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

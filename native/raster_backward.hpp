@@ -9,7 +9,7 @@
 #include "raster.hpp"
 #include "reduction.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // What one splat did to one block; zero where a pixel was finished.
 struct BlockRecord {
@@ -31,7 +31,7 @@ struct alignas(64) BackwardScratch {
 static_assert(sizeof(BackwardScratch) <= kBackwardScratchBytes);
 
 // Pixels outside the image get zeros.
-FS_INLINE F16 load_pixels(const float* values, int stride, const RasterInput& in, int left,
+SP_INLINE F16 load_pixels(const float* values, int stride, const RasterInput& in, int left,
                           int top) {
   alignas(64) float pixels[kLanes] = {};
   const int columns = in.width - left < kBlockSize ? in.width - left : kBlockSize;
@@ -47,7 +47,7 @@ FS_INLINE F16 load_pixels(const float* values, int stride, const RasterInput& in
 }
 
 template <bool kColor, bool kDepth>
-FS_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int left, int top,
+SP_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int left, int top,
                           BlockBackward& block) {
   block.alpha = load_pixels(g.alpha, 1, in, left, top);
   if constexpr (kColor) {
@@ -73,7 +73,7 @@ FS_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int lef
 
 // Composites `count` staged splats again from block.transmittance on and records what they did;
 // returns one past the last record.
-FS_INLINE BlockRecord* replay(BackwardScratch& s, const Pair* pairs, int count, uint32_t live) {
+SP_INLINE BlockRecord* replay(BackwardScratch& s, const Pair* pairs, int count, uint32_t live) {
   BlockRecord* record = s.records;
   for (int i = 0; i < count; ++i) {
     const StagedSplat& splat = s.splats[i];
@@ -102,12 +102,12 @@ FS_INLINE BlockRecord* replay(BackwardScratch& s, const Pair* pairs, int count, 
 
 // One register at a time, so that the sums stay in registers at every SIMD level.
 template <bool kColor, bool kDepth, bool kAbsolute>
-FS_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const BlockRecord* record,
+SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const BlockRecord* record,
                              BlockBackward* blocks, PairGradient& gradient) {
   Register sums[16] = {};
   for (uint32_t bits = touched; bits; bits &= bits - 1, ++record) {
     BlockBackward& block = blocks[__builtin_ctz(bits)];
-    FS_EACH_REGISTER(k) {
+    SP_EACH_REGISTER(k) {
       const Register x = block.x.r[k], y = block.y.r[k];
       const Register alpha = record->alpha.r[k], weight = record->weight.r[k];
       const Register behind = block.behind.r[k];
@@ -234,4 +234,4 @@ inline void gather_gradients(const Splat* splats, size_t count, const PairRange*
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -3,31 +3,31 @@
 
 #include "simd.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Halves of 128-bit lanes: (a0 + a2, a1 + a3, b0 + b2, b1 + b3) of each, then the sums of two such.
 #if defined(__AVX512F__)
-#define FS_SHUFFLE_LANES(a, b, i, j, k, l)                                                   \
+#define SP_SHUFFLE_LANES(a, b, i, j, k, l)                                                   \
   __builtin_shufflevector(a, b, i, j, 16 + k, 16 + l, 4 + i, 4 + j, 20 + k, 20 + l, 8 + i, \
                           8 + j, 24 + k, 24 + l, 12 + i, 12 + j, 28 + k, 28 + l)
 #elif defined(__AVX2__)
-#define FS_SHUFFLE_LANES(a, b, i, j, k, l) \
+#define SP_SHUFFLE_LANES(a, b, i, j, k, l) \
   __builtin_shufflevector(a, b, i, j, 8 + k, 8 + l, 4 + i, 4 + j, 12 + k, 12 + l)
 #else
-#define FS_SHUFFLE_LANES(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, 4 + k, 4 + l)
+#define SP_SHUFFLE_LANES(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, 4 + k, 4 + l)
 #endif
 
-FS_INLINE Register fold_halves(const Register& a, const Register& b) {
-  return FS_SHUFFLE_LANES(a, b, 0, 1, 0, 1) + FS_SHUFFLE_LANES(a, b, 2, 3, 2, 3);
+SP_INLINE Register fold_halves(const Register& a, const Register& b) {
+  return SP_SHUFFLE_LANES(a, b, 0, 1, 0, 1) + SP_SHUFFLE_LANES(a, b, 2, 3, 2, 3);
 }
 
-FS_INLINE Register fold_pairs(const Register& a, const Register& b) {
-  return FS_SHUFFLE_LANES(a, b, 0, 2, 0, 2) + FS_SHUFFLE_LANES(a, b, 1, 3, 1, 3);
+SP_INLINE Register fold_pairs(const Register& a, const Register& b) {
+  return SP_SHUFFLE_LANES(a, b, 0, 2, 0, 2) + SP_SHUFFLE_LANES(a, b, 1, 3, 1, 3);
 }
-#undef FS_SHUFFLE_LANES
+#undef SP_SHUFFLE_LANES
 
 // sums[i] = the sum over the lanes of a[i]. The order of additions is fixed.
-FS_INLINE void sum_lanes(const Register a[16], float sums[16]) {
+SP_INLINE void sum_lanes(const Register a[16], float sums[16]) {
   Register folded[kRegisters][4];
   for (int e = 0; e < 4; ++e) {
 #if defined(__AVX512F__)
@@ -53,4 +53,4 @@ FS_INLINE void sum_lanes(const Register a[16], float sums[16]) {
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

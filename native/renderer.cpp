@@ -8,7 +8,7 @@
 
 #include "dispatch.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 Camera make_camera(const CameraParameters& p) {
   Camera c{};
@@ -79,7 +79,7 @@ Camera make_camera(const CameraParameters& p) {
 }
 
 Renderer::Renderer(int threads, const std::string& simd_level)
-    : pool_(threads), kernels_(flysplat::kernels(simd_level)) {}
+    : pool_(threads), kernels_(splatpilot::kernels(simd_level)) {}
 
 void Renderer::render(const GaussianArrays& gaussians, const Camera& camera, const Image& image,
                       bool keep) {
@@ -290,4 +290,4 @@ void Renderer::finish(const Image& image, bool keep) {
   seconds_.raster = lap();
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

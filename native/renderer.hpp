@@ -13,7 +13,7 @@
 #include "thread_pool.hpp"
 #include "types.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 struct CameraParameters {
   int width, height;
@@ -138,4 +138,4 @@ class Renderer {
   std::vector<PairGradient> pair_gradients_;
 };
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -5,7 +5,7 @@
 
 #include "renderer.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 struct alignas(64) Scratch {
@@ -85,4 +85,4 @@ PoseSums Renderer::project_backward(const Frame& frame, const GaussianArrays& ga
   return total;
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

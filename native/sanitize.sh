@@ -15,7 +15,7 @@ build=$root/build/sanitize
   -DCMAKE_CXX_FLAGS="-O1 -g1 -fsanitize=address,undefined -fno-sanitize-recover=all"
 "$python" -m cmake --build "$build"
 # The interpreter is not instrumented: the run-time library goes first, leaks are Python's own, and
-# flysplat._native comes from the build folder. pytest must not swallow the report (-s).
+# splatpilot._native comes from the build folder. pytest must not swallow the report (-s).
 cd "$root"
 LD_PRELOAD="$(${CXX:-c++} -print-file-name=libasan.so) $(${CXX:-c++} -print-file-name=libstdc++.so)" \
 ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH="$build" \
@@ -27,13 +27,13 @@ from pathlib import Path
 import pytest
 
 library = next(Path(sys.path[1] if sys.path[0] == "" else sys.path[0]).glob("_native*.so"))
-spec = importlib.util.spec_from_file_location("flysplat._native", library)
+spec = importlib.util.spec_from_file_location("splatpilot._native", library)
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
-sys.modules["flysplat._native"] = module
-import flysplat
+sys.modules["splatpilot._native"] = module
+import splatpilot
 
-flysplat._native = module
+splatpilot._native = module
 print("sanitized:", module.__file__)
 sys.exit(pytest.main([*(sys.argv[1:] or ["tests/systems/splats"]), "-s"]))
 END

@@ -1,7 +1,7 @@
 // Packs of 16 floats or 32-bit integers: one AVX-512 register, two of AVX or four of SSE or NEON.
 //
 // Every kernel is written once in terms of these packs and compiled once per SIMD level, each time
-// inside its own namespace FLYSPLAT_LEVEL. Kernel code must use nothing from the standard library
+// inside its own namespace SIMD_LEVEL. Kernel code must use nothing from the standard library
 // that could be emitted out of line: the linker would be free to keep the copy with the widest
 // instructions and call it on a machine that lacks them.
 #pragma once
@@ -15,10 +15,10 @@
 #include <arm_neon.h>
 #endif
 
-#define FS_INLINE inline __attribute__((always_inline))
-#define FS_EACH_REGISTER(k) _Pragma("GCC unroll 4") for (int k = 0; k < kRegisters; ++k)
+#define SP_INLINE inline __attribute__((always_inline))
+#define SP_EACH_REGISTER(k) _Pragma("GCC unroll 4") for (int k = 0; k < kRegisters; ++k)
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 constexpr int kLanes = 16;
 #if defined(__AVX512F__)
@@ -39,8 +39,8 @@ struct F16 {
   FloatRegister r[kRegisters];
 
   F16() = default;
-  FS_INLINE F16(float s) {
-    FS_EACH_REGISTER(k) r[k] = s - FloatRegister{};
+  SP_INLINE F16(float s) {
+    SP_EACH_REGISTER(k) r[k] = s - FloatRegister{};
   }
 };
 
@@ -58,190 +58,190 @@ struct Mask16 {
 };
 
 // Register by register: of a copy of the whole, GCC makes one through memory in small pieces.
-FS_INLINE F16 load(const float* p) {
+SP_INLINE F16 load(const float* p) {
   F16 a;
-  FS_EACH_REGISTER(k) std::memcpy(&a.r[k], p + k * kRegisterLanes, kRegisterBytes);
+  SP_EACH_REGISTER(k) std::memcpy(&a.r[k], p + k * kRegisterLanes, kRegisterBytes);
   return a;
 }
 
-FS_INLINE I16 load(const int32_t* p) {
+SP_INLINE I16 load(const int32_t* p) {
   I16 a;
-  FS_EACH_REGISTER(k) std::memcpy(&a.r[k], p + k * kRegisterLanes, kRegisterBytes);
+  SP_EACH_REGISTER(k) std::memcpy(&a.r[k], p + k * kRegisterLanes, kRegisterBytes);
   return a;
 }
 
-FS_INLINE void store(float* p, const F16& a) {
-  FS_EACH_REGISTER(k) std::memcpy(p + k * kRegisterLanes, &a.r[k], kRegisterBytes);
+SP_INLINE void store(float* p, const F16& a) {
+  SP_EACH_REGISTER(k) std::memcpy(p + k * kRegisterLanes, &a.r[k], kRegisterBytes);
 }
 
-#define FS_BINARY(op)                                         \
-  FS_INLINE F16 operator op(const F16& a, const F16& b) { \
+#define SP_BINARY(op)                                         \
+  SP_INLINE F16 operator op(const F16& a, const F16& b) { \
     F16 c;                                           \
-    FS_EACH_REGISTER(k) c.r[k] = a.r[k] op b.r[k];            \
+    SP_EACH_REGISTER(k) c.r[k] = a.r[k] op b.r[k];            \
     return c;                                                 \
   }
-FS_BINARY(+)
-FS_BINARY(-)
-FS_BINARY(*)
-FS_BINARY(/)
-#undef FS_BINARY
+SP_BINARY(+)
+SP_BINARY(-)
+SP_BINARY(*)
+SP_BINARY(/)
+#undef SP_BINARY
 
-FS_INLINE F16 operator-(const F16& a) {
+SP_INLINE F16 operator-(const F16& a) {
   F16 c;
-  FS_EACH_REGISTER(k) c.r[k] = -a.r[k];
+  SP_EACH_REGISTER(k) c.r[k] = -a.r[k];
   return c;
 }
 
-FS_INLINE F16& operator+=(F16& a, const F16& b) { return a = a + b; }
+SP_INLINE F16& operator+=(F16& a, const F16& b) { return a = a + b; }
 
 using Register = FloatRegister;
 #if defined(__AVX512F__)
-FS_INLINE Register register_min(Register a, Register b) { return _mm512_min_ps(a, b); }
-FS_INLINE Register register_max(Register a, Register b) { return _mm512_max_ps(a, b); }
-FS_INLINE Register register_sqrt(Register a) { return _mm512_sqrt_ps(a); }
+SP_INLINE Register register_min(Register a, Register b) { return _mm512_min_ps(a, b); }
+SP_INLINE Register register_max(Register a, Register b) { return _mm512_max_ps(a, b); }
+SP_INLINE Register register_sqrt(Register a) { return _mm512_sqrt_ps(a); }
 #elif defined(__AVX2__)
-FS_INLINE Register register_min(Register a, Register b) { return _mm256_min_ps(a, b); }
-FS_INLINE Register register_max(Register a, Register b) { return _mm256_max_ps(a, b); }
-FS_INLINE Register register_sqrt(Register a) { return _mm256_sqrt_ps(a); }
+SP_INLINE Register register_min(Register a, Register b) { return _mm256_min_ps(a, b); }
+SP_INLINE Register register_max(Register a, Register b) { return _mm256_max_ps(a, b); }
+SP_INLINE Register register_sqrt(Register a) { return _mm256_sqrt_ps(a); }
 #elif defined(__SSE4_1__)
-FS_INLINE Register register_min(Register a, Register b) { return _mm_min_ps(a, b); }
-FS_INLINE Register register_max(Register a, Register b) { return _mm_max_ps(a, b); }
-FS_INLINE Register register_sqrt(Register a) { return _mm_sqrt_ps(a); }
+SP_INLINE Register register_min(Register a, Register b) { return _mm_min_ps(a, b); }
+SP_INLINE Register register_max(Register a, Register b) { return _mm_max_ps(a, b); }
+SP_INLINE Register register_sqrt(Register a) { return _mm_sqrt_ps(a); }
 #else
-FS_INLINE Register register_min(Register a, Register b) { return a < b ? a : b; }
-FS_INLINE Register register_max(Register a, Register b) { return a > b ? a : b; }
-FS_INLINE Register register_sqrt(Register a) {
+SP_INLINE Register register_min(Register a, Register b) { return a < b ? a : b; }
+SP_INLINE Register register_max(Register a, Register b) { return a > b ? a : b; }
+SP_INLINE Register register_sqrt(Register a) {
   for (int i = 0; i < kRegisterLanes; ++i) a[i] = __builtin_sqrtf(a[i]);
   return a;
 }
 #endif
 
 // Of an unordered pair both return the second operand, as the x86 instructions do.
-FS_INLINE F16 min(const F16& a, const F16& b) {
+SP_INLINE F16 min(const F16& a, const F16& b) {
   F16 c;
-  FS_EACH_REGISTER(k) c.r[k] = register_min(a.r[k], b.r[k]);
+  SP_EACH_REGISTER(k) c.r[k] = register_min(a.r[k], b.r[k]);
   return c;
 }
 
-FS_INLINE F16 max(const F16& a, const F16& b) {
+SP_INLINE F16 max(const F16& a, const F16& b) {
   F16 c;
-  FS_EACH_REGISTER(k) c.r[k] = register_max(a.r[k], b.r[k]);
+  SP_EACH_REGISTER(k) c.r[k] = register_max(a.r[k], b.r[k]);
   return c;
 }
 
-FS_INLINE F16 clamp(const F16& a, const F16& low, const F16& high) {
+SP_INLINE F16 clamp(const F16& a, const F16& low, const F16& high) {
   return min(max(a, low), high);
 }
 
-FS_INLINE F16 sqrt(const F16& a) {
+SP_INLINE F16 sqrt(const F16& a) {
   F16 c;
-  FS_EACH_REGISTER(k) c.r[k] = register_sqrt(a.r[k]);
+  SP_EACH_REGISTER(k) c.r[k] = register_sqrt(a.r[k]);
   return c;
 }
 
-FS_INLINE I16 bits_of(const F16& a) {
+SP_INLINE I16 bits_of(const F16& a) {
   I16 b;
-  FS_EACH_REGISTER(k) b.r[k] = reinterpret_cast<IntRegister>(a.r[k]);
+  SP_EACH_REGISTER(k) b.r[k] = reinterpret_cast<IntRegister>(a.r[k]);
   return b;
 }
 
-FS_INLINE F16 float_from_bits(const I16& a) {
+SP_INLINE F16 float_from_bits(const I16& a) {
   F16 b;
-  FS_EACH_REGISTER(k) b.r[k] = reinterpret_cast<FloatRegister>(a.r[k]);
+  SP_EACH_REGISTER(k) b.r[k] = reinterpret_cast<FloatRegister>(a.r[k]);
   return b;
 }
 
 // Wraps around.
-FS_INLINE I16 operator+(const I16& a, const I16& b) {
+SP_INLINE I16 operator+(const I16& a, const I16& b) {
   I16 c;
-  FS_EACH_REGISTER(k) {
+  SP_EACH_REGISTER(k) {
     c.r[k] = reinterpret_cast<IntRegister>(reinterpret_cast<UnsignedRegister>(a.r[k]) +
                                            reinterpret_cast<UnsignedRegister>(b.r[k]));
   }
   return c;
 }
 
-FS_INLINE I16 operator-(const I16& a, int32_t b) {
+SP_INLINE I16 operator-(const I16& a, int32_t b) {
   I16 c;
-  FS_EACH_REGISTER(k) {
+  SP_EACH_REGISTER(k) {
     c.r[k] = reinterpret_cast<IntRegister>(reinterpret_cast<UnsignedRegister>(a.r[k]) -
                                            static_cast<uint32_t>(b));
   }
   return c;
 }
 
-FS_INLINE I16 operator&(const I16& a, int32_t b) {
+SP_INLINE I16 operator&(const I16& a, int32_t b) {
   I16 c;
-  FS_EACH_REGISTER(k) c.r[k] = a.r[k] & b;
+  SP_EACH_REGISTER(k) c.r[k] = a.r[k] & b;
   return c;
 }
 
-FS_INLINE I16 shift_left(const I16& a, int n) {
+SP_INLINE I16 shift_left(const I16& a, int n) {
   I16 c;
-  FS_EACH_REGISTER(k) c.r[k] = a.r[k] << n;
+  SP_EACH_REGISTER(k) c.r[k] = a.r[k] << n;
   return c;
 }
 
-FS_INLINE I16 shift_right(const I16& a, int n) {
+SP_INLINE I16 shift_right(const I16& a, int n) {
   I16 c;
-  FS_EACH_REGISTER(k) c.r[k] = a.r[k] >> n;
+  SP_EACH_REGISTER(k) c.r[k] = a.r[k] >> n;
   return c;
 }
 
-FS_INLINE F16 to_float(const I16& a) {
+SP_INLINE F16 to_float(const I16& a) {
   F16 c;
-  FS_EACH_REGISTER(k) c.r[k] = __builtin_convertvector(a.r[k], FloatRegister);
+  SP_EACH_REGISTER(k) c.r[k] = __builtin_convertvector(a.r[k], FloatRegister);
   return c;
 }
 
 #if defined(__AVX512F__)
-#define FS_COMPARE(name, op, predicate)                   \
-  FS_INLINE Mask16 name(const F16& a, const F16& b) { \
+#define SP_COMPARE(name, op, predicate)                   \
+  SP_INLINE Mask16 name(const F16& a, const F16& b) { \
     return {_mm512_cmp_ps_mask(a.r[0], b.r[0], predicate)}; \
   }
 #else
-#define FS_COMPARE(name, op, predicate)                   \
-  FS_INLINE Mask16 name(const F16& a, const F16& b) { \
+#define SP_COMPARE(name, op, predicate)                   \
+  SP_INLINE Mask16 name(const F16& a, const F16& b) { \
     Mask16 m;                                             \
-    FS_EACH_REGISTER(k) m.r[k] = a.r[k] op b.r[k];        \
+    SP_EACH_REGISTER(k) m.r[k] = a.r[k] op b.r[k];        \
     return m;                                             \
   }
 #endif
-FS_COMPARE(operator>, >, _CMP_GT_OQ)
-FS_COMPARE(operator>=, >=, _CMP_GE_OQ)
-FS_COMPARE(operator<, <, _CMP_LT_OQ)
-FS_COMPARE(operator<=, <=, _CMP_LE_OQ)
-#undef FS_COMPARE
+SP_COMPARE(operator>, >, _CMP_GT_OQ)
+SP_COMPARE(operator>=, >=, _CMP_GE_OQ)
+SP_COMPARE(operator<, <, _CMP_LT_OQ)
+SP_COMPARE(operator<=, <=, _CMP_LE_OQ)
+#undef SP_COMPARE
 
-FS_INLINE Mask16 operator&(const Mask16& a, const Mask16& b) {
+SP_INLINE Mask16 operator&(const Mask16& a, const Mask16& b) {
   Mask16 c;
 #if defined(__AVX512F__)
   c.bits = static_cast<__mmask16>(a.bits & b.bits);
 #else
-  FS_EACH_REGISTER(k) c.r[k] = a.r[k] & b.r[k];
+  SP_EACH_REGISTER(k) c.r[k] = a.r[k] & b.r[k];
 #endif
   return c;
 }
 
-FS_INLINE F16 zero_unless(const Mask16& m, const F16& a) {
+SP_INLINE F16 zero_unless(const Mask16& m, const F16& a) {
   F16 c;
 #if defined(__AVX512F__)
   c.r[0] = _mm512_maskz_mov_ps(m.bits, a.r[0]);
 #else
   I16 b = bits_of(a);
-  FS_EACH_REGISTER(k) b.r[k] &= m.r[k];
+  SP_EACH_REGISTER(k) b.r[k] &= m.r[k];
   c = float_from_bits(b);
 #endif
   return c;
 }
 
 // The signs of the lanes, lane 0 lowest.
-FS_INLINE uint32_t sign_bits(const I16& a) {
+SP_INLINE uint32_t sign_bits(const I16& a) {
 #if defined(__AVX512F__)
   return _mm512_movepi32_mask(reinterpret_cast<__m512i>(a.r[0]));
 #else
   uint32_t bits = 0;
-  FS_EACH_REGISTER(k) {
+  SP_EACH_REGISTER(k) {
 #if defined(__AVX2__)
     const int part = _mm256_movemask_ps(reinterpret_cast<__m256>(a.r[k]));
 #elif defined(__SSE4_1__)
@@ -261,17 +261,17 @@ FS_INLINE uint32_t sign_bits(const I16& a) {
 }
 
 // One bit per lane, lane 0 lowest.
-FS_INLINE uint32_t lane_bits(const Mask16& m) {
+SP_INLINE uint32_t lane_bits(const Mask16& m) {
 #if defined(__AVX512F__)
   return m.bits;
 #else
   I16 a;
-  FS_EACH_REGISTER(k) a.r[k] = m.r[k];
+  SP_EACH_REGISTER(k) a.r[k] = m.r[k];
   return sign_bits(a);
 #endif
 }
 
-FS_INLINE bool any(const Mask16& m) {
+SP_INLINE bool any(const Mask16& m) {
 #if defined(__AVX512F__)
   return m.bits != 0;
 #else
@@ -289,4 +289,4 @@ FS_INLINE bool any(const Mask16& m) {
 #endif
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -4,11 +4,11 @@
 
 #include "simd.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // colour = max(0, 1/2 + sum_k c_k Y_k(d)) for 16 Gaussians. `coefficients` holds 3 K packs, channel
 // fastest; (x, y, z) is the direction from the camera to the Gaussian, of any length.
-FS_INLINE void evaluate_sh(int degree, const float* coefficients, F16 x, F16 y, F16 z,
+SP_INLINE void evaluate_sh(int degree, const float* coefficients, F16 x, F16 y, F16 z,
                            F16 color[3]) {
   F16 basis[16];
   int count = 1;
@@ -49,4 +49,4 @@ FS_INLINE void evaluate_sh(int degree, const float* coefficients, F16 x, F16 y, 
   for (int c = 0; c < 3; ++c) color[c] = max(color[c], F16(0.0f));
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -3,14 +3,14 @@
 
 #include "spherical_harmonics.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Basis functions and their derivatives by the unit direction, as polynomials in x, y, z.
 struct BasisDerivatives {
   F16 value[16], x[16], y[16], z[16];
 };
 
-FS_INLINE int basis_derivatives(int degree, const F16& x, const F16& y, const F16& z,
+SP_INLINE int basis_derivatives(int degree, const F16& x, const F16& y, const F16& z,
                                 BasisDerivatives& b) {
   const F16 zero = F16(0.0f), two = F16(2.0f), three = F16(3.0f), four = F16(4.0f);
   const auto set = [&](int k, float scale, const F16& value, const F16& dx, const F16& dy,
@@ -48,7 +48,7 @@ FS_INLINE int basis_derivatives(int degree, const F16& x, const F16& y, const F1
 }
 
 // `coefficients` as in evaluate_sh; writes dL/d(coefficients) over them and adds dL/d(x, y, z).
-FS_INLINE void evaluate_sh_backward(int degree, float* coefficients, F16 x, F16 y, F16 z,
+SP_INLINE void evaluate_sh_backward(int degree, float* coefficients, F16 x, F16 y, F16 z,
                                     const F16 color_gradient[3], F16 direction_gradient[3]) {
   const F16 inverse_length = F16(1.0f) / sqrt(max(x * x + y * y + z * z, F16(1e-30f)));
   x = x * inverse_length;
@@ -74,4 +74,4 @@ FS_INLINE void evaluate_sh_backward(int degree, float* coefficients, F16 x, F16 
   direction_gradient[2] += (d[2] - radial * z) * inverse_length;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -3,21 +3,21 @@
 #include "surfel_raster_backward.hpp"
 #include "surfel_tiles.hpp"
 
-namespace flysplat {
-namespace FLYSPLAT_LEVEL {
+namespace splatpilot {
+namespace SIMD_LEVEL {
 
-#define FS_STRING_OF(name) #name
-#define FS_STRING(name) FS_STRING_OF(name)
+#define SP_STRING_OF(name) #name
+#define SP_STRING(name) SP_STRING_OF(name)
 static const SurfelKernels kSurfelTable = {
-    FS_STRING(FLYSPLAT_LEVEL), project_surfels,         bin_footprints<SurfelFootprint>,
+    SP_STRING(SIMD_LEVEL), project_surfels,         bin_footprints<SurfelFootprint>,
     raster_surfels,            raster_surfels_backward, project_surfels_backward};
 
-}  // namespace FLYSPLAT_LEVEL
+}  // namespace SIMD_LEVEL
 
-#define FS_JOIN_OF(a, b) a##b
-#define FS_JOIN(a, b) FS_JOIN_OF(a, b)
-const SurfelKernels& FS_JOIN(surfel_kernels_, FLYSPLAT_LEVEL)() {
-  return FLYSPLAT_LEVEL::kSurfelTable;
+#define SP_JOIN_OF(a, b) a##b
+#define SP_JOIN(a, b) SP_JOIN_OF(a, b)
+const SurfelKernels& SP_JOIN(surfel_kernels_, SIMD_LEVEL)() {
+  return SIMD_LEVEL::kSurfelTable;
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -10,7 +10,7 @@
 #include "bindings.hpp"
 #include "surfels.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 using namespace nb::literals;
@@ -132,4 +132,4 @@ void bind_surfels(nb::module_& m) {
            "by_opacities"_a, "by_colors"_a);
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

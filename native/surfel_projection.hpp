@@ -6,19 +6,19 @@
 #include "surfel_lanes.hpp"
 #include "surfel_types.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
-FS_INLINE Vector16 cross(const Vector16& a, const Vector16& b) {
+SP_INLINE Vector16 cross(const Vector16& a, const Vector16& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-FS_INLINE Vector16 scaled(const Vector16& a, const F16& s) { return {a.x * s, a.y * s, a.z * s}; }
-FS_INLINE Vector16 sum(const Vector16& a, const Vector16& b) {
+SP_INLINE Vector16 scaled(const Vector16& a, const F16& s) { return {a.x * s, a.y * s, a.z * s}; }
+SP_INLINE Vector16 sum(const Vector16& a, const Vector16& b) {
   return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
 
 // The unit tangents and the normal t[2] = t[0] x t[1] of surfels, in the world.
-FS_INLINE void surfel_axes(const F16 q[4], Vector16 t[3]) {
+SP_INLINE void surfel_axes(const F16 q[4], Vector16 t[3]) {
   const F16 ones[3] = {F16(1.0f), F16(1.0f), F16(1.0f)};
   covariance_factor(q, ones, t);
 }
@@ -34,7 +34,7 @@ struct SurfelPlane {
   Mask16 edge_on;
 };
 
-FS_INLINE SurfelPlane surfel_plane(const Camera& camera, const Vector16& p_C,
+SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const Vector16& p_C,
                                    const Vector16 t_W[3], const F16 scale[2]) {
   SurfelPlane s;
   s.p = p_C;
@@ -52,7 +52,7 @@ FS_INLINE SurfelPlane surfel_plane(const Camera& camera, const Vector16& p_C,
 // Where alpha can reach the cut: the image of the disc of radius r standard deviations about the
 // centre, an ellipse while the disc is beyond the near plane, and the blob. Returns the lanes of
 // which some of it is on the image.
-FS_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const F16 scale[2],
+SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const F16 scale[2],
                                const F16& log2_opacity, SplatPack& out, F16& disc_radius) {
   const F16 zero = F16(0.0f), one = F16(1.0f);
   const F16 budget = log2_opacity - F16(kLog2AlphaCut);
@@ -214,4 +214,4 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
   return count;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -4,23 +4,23 @@
 #include "color_backward.hpp"
 #include "surfel_projection.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // A gradient in the camera frame, in the world.
-FS_INLINE Vector16 to_world(const Camera& camera, const Vector16& c) {
+SP_INLINE Vector16 to_world(const Camera& camera, const Vector16& c) {
   const float* R = camera.R_CW;
   return {F16(R[0]) * c.x + F16(R[3]) * c.y + F16(R[6]) * c.z,
           F16(R[1]) * c.x + F16(R[4]) * c.y + F16(R[7]) * c.z,
           F16(R[2]) * c.x + F16(R[5]) * c.y + F16(R[8]) * c.z};
 }
 
-FS_INLINE Vector16 zero_unless(const Mask16& m, const Vector16& a) {
+SP_INLINE Vector16 zero_unless(const Mask16& m, const Vector16& a) {
   return {zero_unless(m, a.x), zero_unless(m, a.y), zero_unless(m, a.z)};
 }
 
 // The gradient with respect to a quaternion of any length, from those of the first two columns of
 // its rotation matrix.
-FS_INLINE void quaternion_gradient(const F16 raw[4], const Vector16& a, const Vector16& b,
+SP_INLINE void quaternion_gradient(const F16 raw[4], const Vector16& a, const Vector16& b,
                                    F16 gradient[4]) {
   const F16 inverse_norm = F16(1.0f) / sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] +
                                             raw[3] * raw[3]);
@@ -43,7 +43,7 @@ struct PlaneGradient {
   F16 scale[2];
 };
 
-FS_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& s,
+SP_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& s,
                                        const F16 scale[2], const F16 g[16]) {
   const F16 zero = F16(0.0f);
   const F16 inverse_s0 = F16(1.0f) / scale[0], inverse_s1 = F16(1.0f) / scale[1];
@@ -87,7 +87,7 @@ FS_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& 
 }
 
 // Sums of 16 lanes, of which those not in `bits` are left out.
-FS_INLINE double masked_sum(const F16& a, uint32_t bits) {
+SP_INLINE double masked_sum(const F16& a, uint32_t bits) {
   alignas(64) float lanes[kLanes];
   store(lanes, a);
   double total = 0.0;
@@ -169,4 +169,4 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

@@ -6,14 +6,14 @@
 #include "surfel_lanes.hpp"
 #include "surfel_types.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 struct alignas(64) StagedSurfels {
   Surfel surfels[kStageSize];  // with means relative to the tile
   uint64_t touching[kBlocksPerTile][kStageWords];
 };
 
-FS_INLINE void stage_surfels(const SurfelRasterInput& in, uint32_t begin, uint32_t end, float left,
+SP_INLINE void stage_surfels(const SurfelRasterInput& in, uint32_t begin, uint32_t end, float left,
                              float top, StagedSurfels& staged) {
   alignas(64) int32_t blocks[kStageSize];
   const int count = static_cast<int>(end - begin);
@@ -34,7 +34,7 @@ struct BlockLanes {
   F16 x, y;
 };
 
-FS_INLINE BlockLanes block_lanes(int b) {
+SP_INLINE BlockLanes block_lanes(int b) {
   alignas(64) float x[kLanes], y[kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     x[lane] = static_cast<float>(kBlockSize * (b % 4) + lane % kBlockSize) + 0.5f;
@@ -56,7 +56,7 @@ struct SurfelSample {
 
 // alpha = o exp(-r2 / 2): r2 is the lesser of u^2 + v^2 on the surfel's plane and of the blob's
 // |d|^2 / kBlobVariance (the larger of the two Gaussians; Huang et al. 2024, equation 11).
-FS_INLINE SurfelSample sample_surfel(const Surfel& s, const BlockLanes& pixel,
+SP_INLINE SurfelSample sample_surfel(const Surfel& s, const BlockLanes& pixel,
                                      const F16& near_plane) {
   SurfelSample a;
   a.dx = pixel.x - F16(s.mean[0]);
@@ -85,7 +85,7 @@ struct SurfelBlockState {
 // Composites the staged surfels, of which the first has the index `first` in the tile; returns
 // whether any pixel is still open.
 template <bool kDistort, bool kRecord>
-FS_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b, float first,
+SP_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b, float first,
                                  const F16& near_plane, SurfelBlockState& state) {
   const BlockLanes pixel = block_lanes(b);
   SurfelBlockState s = state;
@@ -125,7 +125,7 @@ FS_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b, 
 
 // Calls move(lane, pixel) for the pixels of a block that are on the image.
 template <typename Move>
-FS_INLINE void for_each_pixel(int width, int height, int left, int top, const Move& move) {
+SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Move& move) {
   const int columns = width - left < kBlockSize ? width - left : kBlockSize;
   const int rows = height - top < kBlockSize ? height - top : kBlockSize;
   for (int row = 0; row < rows; ++row) {
@@ -135,7 +135,7 @@ FS_INLINE void for_each_pixel(int width, int height, int left, int top, const Mo
   }
 }
 
-FS_INLINE void write_surfel_block(const SurfelImages<float>& out, const SurfelBlockState& s,
+SP_INLINE void write_surfel_block(const SurfelImages<float>& out, const SurfelBlockState& s,
                                   int width, int height, int left, int top) {
   alignas(64) float lanes[10][kLanes];
   const F16* packs[10] = {s.color, s.color + 1, s.color + 2, s.normal, s.normal + 1,
@@ -210,4 +210,4 @@ inline void raster_surfels(const SurfelRasterInput& in, const SurfelImages<float
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

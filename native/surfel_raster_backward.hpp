@@ -4,7 +4,7 @@
 
 #include "surfel_raster.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Gradients of the loss with respect to the pixels of a block, and the running state.
 struct BackwardBlock {
@@ -15,7 +15,7 @@ struct BackwardBlock {
   F16 alpha_behind, depth_behind;   // sums of weights and of weighted depths
 };
 
-FS_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
+SP_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
                                        const SurfelImages<const float>& g,
                                        const SurfelBlockRecord& record, int left, int top) {
   alignas(64) float lanes[10][kLanes] = {};
@@ -48,7 +48,7 @@ FS_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
 
 // Adds what 16 pixels give to the gradient of a surfel; fields as in SurfelGradient.
 template <bool kDistort>
-FS_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, const F16& index,
+SP_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, const F16& index,
                                  const F16& near_plane, BackwardBlock& block, F16 sums[16]) {
   const F16 zero = F16(0.0f), one = F16(1.0f);
   const SurfelSample a = sample_surfel(surfel, pixel, near_plane);
@@ -154,4 +154,4 @@ inline void raster_surfels_backward(const SurfelRasterInput& in, const SurfelIma
   }
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

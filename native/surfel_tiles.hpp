@@ -4,10 +4,10 @@
 #include "surfel_types.hpp"
 #include "tiles.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // The blocks that hold a point of the disc.
-FS_INLINE uint32_t blocks_of_disc(const Disc& disc, const BlockGrid& grid, float tile_left,
+SP_INLINE uint32_t blocks_of_disc(const Disc& disc, const BlockGrid& grid, float tile_left,
                                   float tile_top) {
   const F16 span = F16(static_cast<float>(kBlockSize - 1)), zero = F16(0.0f);
   const F16 x0 = grid.left + F16(tile_left - disc.x);
@@ -16,28 +16,28 @@ FS_INLINE uint32_t blocks_of_disc(const Disc& disc, const BlockGrid& grid, float
   return lane_bits(x * x + y * y <= F16(disc.radius * disc.radius));
 }
 
-FS_INLINE TileRange united(const TileRange& a, const TileRange& b) {
+SP_INLINE TileRange united(const TileRange& a, const TileRange& b) {
   return {a.first < b.first ? a.first : b.first, a.last > b.last ? a.last : b.last};
 }
 
 // The ellipse's blocks and the disc's.
 struct SurfelFootprint {
   // A little more, so that rounding never hides a pixel.
-  static FS_INLINE Disc disc(const Splat& s) {
+  static SP_INLINE Disc disc(const Splat& s) {
     const Disc d = disc_of(s);
     return {d.x, d.y, d.radius * 1.0001f + 1e-3f};
   }
-  static FS_INLINE TileRange columns(const Splat& s, int tiles) {
+  static SP_INLINE TileRange columns(const Splat& s, int tiles) {
     const Disc d = disc(s);
     return united(SplatFootprint::columns(s, tiles), tile_range(d.x, d.radius, tiles));
   }
-  static FS_INLINE TileRange rows(const Splat& s, int tiles) {
+  static SP_INLINE TileRange rows(const Splat& s, int tiles) {
     const Disc d = disc(s);
     return united(SplatFootprint::rows(s, tiles), tile_range(d.y, d.radius, tiles));
   }
-  static FS_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
+  static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
     return SplatFootprint::blocks(s, grid, left, top) | blocks_of_disc(disc(s), grid, left, top);
   }
 };
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

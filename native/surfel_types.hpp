@@ -3,7 +3,7 @@
 
 #include "types.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 // The pixel's low-pass filter: a blob with a standard deviation of sqrt(1/2) px.
 constexpr float kBlobVariance = 0.5f;
@@ -107,4 +107,4 @@ const SurfelKernels& surfel_kernels_v4();
 const SurfelKernels& surfel_kernels_generic();
 #endif
 
-}  // namespace flysplat
+}  // namespace splatpilot

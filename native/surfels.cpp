@@ -6,7 +6,7 @@
 
 #include "dispatch.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 const SurfelKernels& surfel_kernels(const Kernels& level) {
@@ -101,4 +101,4 @@ CameraGradient SurfelRenderer::backward(const GaussianArrays& gaussians,
   return by_camera;
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -4,7 +4,7 @@
 #include "renderer.hpp"
 #include "surfel_types.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 
 // As Renderer, and holds what the backward pass of the last frame needs. To keep a frame for later,
 // keep its renderer.
@@ -37,4 +37,4 @@ class SurfelRenderer : public Renderer {
   std::vector<SurfelGradient> pair_gradients_, surfel_gradients_;
 };
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -1,6 +1,6 @@
 #include "thread_pool.hpp"
 
-namespace flysplat {
+namespace splatpilot {
 namespace {
 
 constexpr int kSpins = 2000;  // of the order of 20 us
@@ -69,4 +69,4 @@ void ThreadPool::work() {
   }
 }
 
-}  // namespace flysplat
+}  // namespace splatpilot

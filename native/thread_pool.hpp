@@ -6,7 +6,7 @@
 #include <thread>
 #include <vector>
 
-namespace flysplat {
+namespace splatpilot {
 
 // Workers spin for some microseconds after a loop, since the next stage of a frame follows at once,
 // then sleep until called: an idle pool costs nothing, and one that shares its cores does not
@@ -49,4 +49,4 @@ class ThreadPool {
   std::atomic<bool> stop_{false};
 };
 
-}  // namespace flysplat
+}  // namespace splatpilot

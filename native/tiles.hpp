@@ -4,14 +4,14 @@
 #include "simd.hpp"
 #include "types.hpp"
 
-namespace flysplat::FLYSPLAT_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 // Tiles [first, last] along one axis that meet the interval mean -+ extent.
 struct TileRange {
   int first, last;
 };
 
-FS_INLINE TileRange tile_range(float mean, float extent, int tiles) {
+SP_INLINE TileRange tile_range(float mean, float extent, int tiles) {
   // Pixel i has its centre at i + 1/2. Clamped as floats: extents may exceed any integer.
   const float low = (mean - extent - 0.5f) * (1.0f / kTileSize);
   const float high = (mean + extent - 0.5f) * (1.0f / kTileSize);
@@ -26,7 +26,7 @@ struct BlockGrid {
   F16 left, top;
 };
 
-FS_INLINE BlockGrid block_grid() {
+SP_INLINE BlockGrid block_grid() {
   alignas(64) float left[kLanes], top[kLanes];
   for (int b = 0; b < kLanes; ++b) {
     left[b] = static_cast<float>(kBlockSize * (b % 4)) + 0.5f;
@@ -38,7 +38,7 @@ FS_INLINE BlockGrid block_grid() {
 // The blocks that hold a point with alpha >= 1/255, one bit each. The squared norm u^2 + v^2 is a
 // convex quadratic with its minimum 0 at the mean, so over a rectangle it is least on the line
 // x = (nearest x to the mean) or on y = (nearest y); on either line the minimum is a clamp.
-FS_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float tile_left,
+SP_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float tile_left,
                                   float tile_top, float budget) {
   const F16 span = F16(static_cast<float>(kBlockSize - 1));
   const F16 x0 = grid.left + F16(tile_left - s.mean_x), x1 = x0 + span;
@@ -55,13 +55,13 @@ FS_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float t
 
 // Which tiles to look at, and which blocks of one of them a splat touches.
 struct SplatFootprint {
-  static FS_INLINE TileRange columns(const Splat& s, int tiles) {
+  static SP_INLINE TileRange columns(const Splat& s, int tiles) {
     return tile_range(s.mean_x, s.extent_x, tiles);
   }
-  static FS_INLINE TileRange rows(const Splat& s, int tiles) {
+  static SP_INLINE TileRange rows(const Splat& s, int tiles) {
     return tile_range(s.mean_y, s.extent_y, tiles);
   }
-  static FS_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
+  static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
     // A little more than log2(255 o), so that rounding here never hides a pixel.
     const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
     return touched_blocks(s, grid, left, top, budget);
@@ -100,4 +100,4 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
   return i;
 }
 
-}  // namespace flysplat::FLYSPLAT_LEVEL
+}  // namespace splatpilot::SIMD_LEVEL

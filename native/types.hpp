@@ -5,7 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 
-namespace flysplat {
+namespace splatpilot {
 
 constexpr int kTileSize = 16;        // [px]
 constexpr int kBlockSize = 4;        // [px]; one block is 16 pixels, the width of a pack
@@ -214,4 +214,4 @@ const Kernels& kernels_v4();
 const Kernels& kernels_generic();
 #endif
 
-}  // namespace flysplat
+}  // namespace splatpilot

@@ -1,7 +1,7 @@
 import pytest
 from hypothesis import settings
 
-from flysplat.systems.opengl import require_opengl
+from splatpilot.systems.opengl import require_opengl
 
 # The same examples in every run, and no failure because the machine was busy.
 settings.register_profile("repeatable", deadline=None, derandomize=True)

@@ -5,7 +5,7 @@ function that runs it. That function imports what it needs when it runs: torch a
 seconds to load.
 """
 
-from flysplat.analysis.commands import (
+from splatpilot.analysis.commands import (
     ablate,
     benchmark,
     capture,

@@ -1,9 +1,9 @@
-"""`flysplat ablate`."""
+"""`splatpilot ablate`."""
 
 import argparse
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -21,9 +21,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _ablate(options: argparse.Namespace) -> None:
-    from flysplat.analysis import ablation
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.training.reconstruct_config import ReconstructConfig
+    from splatpilot.analysis.reconstruction import ablation
+    from splatpilot.systems.configuration import load_config
+    from splatpilot.training.reconstruction.config import ReconstructConfig
 
     config = load_config(ReconstructConfig(), overrides=options.overrides)
     ablation.run(options.captures, options.out, config)

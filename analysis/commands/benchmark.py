@@ -1,10 +1,10 @@
-"""`flysplat benchmark`."""
+"""`splatpilot benchmark`."""
 
 import argparse
 import logging
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 QUICK_SCENARIOS = "P02", "P06", "P08"
 QUICK_POLICIES = "planner", "straight", "reactive"
@@ -46,8 +46,8 @@ def _names(text: str) -> list[str]:
 
 
 def _benchmark(options: argparse.Namespace) -> None:
-    from flysplat.analysis import benchmark
-    from flysplat.analysis.study import StudyConfig
+    from splatpilot.analysis.benchmark import run as benchmark
+    from splatpilot.analysis.benchmark.study import StudyConfig
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     config = StudyConfig(overrides=options.overrides)

@@ -1,9 +1,9 @@
-"""`flysplat capture`: work on captures before they become scenes."""
+"""`splatpilot capture`: work on captures before they become scenes."""
 
 import argparse
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -26,8 +26,8 @@ def _add_check(actions: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.training.captures import check
+    from splatpilot.systems.configuration import load_config
+    from splatpilot.training.captures import check
 
     config = load_config(check.CheckConfig(), overrides=options.overrides)
     check.run(capture=options.capture, config=config)
@@ -52,8 +52,8 @@ def _add_render(actions: argparse._SubParsersAction) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.training.captures import render_capture
+    from splatpilot.systems.configuration import load_config
+    from splatpilot.training.captures import render_capture
 
     config = render_capture.RenderConfig()
     if options.up is not None:

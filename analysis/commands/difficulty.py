@@ -1,4 +1,4 @@
-"""`flysplat difficulty`."""
+"""`splatpilot difficulty`."""
 
 import argparse
 
@@ -15,6 +15,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _difficulty(options: argparse.Namespace) -> None:
-    from flysplat.analysis import difficulty
+    from splatpilot.analysis import difficulty
 
     difficulty.run(scenarios=options.scenarios, seeds=options.seeds)

@@ -1,9 +1,9 @@
-"""`flysplat fidelity`."""
+"""`splatpilot fidelity`."""
 
 import argparse
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -19,8 +19,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _fidelity(options: argparse.Namespace) -> None:
-    from flysplat.analysis import fidelity
-    from flysplat.diagrams.configuration import load_config
+    from splatpilot.analysis.fidelity import run as fidelity
+    from splatpilot.systems.configuration import load_config
 
     config = load_config(fidelity.FidelityConfig(), overrides=options.overrides)
     fidelity.run(options.scenes, options.out, config)

@@ -1,10 +1,10 @@
-"""`flysplat fly`."""
+"""`splatpilot fly`."""
 
 import argparse
 import logging
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -36,12 +36,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _fly(options: argparse.Namespace) -> None:
-    from flysplat.diagrams import fly
-    from flysplat.diagrams.add_policy import policy_named
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.diagrams.scenario import Scenario
-    from flysplat.diagrams.scenario_files import scenario_file
-    from flysplat.diagrams.worlds.make_world import SceneConfig
+    from splatpilot.diagrams import fly
+    from splatpilot.diagrams.add_policy import policy_named
+    from splatpilot.diagrams.scenario import Scenario
+    from splatpilot.diagrams.scenario_files import scenario_file
+    from splatpilot.diagrams.worlds.make_world import SceneConfig
+    from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     file = None if options.scenario is None else scenario_file(options.scenario)

@@ -1,4 +1,4 @@
-"""`flysplat measure`."""
+"""`splatpilot measure`."""
 
 import argparse
 from pathlib import Path
@@ -13,6 +13,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _measure(options: argparse.Namespace) -> None:
-    from flysplat.analysis import measure_scene
+    from splatpilot.analysis.reconstruction import measure_scene
 
     measure_scene.run(options.scene)

@@ -1,9 +1,9 @@
-"""`flysplat reconstruct`."""
+"""`splatpilot reconstruct`."""
 
 import argparse
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -19,11 +19,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
-    from flysplat.analysis import measure_scene
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.training import reconstruct
-    from flysplat.training.captures.read_capture import read_capture
-    from flysplat.training.reconstruct_config import ReconstructConfig
+    from splatpilot.analysis.reconstruction import measure_scene
+    from splatpilot.systems.configuration import load_config
+    from splatpilot.training.captures.read_capture import read_capture
+    from splatpilot.training.reconstruction import reconstruct
+    from splatpilot.training.reconstruction.config import ReconstructConfig
 
     config = load_config(ReconstructConfig(), overrides=options.overrides)
     if options.iterations is not None:

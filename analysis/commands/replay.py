@@ -1,4 +1,4 @@
-"""`flysplat replay`."""
+"""`splatpilot replay`."""
 
 import argparse
 import logging
@@ -8,7 +8,7 @@ from pathlib import Path
 def add_to(verbs: argparse._SubParsersAction) -> None:
     replay = verbs.add_parser("replay", help="fly one flight of a study again, and check it")
     replay.set_defaults(verb=_replay)
-    replay.add_argument("study", type=Path, help="folder that `flysplat benchmark` has written")
+    replay.add_argument("study", type=Path, help="folder that `splatpilot benchmark` has written")
     replay.add_argument("id", help="of the flight, as in rollouts.csv")
     replay.add_argument("--meshcat", action="store_true", help="write flight.html, in Meshcat")
     replay.add_argument("--video", action="store_true", help="write flight.mp4, the onboard view")
@@ -16,7 +16,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _replay(options: argparse.Namespace) -> None:
-    from flysplat.analysis import replay
+    from splatpilot.analysis.benchmark import replay
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     replay.run(

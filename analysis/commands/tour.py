@@ -1,10 +1,10 @@
-"""`flysplat tour`."""
+"""`splatpilot tour`."""
 
 import argparse
 import logging
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -23,9 +23,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _tour(options: argparse.Namespace) -> None:
-    from flysplat.analysis import tour
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.diagrams.scenario_files import benchmark_scenarios
+    from splatpilot.analysis import tour
+    from splatpilot.diagrams.scenario_files import benchmark_scenarios
+    from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     config = tour.TourConfig()

@@ -1,9 +1,9 @@
-"""`flysplat train`."""
+"""`splatpilot train`."""
 
 import argparse
 from pathlib import Path
 
-from flysplat.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -28,12 +28,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from flysplat.analysis import benchmark
-    from flysplat.analysis.study import StudyConfig
-    from flysplat.diagrams.configuration import load_config
-    from flysplat.diagrams.scenario_files import scenario_file
-    from flysplat.training.policies.registry import RECIPES
-    from flysplat.training.policies.train import run
+    from splatpilot.analysis.benchmark import run as benchmark
+    from splatpilot.analysis.benchmark.study import StudyConfig
+    from splatpilot.diagrams.scenario_files import scenario_file
+    from splatpilot.systems.configuration import load_config
+    from splatpilot.training.policies.registry import RECIPES
+    from splatpilot.training.policies.train import run
 
     scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
     for name in scenarios:

@@ -1,7 +1,7 @@
 """Drake's bodies in a forest of Gaussians: a ball and a box, thrown across the view, bounce between
 the trunks.
 
-    python -m flysplat.diagrams.examples.splat_background --out out/splat_background
+    python -m splatpilot.diagrams.examples.splat_background --out out/splat_background
 
 Nothing here but `SplatRenderEngine` is particular to splats: a MultibodyPlant, a SceneGraph and
 an RgbdSensor that names the renderer.
@@ -35,13 +35,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
-from flysplat.diagrams.worlds.forest import make_forest
-from flysplat.diagrams.worlds.forest_config import ForestConfig
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.splat_render_engine import SplatRenderEngine
-from flysplat.systems.visualization.video_recorder import colorize_depth
+from splatpilot.diagrams.worlds.forest.config import ForestConfig
+from splatpilot.diagrams.worlds.forest.forest import make_forest
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
+from splatpilot.systems.visualization.video_recorder import colorize_depth
 
 RADIUS = 0.35  # [m] of the ball, and half the edge of the box
 MAX_DEPTH = 20.0  # [m]

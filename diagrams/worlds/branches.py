@@ -4,18 +4,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.feasibility import CLEARANCE, TRIES, is_feasible
-from flysplat.diagrams.worlds.fittings import check_count, check_range, clear_of
-from flysplat.diagrams.worlds.forest import Forest
-from flysplat.diagrams.worlds.forest_config import TrunksConfig
-from flysplat.diagrams.worlds.forest_layout import BARK
-from flysplat.diagrams.worlds.solid import Solid
-from flysplat.diagrams.worlds.solid_surfels import draw
-from flysplat.diagrams.worlds.surfaces import merged
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.shapes import Capsule
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.diagrams.worlds.feasibility import CLEARANCE, TRIES, is_feasible
+from splatpilot.diagrams.worlds.fittings import check_count, check_range, clear_of
+from splatpilot.diagrams.worlds.forest.config import TrunksConfig
+from splatpilot.diagrams.worlds.forest.forest import Forest
+from splatpilot.diagrams.worlds.forest.layout import BARK
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.shapes import Capsule
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
 @dataclass

@@ -6,9 +6,8 @@ import numpy as np
 from pydrake.math import RollPitchYaw, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.feasibility import drawn
-from flysplat.diagrams.worlds.fittings import (
+from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.fittings import (
     check_count,
     check_positive,
     check_range,
@@ -19,9 +18,10 @@ from flysplat.diagrams.worlds.fittings import (
     trees_around,
     turned_box,
 )
-from flysplat.diagrams.worlds.plot import Plot
-from flysplat.diagrams.worlds.solid import Solid
-from flysplat.systems.collision.shapes import Sphere
+from splatpilot.diagrams.worlds.plot import Plot
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.systems.collision.shapes import Sphere
 
 _OPEN = 1.0
 """[m], least distance of obstacles from start and goal."""

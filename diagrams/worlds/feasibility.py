@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.systems.collision.distance_field import DistanceField
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
 """[m], least distance of start and goal from everything, the bounds included."""

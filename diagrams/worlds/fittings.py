@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.diagrams.worlds import forest_surroundings
-from flysplat.diagrams.worlds.illumination import Illumination, Lamplight, Sunlight
-from flysplat.diagrams.worlds.light import Daylight
-from flysplat.diagrams.worlds.patterns import SIGN
-from flysplat.diagrams.worlds.plot import Plot
-from flysplat.diagrams.worlds.solid import Solid
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.shapes import Box, HalfSpace, Shape
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.diagrams.worlds.forest import surroundings as forest_surroundings
+from splatpilot.diagrams.worlds.plot import Plot
+from splatpilot.diagrams.worlds.solids.illumination import Illumination, Lamplight, Sunlight
+from splatpilot.diagrams.worlds.solids.light import Daylight
+from splatpilot.diagrams.worlds.solids.patterns import SIGN
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 WALL = 0.3
 """[m], thickness of walls."""

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.solid_mesh import Mesh, mesh_of, mesh_of_gaussians
-from flysplat.diagrams.worlds.surfaces import merged
-from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from flysplat.systems.files import written_atomically
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.mesh import Mesh, mesh_of, mesh_of_gaussians
+from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.files import written_atomically
 
 _FLOAT, _UINT = 5126, 5125  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
@@ -46,7 +46,7 @@ def write_gltf(blueprint: Blueprint, path: Path, texel: float = 0.02) -> None:
 def _document(meshes: list[Mesh]) -> dict[str, Any]:
     """The meshes as a glTF 2.0 document with everything embedded."""
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "flysplat"},
+        "asset": {"version": "2.0", "generator": "splatpilot"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "samplers": [

@@ -7,20 +7,20 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.feasibility import TRIES
-from flysplat.diagrams.worlds.fittings import check_range
-from flysplat.diagrams.worlds.illumination import Lamplight
-from flysplat.diagrams.worlds.scene import SceneSource, read_scene_world
-from flysplat.diagrams.worlds.solid import Solid, faces_of
-from flysplat.diagrams.worlds.solid_surfels import draw
-from flysplat.diagrams.worlds.start_and_goal import draw_start_and_goal
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.shapes import Box, Capsule, Shape, Sphere
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.feasibility import TRIES
+from splatpilot.diagrams.worlds.fittings import check_range
+from splatpilot.diagrams.worlds.scene import SceneSource, read_scene_world
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.illumination import Lamplight
+from splatpilot.diagrams.worlds.solids.solid import Solid, faces_of
+from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.shapes import Box, Capsule, Shape, Sphere
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 GAP = 1.3 * 2 * VEHICLE_RADIUS
 """[m], least width of a gap."""

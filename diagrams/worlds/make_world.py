@@ -1,19 +1,19 @@
 """From a scenario's `world` field to the world."""
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.branches import Branches, BranchesConfig
-from flysplat.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
-from flysplat.diagrams.worlds.forest import Forest, ForestConfig
-from flysplat.diagrams.worlds.inserted import InsertedConfig, inserted_world
-from flysplat.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
-from flysplat.diagrams.worlds.over_under import OverUnderConfig, over_under_blueprint
-from flysplat.diagrams.worlds.room import RoomConfig, room_blueprint
-from flysplat.diagrams.worlds.scene import SceneConfig, read_scene_world
-from flysplat.diagrams.worlds.solid_surfels import draw
-from flysplat.diagrams.worlds.surfaces import merged
-from flysplat.diagrams.worlds.walls import WallsConfig, walls_blueprint
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.diagrams.worlds.branches import Branches, BranchesConfig
+from splatpilot.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
+from splatpilot.diagrams.worlds.forest.forest import Forest, ForestConfig
+from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
+from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
+from splatpilot.diagrams.worlds.over_under import OverUnderConfig, over_under_blueprint
+from splatpilot.diagrams.worlds.room import RoomConfig, room_blueprint
+from splatpilot.diagrams.worlds.scene import SceneConfig, read_scene_world
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.diagrams.worlds.walls import WallsConfig, walls_blueprint
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 
 ProceduralConfig = (
     ForestConfig | BranchesConfig | ClutterConfig | WallsConfig | RoomConfig | OverUnderConfig

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
-from flysplat.diagrams.worlds.light import Daylight
-from flysplat.diagrams.worlds.scene import SceneSource, find_scene
-from flysplat.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
-from flysplat.diagrams.worlds.surfaces import COVERAGE, Surfels, colored, perpendicular
-from flysplat.diagrams.worlds.textures import fbm, hash_unit, ramp
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.octomap import esdf_from_octomap
-from flysplat.systems.splats.gaussian_scene import GaussianScene
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
+from splatpilot.diagrams.worlds.solids.light import Daylight
+from splatpilot.diagrams.worlds.solids.surfaces import COVERAGE, Surfels, colored, perpendicular
+from splatpilot.diagrams.worlds.solids.textures import fbm, hash_unit, ramp
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.octomap import esdf_from_octomap
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 
 @dataclass

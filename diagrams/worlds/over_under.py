@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.feasibility import drawn
-from flysplat.diagrams.worlds.fittings import (
+from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.fittings import (
     INSET,
     WALL,
     box,
@@ -18,7 +17,8 @@ from flysplat.diagrams.worlds.fittings import (
     signs_on,
     start_and_goal,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 _MATERIALS = ["brick", "concrete", "hazard", "wood", "metal"]
 

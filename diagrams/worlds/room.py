@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.feasibility import CLEARANCE, drawn
-from flysplat.diagrams.worlds.fittings import (
+from splatpilot.diagrams.worlds.feasibility import CLEARANCE, drawn
+from splatpilot.diagrams.worlds.fittings import (
     check_count,
     check_positive,
     clear_of,
@@ -21,8 +20,9 @@ from flysplat.diagrams.worlds.fittings import (
     start_and_goal,
     turned_box,
 )
-from flysplat.diagrams.worlds.solid import Solid
-from flysplat.systems.collision.shapes import Capsule, Cylinder, Sphere
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.systems.collision.shapes import Capsule, Cylinder, Sphere
 
 
 @dataclass

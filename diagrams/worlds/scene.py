@@ -4,12 +4,12 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flysplat.diagrams.worlds.scene_folder import read_scene
-from flysplat.diagrams.worlds.start_and_goal import draw_start_and_goal
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.scene_folder import read_scene
+from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
-SCENES = "FLYSPLAT_SCENES"
+SCENES = "SPLATPILOT_SCENES"
 """Environment variable that names the folder of scenes."""
 
 
@@ -18,7 +18,7 @@ class SceneSource:
     """A place on disk."""
 
     # A scene folder, or a PLY file of Gaussians; one that is not there is looked for in the folder
-    # that the environment variable FLYSPLAT_SCENES names, or in `scenes`.
+    # that the environment variable SPLATPILOT_SCENES names, or in `scenes`.
     path: str = ""
     # How to get the scene: what the error says if it is not there.
     source: str = ""
@@ -54,7 +54,7 @@ def find_scene(config: SceneSource) -> Path:
     raise FileNotFoundError(
         f"{config.path}: there is no such scene, neither here nor in {folder} (the environment "
         f"variable {SCENES} names that folder); "
-        + (config.source or "reconstruct one with `flysplat reconstruct`").strip()
+        + (config.source or "reconstruct one with `splatpilot reconstruct`").strip()
     )
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
-from flysplat.diagrams.worlds.start_and_goal import choose_start_and_goal
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_build import esdf_from_gaussians
-from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.systems.splats.gaussian_ply import read_ply, write_ply
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 FORMAT_VERSION = 1
 WORLD_FRAME = "z up"
@@ -70,7 +70,7 @@ class SceneMetadata:
     """[px], to which images were scaled down for the making; 0 if they were not."""
     perturbation_bound: float | None = None
     """[m], how far from the poses of the capture images of the scene can be trusted, as
-    `flysplat fidelity` measured it; None before."""
+    `splatpilot fidelity` measured it; None before."""
     pose_perturbation_bounds: list[float] = field(default_factory=list)
     """[m], the same for each pose of the capture, in frame order; empty before."""
 
@@ -97,7 +97,7 @@ def read_scene_folder(path: str | Path) -> World:
         if not file.exists():
             raise FileNotFoundError(
                 f"{file}: does not exist; a scene is a folder with gaussians.ply, esdf.npz and "
-                "scene.yaml, as `flysplat reconstruct` writes it"
+                "scene.yaml, as `splatpilot reconstruct` writes it"
             )
     metadata = read_scene_metadata(path)
     if not metadata.metric:
@@ -168,7 +168,7 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
         raise ValueError(
             f"{file}: perturbation_bound is {metadata.perturbation_bound} and "
             f"pose_perturbation_bounds {metadata.pose_perturbation_bounds}; finite lengths [m] of "
-            "at least 0 are needed, run `flysplat fidelity` again"
+            "at least 0 are needed, run `splatpilot fidelity` again"
         )
     return metadata
 

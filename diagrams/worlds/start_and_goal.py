@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from flysplat.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf import Esdf
 
 _MAX_NODES = 250_000
 

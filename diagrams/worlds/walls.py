@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.feasibility import drawn
-from flysplat.diagrams.worlds.fittings import (
+from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.fittings import (
     INSET,
     WALL,
     box,
@@ -19,9 +18,10 @@ from flysplat.diagrams.worlds.fittings import (
     start_and_goal,
     trees_around,
 )
-from flysplat.diagrams.worlds.plot import Plot
-from flysplat.diagrams.worlds.solid import Solid
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.plot import Plot
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"
 

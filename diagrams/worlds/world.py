@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flysplat.systems.collision.distance_field import DistanceField
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flysplat.systems.collision.distance_field import FieldSample, FieldState
-from flysplat.systems.collision.shapes import Shape, as_point
+from splatpilot.systems.collision.distance_field import FieldSample, FieldState
+from splatpilot.systems.collision.shapes import Shape, as_point
 
 
 class AnalyticDistanceField:

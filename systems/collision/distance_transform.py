@@ -6,7 +6,7 @@ import edt
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from flysplat.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.distance_field import FieldState
 
 
 def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flysplat.systems.collision.distance_field import FieldSample, FieldState
-from flysplat.systems.collision.distance_transform import conservative_distances
-from flysplat.systems.collision.esdf_file import read_esdf_arrays, write_esdf_arrays
-from flysplat.systems.collision.trilinear import (
+from splatpilot.systems.collision.distance_field import FieldSample, FieldState
+from splatpilot.systems.collision.distance_transform import conservative_distances
+from splatpilot.systems.collision.esdf_file import read_esdf_arrays, write_esdf_arrays
+from splatpilot.systems.collision.trilinear import (
     corner_offsets,
     grid_strides,
     trilinear,

@@ -7,9 +7,9 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, ValueProducer
 
-from flysplat.systems.collision.distance_field import DistanceField
-from flysplat.systems.collision.soft_barrier import in_collision, soft_barrier
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.soft_barrier import in_collision, soft_barrier
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 
 class EsdfCollision(LeafSystem):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flysplat.systems.files import written_atomically
+from splatpilot.systems.files import written_atomically
 
 FORMAT_VERSION = 1
 

@@ -6,8 +6,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_from_occupancy import esdf_from_occupancy, grid_shape
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy, grid_shape
 
 # Voxels along the edge of a block, the unit in which what a camera cannot see is skipped.
 _BLOCK = 8

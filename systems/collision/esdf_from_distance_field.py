@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from flysplat.systems.collision.distance_field import DistanceField
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_from_occupancy import grid_shape
+from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 
 
 def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:

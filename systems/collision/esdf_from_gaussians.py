@@ -4,9 +4,9 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from tqdm import tqdm
 
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_from_occupancy import esdf_from_occupancy, grid_shape
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy, grid_shape
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 # Standard deviations beyond which a Gaussian counts as zero.
 _SUPPORT = 3.5

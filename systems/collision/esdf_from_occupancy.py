@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.distance_transform import distances_from_band, occupancy_distances
-from flysplat.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.distance_transform import distances_from_band, occupancy_distances
+from splatpilot.systems.collision.esdf import Esdf
 
 # Voxels a field may have: its arrays and those of its construction stay below about 8 GB.
 MAX_VOXELS = 250_000_000

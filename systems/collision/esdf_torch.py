@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.trilinear import (
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.trilinear import (
     corner_offsets,
     grid_strides,
     trilinear,

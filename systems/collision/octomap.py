@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_from_occupancy import MAX_VOXELS, esdf_from_occupancy
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_occupancy import MAX_VOXELS, esdf_from_occupancy
 
 _DEPTH = 16  # levels of children below the root
 _FREE, _OCCUPIED, _INNER = 1, 2, 3  # the two bits of a child

@@ -8,7 +8,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies.agile_policy import (
+from splatpilot.systems.policies.agile_autonomy_inference import (
     AGILE_NETWORK,
     FARTHEST,
     FOV_X,
@@ -18,10 +18,10 @@ from flysplat.systems.policies.agile_policy import (
     load_network,
     plan,
 )
-from flysplat.systems.policies.depth_policy_config import DepthPolicyConfig
-from flysplat.systems.policies.hypotheses import Hypotheses, unplanned
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
+from splatpilot.systems.policies.hypotheses import Hypotheses, unplanned
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
@@ -57,7 +57,8 @@ class AgileAutonomy(LeafSystem):
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; a discrete state, NaN before the first update.
 
-    Updates at 15 Hz from time 0 by :func:`~flysplat.systems.policies.agile_policy.plan`.
+    Updates at 15 Hz from time 0 by
+    :func:`~splatpilot.systems.policies.agile_autonomy_inference.plan`.
 
     Raises:
         ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights

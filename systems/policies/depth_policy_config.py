@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from flysplat.systems.policies.agile_policy import TrajectoryNetworkSpec
-from flysplat.systems.policies.observation import require_poolable
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.recurrent_network import NetworkSpec
+from splatpilot.systems.policies.agile_autonomy_inference import TrajectoryNetworkSpec
+from splatpilot.systems.policies.observation import require_poolable
+from splatpilot.systems.policies.recurrent_network import NetworkSpec
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 
 @dataclass
@@ -20,7 +20,7 @@ class DepthPolicyConfig:
 
     # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
     speed: float = 2.0
-    # File of weights, as `flysplat train` writes them; those that ship where left empty.
+    # File of weights, as `splatpilot train` writes them; those that ship where left empty.
     weights: str = ""
     # What it sees through: its pixels are pooled to the network's, so give multiples of these.
     camera: OnboardCamera = field(default_factory=OnboardCamera)

@@ -8,8 +8,8 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies.depth_policy_config import DepthPolicyConfig
-from flysplat.systems.policies.depthnav_policy import (
+from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
+from splatpilot.systems.policies.depthnav_inference import (
     DEPTHNAV_NETWORK,
     FARTHEST,
     FOV_X,
@@ -18,9 +18,9 @@ from flysplat.systems.policies.depthnav_policy import (
     decide,
     yaw_of,
 )
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.recurrent_network import load_network
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.policies.recurrent_network import load_network
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
@@ -57,9 +57,10 @@ class DepthNav(LeafSystem):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded; zero before the first update.
     - ``heading`` (1): where body x should point, seen from above [rad] from world x; NaN before.
 
-    Updates at 25 Hz from time 0 by :func:`~flysplat.systems.policies.depthnav_policy.decide`. The
-    discrete state holds the acceleration, the heading, the yaw of the start frame (NaN before the
-    first update) and the network's memory.
+    Updates at 25 Hz from time 0 by
+    :func:`~splatpilot.systems.policies.depthnav_inference.decide`. The discrete state
+    holds the acceleration, the heading, the yaw of the start frame (NaN before the first update)
+    and the network's memory.
 
     Raises:
         ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights

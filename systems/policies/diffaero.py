@@ -8,11 +8,11 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies.depth_policy_config import DepthPolicyConfig
-from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK, FOV_X, RATE, decide
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.recurrent_network import load_network
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, FOV_X, RATE, decide
+from splatpilot.systems.policies.recurrent_network import load_network
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
@@ -45,8 +45,9 @@ class DiffAero(LeafSystem):
     - ``depth_image_32f``: planar depth [m] of the camera ``config.camera``.
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded; zero before the first update.
 
-    Updates at 15 Hz from time 0 by :func:`~flysplat.systems.policies.diffaero_policy.decide`. The
-    discrete state holds the acceleration and the network's memory.
+    Updates at 15 Hz from time 0 by
+    :func:`~splatpilot.systems.policies.diffaero_inference.decide`. The discrete state
+    holds the acceleration and the network's memory.
 
     Raises:
         ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from flysplat.systems.policies.hypotheses import (
+from splatpilot.systems.policies.hypotheses import (
     NUM_WAYPOINTS,
     WAYPOINT_PERIOD,
     Hypotheses,

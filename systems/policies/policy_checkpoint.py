@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flysplat.systems.files import written_atomically
+from splatpilot.systems.files import written_atomically
 
 FORMAT = 1
 """Of the file; observations and commands that mean something else make another number."""
@@ -52,7 +52,7 @@ class PolicyCheckpoint:
             ValueError: if it is damaged, or of another policy, version or architecture.
         """
         path = Path(path) if path else _SHIPPED / f"{policy}.npz"
-        remedy = f"train them with: flysplat train {policy} --out DIR"
+        remedy = f"train them with: splatpilot train {policy} --out DIR"
         about, weights = _read(path, remedy)
         found_format, found_policy = about["format"], about["policy"]
         found_spec, provenance = about["spec"], about["provenance"]
@@ -81,7 +81,7 @@ def policy_of(path: str | Path) -> str:
         FileNotFoundError: if there is no such file.
         ValueError: if it holds no weights.
     """
-    return _read(Path(path), "train some with: flysplat train POLICY --out DIR")[0]["policy"]
+    return _read(Path(path), "train some with: splatpilot train POLICY --out DIR")[0]["policy"]
 
 
 def _read(path: Path, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

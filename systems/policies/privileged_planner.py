@@ -8,12 +8,12 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
 
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
-from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
-from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 _STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
 

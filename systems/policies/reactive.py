@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies.reactive_planner import (
+from splatpilot.systems.policies.reactive_planner import (
     ReactiveConfig,
     candidate_costs,
     candidate_velocities,
@@ -15,8 +15,8 @@ from flysplat.systems.policies.reactive_planner import (
     nearest_points,
     responses,
 )
-from flysplat.systems.policies.velocity_tracking import approach_velocity, tracking_acceleration
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.policies.velocity_tracking import approach_velocity, tracking_acceleration
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
 class Reactive(LeafSystem):

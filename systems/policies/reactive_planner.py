@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import KDTree
 
-from flysplat.systems.collision.soft_barrier import soft_barrier
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.trajectory_lattice import rotation_to
-from flysplat.systems.policies.velocity_tracking import RESPONSE_TIME
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.soft_barrier import soft_barrier
+from splatpilot.systems.policies.trajectory_lattice import rotation_to
+from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 _REACH = 1.5  # [m] Points farther than this from a trajectory cost nothing.
 _SAMPLE_PERIOD = 0.25  # [s]

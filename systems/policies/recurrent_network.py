@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flysplat.systems.policies.convolutions import (
+from splatpilot.systems.policies.convolutions import (
     Convolutions,
     Layer,
     convolution_shapes,
     layer_sizes,
     rectified,
 )
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from flysplat.systems.policies.velocity_tracking import (
+from splatpilot.systems.policies.velocity_tracking import (
     approach_velocity,
     tracking_acceleration,
 )

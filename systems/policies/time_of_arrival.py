@@ -16,15 +16,15 @@ import numpy as np
 import skfmm
 from scipy.ndimage import distance_transform_edt
 
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.soft_barrier import soft_barrier
-from flysplat.systems.collision.trilinear import (
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.soft_barrier import soft_barrier
+from splatpilot.systems.collision.trilinear import (
     corner_offsets,
     grid_strides,
     trilinear,
     trilinear_with_gradient,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 OPEN_CLEARANCE = 0.6
 """Clearance [m] from which on the vehicle may fly at full speed."""

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flysplat.systems.collision.distance_field import DistanceField
-from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
-from flysplat.systems.policies.time_of_arrival import TimeOfArrival, slowness
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, slowness
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 _LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near a goal that is not in direct reach
 

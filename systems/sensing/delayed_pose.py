@@ -7,8 +7,8 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
-from flysplat.systems.weakly import weakly
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.weakly import weakly
 
 
 class DelayedPose(LeafSystem):

@@ -7,13 +7,13 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.sensing.observation_noise import (
+from splatpilot.systems.sensing.observation_noise import (
     ObservationNoise,
     image_generator,
     noisy_depth,
 )
-from flysplat.systems.weakly import weakly
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.weakly import weakly
 
 
 class DepthNoise(LeafSystem):

@@ -7,19 +7,19 @@ nothing else here does.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flysplat.systems.splats.rasterization import rasterize
-    from flysplat.systems.splats.surfels import rasterize_surfels
+    from splatpilot.systems.splats.rasterization import rasterize
+    from splatpilot.systems.splats.surfels import rasterize_surfels
 
 __all__ = ["rasterize", "rasterize_surfels"]
 
 
 def __getattr__(name: str) -> Any:
     if name == "rasterize":
-        from flysplat.systems.splats.rasterization import rasterize
+        from splatpilot.systems.splats.rasterization import rasterize
 
         return rasterize
     if name == "rasterize_surfels":
-        from flysplat.systems.splats.surfels import rasterize_surfels
+        from splatpilot.systems.splats.surfels import rasterize_surfels
 
         return rasterize_surfels
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

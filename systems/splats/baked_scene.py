@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from flysplat import _native
+from splatpilot import _native
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pydrake.math import RigidTransform
 
-    from flysplat.systems.splats.gaussian_scene import GaussianScene
+    from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gsplat
 
@@ -27,15 +27,15 @@ class RenderedView(NamedTuple):
 def create_renderer(threads: int, simd: str = "") -> _native.Renderer:
     """The native threads and scratch memory.
 
-    `simd` (default: the environment variable FLYSPLAT_SIMD, else the widest that the machine has)
-    is one of `flysplat._native.simd_levels()`.
+    `simd` (default: the environment variable SPLATPILOT_SIMD, else the widest that the machine has)
+    is one of `splatpilot._native.simd_levels()`.
 
     Raises:
         ValueError: `threads` is not a positive integer, or this machine lacks the SIMD level.
     """
     if not 1 <= int(threads) <= 1024:
         raise ValueError(f"threads is {threads}; it must lie between 1 and 1024")
-    return _native.Renderer(int(threads), simd or os.environ.get("FLYSPLAT_SIMD", ""))
+    return _native.Renderer(int(threads), simd or os.environ.get("SPLATPILOT_SIMD", ""))
 
 
 def check_camera(K: "ArrayLike", width: int, height: int, near: float, far: float) -> np.ndarray:

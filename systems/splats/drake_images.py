@@ -6,7 +6,7 @@ from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
-from flysplat.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 
 # Below one half, more of the light along a ray comes from behind the surface than from it: no depth
 # to speak of.

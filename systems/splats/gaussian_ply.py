@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyParseError
 
-from flysplat.systems.files import written_atomically
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.files import written_atomically
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 _NORMALS = ["nx", "ny", "nz"]
 _MEANS = ["x", "y", "z"]

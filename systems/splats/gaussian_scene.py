@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.systems.splats.spherical_harmonics import C0, degree_of, rotation_matrices
+from splatpilot.systems.splats.spherical_harmonics import C0, degree_of, rotation_matrices
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flysplat import _native
-from flysplat.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
-from flysplat.systems.splats.rasterization_autograd import (
+from splatpilot import _native
+from splatpilot.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
+from splatpilot.systems.splats.rasterization_autograd import (
     Composite,
     Project,
     Views,
     joined,
     to_numpy,
 )
-from flysplat.systems.splats.rasterization_checks import (
+from splatpilot.systems.splats.rasterization_checks import (
     CHANNELS,
     by_name,
     check_device,
@@ -27,7 +27,7 @@ from flysplat.systems.splats.rasterization_checks import (
     import_gsplat,
     pair_meta,
 )
-from flysplat.systems.splats.rasterization_unscented import (
+from splatpilot.systems.splats.rasterization_unscented import (
     RADIAL_COUNTS,
     camera_projections,
     check_camera_model,

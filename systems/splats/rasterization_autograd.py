@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from flysplat import _native
+from splatpilot import _native
 
 SPLAT_GRADIENT = (
     16  # floats a splat: mean 2, |mean| 2, ln opacity, shape 3, colour 3, depth; 4 idle

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flysplat import _native
+from splatpilot import _native
 
 TILE_SIZE = 16  # [px]
 CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
@@ -137,7 +137,7 @@ def import_gsplat() -> ModuleType:
     except ImportError as error:
         raise ImportError(
             "rendering CUDA tensors needs gsplat, which is not installed: "
-            "pip install 'flysplat[cuda]', or move the tensors to the CPU"
+            "pip install 'splatpilot[cuda]', or move the tensors to the CPU"
         ) from error
     return gsplat
 

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from flysplat import _native
-from flysplat.systems.splats.camera_models import (
+from splatpilot import _native
+from splatpilot.systems.splats.camera_models import (
     Projection,
     project_fisheye,
     project_opencv,
     unscented_projection,
 )
-from flysplat.systems.splats.rasterization_autograd import (
+from splatpilot.systems.splats.rasterization_autograd import (
     SPLAT_GRADIENT,
     Composite,
     Views,
     to_numpy,
 )
-from flysplat.systems.splats.spherical_harmonics import sh_basis_functions
+from splatpilot.systems.splats.spherical_harmonics import sh_basis_functions
 
 CAMERA_MODELS = ("pinhole", "fisheye")
 RADIAL_COUNTS = {"pinhole": (2, 3, 6), "fisheye": (4,)}

@@ -14,14 +14,14 @@ from pydrake.systems.sensors import (
     ImageRgba8U,
 )
 
-from flysplat.systems.splats.baked_scene import BakedScene, RenderedView
-from flysplat.systems.splats.drake_images import (
+from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.drake_images import (
     color_pixels,
     ranged_depth,
     render_view,
     surface_labels,
 )
-from flysplat.systems.weakly import weakly
+from splatpilot.systems.weakly import weakly
 
 
 class SplatCamera(LeafSystem):

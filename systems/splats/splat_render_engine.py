@@ -28,8 +28,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
-from flysplat.systems.splats.baked_scene import BakedScene, RenderedView
-from flysplat.systems.splats.drake_images import (
+from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.drake_images import (
     color_pixels,
     ranged_depth,
     render_view,

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flysplat import _native
-from flysplat.systems.splats.baked_scene import check_camera, create_renderer
-from flysplat.systems.splats.depth_normals import depth_to_normals
-from flysplat.systems.splats.rasterization_autograd import joined
-from flysplat.systems.splats.rasterization_checks import (
+from splatpilot import _native
+from splatpilot.systems.splats.baked_scene import check_camera, create_renderer
+from splatpilot.systems.splats.depth_normals import depth_to_normals
+from splatpilot.systems.splats.rasterization_autograd import joined
+from splatpilot.systems.splats.rasterization_checks import (
     by_name,
     check_device,
     check_render_mode,

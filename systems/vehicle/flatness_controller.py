@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from flysplat.systems.vehicle.flatness import (
+from splatpilot.systems.vehicle.flatness import (
     attitude_error,
     attitude_from_thrust,
     limit_norm,
@@ -14,8 +14,8 @@ from flysplat.systems.vehicle.flatness import (
     reaching_acceleration,
     thrust_for_acceleration,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
 @dataclass
@@ -121,7 +121,7 @@ class FlatnessController(LeafSystem):
 
     where tilt and yaw turn the body so that z lies along f_W and x to the heading or along the
     motion: towards the waypoint, or along v_WB when an acceleration is flown. See
-    :mod:`~flysplat.systems.vehicle.flatness`.
+    :mod:`~splatpilot.systems.vehicle.flatness`.
 
     Raises:
         ValueError: from the constructor on a config or parameter out of range; from an update if

@@ -10,7 +10,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from flysplat.systems.vehicle.quadrotor_dynamics import (
+from splatpilot.systems.vehicle.quadrotor_dynamics import (
     QuadrotorParams,
     component_derivatives,
     hover_state,
@@ -37,7 +37,7 @@ def QuadrotorPlant_(T):
         - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
 
         The equations are those of
-        :func:`~flysplat.systems.vehicle.quadrotor_dynamics.quadrotor_derivatives`. Supports the
+        :func:`~splatpilot.systems.vehicle.quadrotor_dynamics.quadrotor_derivatives`. Supports the
         scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s without error
         control: after 5 s of new random commands every 0.02 s, ``runge_kutta3`` is within 2 cm of
         the solution and ``runge_kutta5``, at twice the cost, within 0.2 mm.

@@ -8,7 +8,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
-from flysplat.systems.weakly import weakly
+from splatpilot.systems.weakly import weakly
 
 
 def pose_from_state(state: np.ndarray) -> RigidTransform:

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
-from flysplat.systems.visualization.flipbook import page_path, show_page
+from splatpilot.systems.visualization.flipbook import page_path, show_page
 
 
 class CameraVisualizer(LeafSystem):
@@ -38,7 +38,7 @@ class CameraVisualizer(LeafSystem):
         period: float = 1 / 15,
         stride: int = 3,
         depth: float = 0.6,
-        path: str = "/flysplat/vehicle/camera",
+        path: str = "/splatpilot/vehicle/camera",
     ):
         """
         Args:

@@ -5,8 +5,8 @@ from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.perception import BaseField, Fields, PointCloud
 
-from flysplat.systems.collision.distance_field import DistanceField, FieldState
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.collision.distance_field import DistanceField, FieldState
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
 def draw_gaussians(

@@ -5,9 +5,9 @@ from pydrake.geometry import Meshcat, Rgba
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
-from flysplat.systems.policies.hypotheses import Hypotheses, hypotheses_size
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
-from flysplat.systems.visualization.flipbook import page_path, show_page
+from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.visualization.flipbook import page_path, show_page
 
 
 class FlightVisualizer(LeafSystem):
@@ -31,7 +31,7 @@ class FlightVisualizer(LeafSystem):
         meshcat: Meshcat,
         num_hypotheses: int,
         period: float = 1 / 15,
-        path: str = "/flysplat",
+        path: str = "/splatpilot",
     ):
         """
         Args:

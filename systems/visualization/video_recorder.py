@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem
 from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
 from tqdm import tqdm
 
-from flysplat.systems.files import written_atomically
+from splatpilot.systems.files import written_atomically
 
 
 class VideoRecorder(LeafSystem):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.analysis import ablation, measure_scene
-from flysplat.analysis.study import StudyConfig
-from flysplat.diagrams.worlds.scene_folder import write_scene_folder
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.esdf_build import esdf_from_occupancy
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.gaussian_scene import GaussianScene
-from flysplat.training.captures.capture import Capture, SfmPoints
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.reconstruction import ablation, measure_scene
+from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.captures.capture import Capture, SfmPoints
 
 WIDTH, HEIGHT = 64, 48
 K = np.array([[32.0, 0, 32], [0, 32.0, 24], [0, 0, 1]])
@@ -106,7 +106,7 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
 
     for module in (measure_scene, ablation):
         monkeypatch.setattr(module, "read_capture", read_capture)
-    monkeypatch.delenv("FLYSPLAT_DATA", raising=False)
+    monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
     return Place(gaussians, capture, tmp_path)
 
 

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from flysplat.analysis.cli import main
-from flysplat.diagrams.configuration import load_config
-from flysplat.diagrams.scenario import Scenario
-from flysplat.systems.policies.straight import StraightConfig
-from flysplat.systems.splats.gaussian_ply import write_ply
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.analysis.cli import main
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies.straight import StraightConfig
+from splatpilot.systems.splats.gaussian_ply import write_ply
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 SHORT = ["--set", "world.length=10", "--set", "world.width=6", "--set", "timeout=15"]
 
@@ -74,7 +74,7 @@ def fails(arguments: list[str], capsys) -> str:
     """The one message with which a command that must fail fails."""
     assert main(arguments) == 1
     error = capsys.readouterr().err
-    assert error.startswith("flysplat: ")
+    assert error.startswith("splatpilot: ")
     assert "Traceback" not in error
     return error
 
@@ -159,12 +159,12 @@ def test_reconstruct_without_capture_is_refused(tmp_path, capsys):
     assert not (tmp_path / "scene").exists()
 
 
-@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_flight_through_a_real_capture(tmp_path):
     """TartanAir's hospital, reconstructed without optimisation, is flown for at least 6 m to the
     goal without touching anything.
     """
-    capture = Path(os.environ["FLYSPLAT_DATA"]) / "tartanair" / "hospital"
+    capture = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"
     scene, out = tmp_path / "hospital", tmp_path / "flight"
     assert main(["reconstruct", str(capture), "--out", str(scene), "--iterations", "0"]) == 0
     assert main(["fly", "--scene", str(scene), "--out", str(out)]) == 0

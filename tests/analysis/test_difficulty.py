@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from flysplat.analysis.difficulty import (
+from splatpilot.analysis.difficulty import (
     angle_over_length,
     bottleneck,
     difficulty,
@@ -14,11 +14,11 @@ from flysplat.analysis.difficulty import (
     traversability_obstacle,
     view_obstacle,
 )
-from flysplat.analysis.ways import SPACING, path_length, resampled, shortest_path
-from flysplat.diagrams.worlds.feasibility import grid_distances
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.shapes import Box, Capsule
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
+from splatpilot.analysis.path_lengths import SPACING, path_length, resampled, shortest_path
+from splatpilot.diagrams.worlds.feasibility import grid_distances
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.shapes import Box, Capsule
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
 
 LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
 EMPTY = AnalyticDistanceField([], LOWER, UPPER)
@@ -102,7 +102,7 @@ def test_view_obstacle_of_a_wall_ahead():
 
 def test_table_says_what_was_not_run(tmp_path, monkeypatch, capsys):
     """A generated scenario is measured; a scene that is not there is reported as not run."""
-    monkeypatch.setenv("FLYSPLAT_SCENES", str(tmp_path))
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
     small = tmp_path / "small.yaml"
     small.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
     lines = run(scenarios=[str(small), "R13"], seeds=1)

@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from pydrake.math import RigidTransform
 
-from flysplat.analysis.cli import main
-from flysplat.training.captures.render_capture import true_camera
+from splatpilot.analysis.cli import main
+from splatpilot.training.captures.render_capture import true_camera
 
 SMALL = [
     "render.width=64",

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.esdf_build import esdf_from_distance_field
-from flysplat.systems.collision.shapes import Cylinder
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import Cylinder
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
 @pytest.fixture(scope="session")

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
-from flysplat.diagrams.add_policy import POLICIES, policy_named
-from flysplat.diagrams.flight import Outcome, fly
-from flysplat.diagrams.flight_diagram import BuildFlightDiagram
-from flysplat.diagrams.scenario import Scenario
-from flysplat.systems.policies.depthnav import DepthNavConfig
-from flysplat.systems.policies.depthnav_policy import DEPTHNAV_NETWORK
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.diagrams.add_policy import POLICIES, policy_named
+from splatpilot.diagrams.flight import Outcome, fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.policies.depthnav import DepthNavConfig
+from splatpilot.systems.policies.depthnav_inference import DEPTHNAV_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 
 
 @pytest.mark.parametrize(

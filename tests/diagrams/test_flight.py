@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flysplat.diagrams.add_policy import policy_named
-from flysplat.diagrams.flight import Outcome, flight_outcome, fly, sample_initial_state
-from flysplat.diagrams.flight_diagram import BuildFlightDiagram
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.make_world import make_world
-from flysplat.systems.policies.hypotheses import Hypotheses
-from flysplat.systems.sensing.observation_noise import ObservationNoise
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.diagrams.add_policy import policy_named
+from splatpilot.diagrams.flight import Outcome, flight_outcome, fly, sample_initial_state
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 
 
 def test_flies_round_the_post_to_the_goal(post_world):
@@ -139,10 +139,10 @@ def test_start_and_goal_need_room(post_world, field, point, message):
 def test_same_seed_gives_the_same_bits_in_two_processes():
     """Two processes that fly the default scenario for three seconds leave identical samples."""
     script = (
-        "import hashlib; from flysplat.diagrams.scenario import Scenario;"
-        "from flysplat.diagrams.flight import fly;"
-        "from flysplat.diagrams.flight_diagram import BuildFlightDiagram;"
-        "from flysplat.diagrams.worlds.make_world import make_world;"
+        "import hashlib; from splatpilot.diagrams.scenario import Scenario;"
+        "from splatpilot.diagrams.flight import fly;"
+        "from splatpilot.diagrams.flight_diagram import BuildFlightDiagram;"
+        "from splatpilot.diagrams.worlds.make_world import make_world;"
         "s = Scenario(seed=3, timeout=3.0); w = make_world(s.world, s.seed);"
         "f = fly(BuildFlightDiagram(s, w, video=True), s, w);"
         "print(len(f.times), *(hashlib.sha256(a.tobytes()).hexdigest()"
@@ -161,9 +161,9 @@ def test_same_seed_gives_the_same_bits_in_two_processes():
 
 
 def test_flight_path_does_not_import_torch():
-    """What `flysplat fly` imports does not load torch, which would cost every user seconds."""
+    """What `splatpilot fly` imports does not load torch, which would cost every user seconds."""
     script = (
-        "import sys; import flysplat.diagrams.fly, flysplat.analysis.cli;"
+        "import sys; import splatpilot.diagrams.fly, splatpilot.analysis.cli;"
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from flysplat.diagrams.add_policy import policy_named
-from flysplat.diagrams.flight import fly
-from flysplat.diagrams.flight_diagram import BuildFlightDiagram
-from flysplat.diagrams.scenario import Scenario
-from flysplat.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.diagrams.add_policy import policy_named
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
 
 
 def states(world, **noise) -> np.ndarray:

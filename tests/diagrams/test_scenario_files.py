@@ -5,11 +5,11 @@ from typing import get_args
 
 import pytest
 
-from flysplat.diagrams.add_policy import PolicyConfig
-from flysplat.diagrams.configuration import dump_config, load_config, parse_config
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from flysplat.diagrams.worlds.make_world import WorldConfig
+from splatpilot.diagrams.add_policy import PolicyConfig
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
+from splatpilot.diagrams.worlds.make_world import WorldConfig
+from splatpilot.systems.configuration import dump_config, load_config, parse_config
 
 
 def test_names_and_paths_are_found(tmp_path):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flysplat.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import require_writable_folder, written_atomically
 
 
 def test_success_replaces_and_leaves_nothing_else(tmp_path):

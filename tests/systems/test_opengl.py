@@ -2,7 +2,7 @@
 
 import pytest
 
-from flysplat.systems.opengl import require_opengl
+from splatpilot.systems.opengl import require_opengl
 
 
 def test_missing_driver_is_an_error_that_says_what_to_install(opengl, monkeypatch):

@@ -8,8 +8,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from flysplat.diagrams.worlds.start_and_goal import grid_graph
-from flysplat.systems.collision.esdf import Esdf
+from splatpilot.diagrams.worlds.start_and_goal import grid_graph
+from splatpilot.systems.collision.esdf import Esdf
 
 _STEP = 0.05  # [m], of a path while it is smoothed
 _ROUNDING = 0.4  # [m], standard deviation of the smoothing of corners

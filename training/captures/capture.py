@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.registered_depth import registered_depth
+from splatpilot.training.captures.registered_depth import registered_depth
 
 
 @dataclass(frozen=True, eq=False)

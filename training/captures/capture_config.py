@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flysplat.diagrams.configuration import load_config
+from splatpilot.systems.configuration import load_config
 
 CONFIG_FILE = "capture.yaml"
 """Name of the file in a capture's folder that may hold its `CaptureConfig`."""
@@ -61,7 +61,7 @@ class CaptureConfig:
     """What a capture's files leave open; empty and zero fields take what its kind usually has."""
 
     kind: str = ""
-    """One of `flysplat.training.captures.read_capture.KINDS`; empty: told from the files."""
+    """One of `splatpilot.training.captures.read_capture.KINDS`; empty: told from the files."""
     intrinsics: list[float] = field(default_factory=list)
     """fx, fy, cx, cy [px] of the colour camera."""
     depth_intrinsics: list[float] = field(default_factory=list)

@@ -7,17 +7,17 @@ of frames, see `frame_agreement`.
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flysplat.training.captures.capture import Capture
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.frame_agreement import (
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_agreement import (
     Agreement,
     agreement_of,
     choose_pairs,
     reading_of,
 )
-from flysplat.training.captures.known_mistakes import fitted_readings, other_readings
-from flysplat.training.captures.read_capture import read_capture
-from flysplat.training.captures.registration import ColorFit, fit_color_camera
+from splatpilot.training.captures.known_mistakes import fitted_readings, other_readings
+from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.registration import ColorFit, fit_color_camera
 
 _FEWEST = 200
 """Points, of all pairs together, below which nothing can be told."""

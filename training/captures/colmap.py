@@ -13,14 +13,14 @@ import pycolmap
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture import Capture, FileAxes, SfmPoints
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.frame_files import FrameFiles, open_frames
-from flysplat.training.captures.image_files import read_depth
-from flysplat.training.captures.lens import Lens, pinhole
-from flysplat.training.captures.metric_scale import made_metric
-from flysplat.training.captures.poses import pose_from_matrix
-from flysplat.training.captures.upright import raised
+from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_files import FrameFiles, open_frames
+from splatpilot.training.captures.image_files import read_depth
+from splatpilot.training.captures.lens import Lens, pinhole
+from splatpilot.training.captures.metric_scale import made_metric
+from splatpilot.training.captures.poses import pose_from_matrix
+from splatpilot.training.captures.upright import raised
 
 _MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "../images", "../../images", "")

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture import Capture
-from flysplat.training.captures.registration import grid_step
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.registration import grid_step
 
 _POINTS = 5000
 """About how many pixels of an image are carried over."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
-from flysplat.training.captures.image_files import depth_size, image_size, read_image
-from flysplat.training.captures.lens import Lens, common_pinhole, resampling_maps
-from flysplat.training.captures.poses import stray_frames
+from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
+from splatpilot.training.captures.image_files import depth_size, image_size, read_image
+from splatpilot.training.captures.lens import Lens, common_pinhole, resampling_maps
+from splatpilot.training.captures.poses import stray_frames
 
 MAX_DROPPED = 0.2
 """The fraction of frames that may be left out."""

@@ -9,8 +9,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import minimize
 
-from flysplat.training.captures.capture import Capture
-from flysplat.training.captures.frame_agreement import FramePair, Reading, agreement_of
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.frame_agreement import FramePair, Reading, agreement_of
 
 _BODIES = {
     "optical axes (x right, y down, z forward)": np.eye(3),

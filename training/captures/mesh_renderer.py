@@ -21,8 +21,8 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from flysplat.systems.opengl import require_opengl
-from flysplat.training.captures.capture import CaptureFrame
+from splatpilot.systems.opengl import require_opengl
+from splatpilot.training.captures.capture import CaptureFrame
 
 NEAREST, FARTHEST = 0.05, 150.0
 """[m], range of the depth images; nearer is 0, farther is inf."""

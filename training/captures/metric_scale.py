@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
-from flysplat.training.captures.capture import Capture
-from flysplat.training.captures.capture_config import ScaleConfig
-from flysplat.training.captures.upright import fit_ground, known_points, turned, up_of_cameras
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_config import ScaleConfig
+from splatpilot.training.captures.upright import fit_ground, known_points, turned, up_of_cameras
 
 _FEWEST = 20
 """Points whose depth must be known for a scale."""

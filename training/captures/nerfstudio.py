@@ -16,14 +16,14 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes, SfmPoints
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.frame_files import FrameFiles, open_frames
-from flysplat.training.captures.image_files import depth_size, image_size, read_depth
-from flysplat.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
-from flysplat.training.captures.metric_scale import made_metric
-from flysplat.training.captures.poses import pose_from_matrix
-from flysplat.training.captures.upright import raised
+from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, SfmPoints
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_files import FrameFiles, open_frames
+from splatpilot.training.captures.image_files import depth_size, image_size, read_depth
+from splatpilot.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
+from splatpilot.training.captures.metric_scale import made_metric
+from splatpilot.training.captures.poses import pose_from_matrix
+from splatpilot.training.captures.upright import raised
 
 TRANSFORMS = "transforms.json"
 

@@ -13,10 +13,10 @@ import pycolmap
 from PIL import Image
 from tqdm import tqdm
 
-from flysplat.training.captures.capture import Capture
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.colmap import capture_of_model
-from flysplat.training.captures.image_files import IMAGE_SUFFIXES, image_size
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.colmap import capture_of_model
+from splatpilot.training.captures.image_files import IMAGE_SUFFIXES, image_size
 
 _MAX_SIZE = 1600
 """[px], longer side of the images in which features are sought."""
@@ -86,7 +86,7 @@ def _cache(files: list[Path], config: CaptureConfig) -> Path:
         status = file.stat()
         key.update(f"{file.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "flysplat" / "photographs" / key.hexdigest()[:16]
+    return Path(home) / "splatpilot" / "photographs" / key.hexdigest()[:16]
 
 
 def _one_camera(files: list[Path]) -> bool:

@@ -3,19 +3,19 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from flysplat.training.captures.capture import Capture
-from flysplat.training.captures.capture_config import CaptureConfig, completed_config
-from flysplat.training.captures.colmap import model_folder, read_colmap
-from flysplat.training.captures.nerfstudio import is_nerfstudio, read_nerfstudio
-from flysplat.training.captures.photographs import photographs_in, read_photographs
-from flysplat.training.captures.seven_scenes import is_seven_scenes, read_seven_scenes
-from flysplat.training.captures.tartanair import (
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_config import CaptureConfig, completed_config
+from splatpilot.training.captures.colmap import model_folder, read_colmap
+from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstudio
+from splatpilot.training.captures.photographs import photographs_in, read_photographs
+from splatpilot.training.captures.seven_scenes import is_seven_scenes, read_seven_scenes
+from splatpilot.training.captures.tartanair import (
     is_tartanair_v1,
     is_tartanair_v2,
     read_tartanair_v1,
     read_tartanair_v2,
 )
-from flysplat.training.captures.tum import is_tum, read_tum
+from splatpilot.training.captures.tum import is_tum, read_tum
 
 Reader = Callable[[Path, CaptureConfig], Capture]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.optimize import minimize
 
-from flysplat.training.captures.capture import Capture
+from splatpilot.training.captures.capture import Capture
 
 _POINTS = 3000
 """About how many pixels of an image are compared."""

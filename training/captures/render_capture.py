@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
-from flysplat.diagrams.configuration import dump_config, load_config
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.gltf import write_gltf
-from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
-from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.training.captures.camera_path import beside, poses_along, resampled, visiting_path
-from flysplat.training.captures.capture import CaptureFrame
-from flysplat.training.captures.mesh_renderer import MeshRenderer, check_mesh
-from flysplat.training.captures.tartanair import AXES
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.gltf import write_gltf
+from splatpilot.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
+from splatpilot.systems.configuration import dump_config, load_config
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.training.captures.camera_path import beside, poses_along, resampled, visiting_path
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
+from splatpilot.training.captures.tartanair import AXES
 
 RECIPE = "world.yaml"
 _SAMPLES_PER_VOXEL_FACE = 8

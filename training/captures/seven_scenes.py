@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.frame_files import FrameFiles, open_frames
-from flysplat.training.captures.image_files import numbered_files, read_depth
-from flysplat.training.captures.lens import Lens, pinhole
-from flysplat.training.captures.poses import pose_from_matrix, read_rows
-from flysplat.training.captures.upright import raised
+from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_files import FrameFiles, open_frames
+from splatpilot.training.captures.image_files import numbered_files, read_depth
+from splatpilot.training.captures.lens import Lens, pinhole
+from splatpilot.training.captures.poses import pose_from_matrix, read_rows
+from splatpilot.training.captures.upright import raised
 
 # fx, fy, cx, cy [px] at 640x480, and the colour camera's position in the depth camera [m].
 _COLOR = (523.0, 523.0, 320.0, 240.0)

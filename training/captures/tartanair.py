@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
-from flysplat.training.captures.capture import Capture, FileAxes
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.frame_files import FrameFiles, open_frames
-from flysplat.training.captures.image_files import (
+from splatpilot.training.captures.capture import Capture, FileAxes
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_files import FrameFiles, open_frames
+from splatpilot.training.captures.image_files import (
     numbered_files,
     read_depth,
     read_packed_depth,
 )
-from flysplat.training.captures.lens import Lens, pinhole
-from flysplat.training.captures.poses import pose_from_quaternion, read_rows
+from splatpilot.training.captures.lens import Lens, pinhole
+from splatpilot.training.captures.poses import pose_from_quaternion, read_rows
 
 AXES = FileAxes(
     "north-east-down: camera looks along x, y right, z down",

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture import Capture, FileAxes
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.frame_files import FrameFiles, open_frames
-from flysplat.training.captures.image_files import read_depth
-from flysplat.training.captures.lens import Lens, opencv_lens, pinhole
-from flysplat.training.captures.poses import pose_from_quaternion, read_rows
-from flysplat.training.captures.upright import raised
+from splatpilot.training.captures.capture import Capture, FileAxes
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_files import FrameFiles, open_frames
+from splatpilot.training.captures.image_files import read_depth
+from splatpilot.training.captures.lens import Lens, opencv_lens, pinhole
+from splatpilot.training.captures.poses import pose_from_quaternion, read_rows
+from splatpilot.training.captures.upright import raised
 
 _MAX_APART = 0.02
 """[s] between a colour image and its depth, as the data set's own tools have it."""

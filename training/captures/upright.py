@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture import Capture, FileAxes, SfmPoints
+from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints
 
 # How much cameras that look level count against images that are level.
 _LEVEL_GAZE = 0.01

@@ -21,26 +21,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from flysplat.systems.policies.agile_policy import (
+from splatpilot.systems.policies.agile_autonomy_inference import (
     AGILE_NETWORK,
     FARTHEST,
     MODES,
     NEAREST,
     RATE,
 )
-from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS
-from flysplat.systems.policies.privileged_planner import plan
-from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from flysplat.training.policies.agile_pilot import LOOKAHEAD, AgilePilot, reaching
-from flysplat.training.policies.courses import CourseSelection, training_fields, validation_fields
-from flysplat.training.policies.fields import STARTS, Fields
-from flysplat.training.policies.flight import BodyRate
-from flysplat.training.policies.flights import FlightConditions, fly_courses, look
-from flysplat.training.policies.network import TrajectoryModule
-from flysplat.training.policies.observation import Observation, ObservationNoise
-from flysplat.training.policies.train import Schedule
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
+from splatpilot.systems.policies.privileged_planner import plan
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.policies.agile_pilot import LOOKAHEAD, AgilePilot, reaching
+from splatpilot.training.policies.courses import CourseSelection, training_fields, validation_fields
+from splatpilot.training.policies.evaluation import FlightConditions, fly_courses, look
+from splatpilot.training.policies.fields import STARTS, Fields
+from splatpilot.training.policies.network import TrajectoryModule
+from splatpilot.training.policies.observation import Observation, ObservationNoise
+from splatpilot.training.policies.train import Schedule
+from splatpilot.training.policies.vehicles import BodyRate
 
 EPSILON = 0.05
 """Part of an expert's pull on the hypotheses that are not the closest to it."""
@@ -92,7 +92,7 @@ class AgileTraining:
 
 
 class AgileTrainee:
-    """See `flysplat.training.policies.train.Trainee`."""
+    """See `splatpilot.training.policies.train.Trainee`."""
 
     policy = "agile_autonomy"
 

@@ -3,12 +3,18 @@
 import torch
 from torch import Tensor
 
-from flysplat.systems.policies.agile_policy import FARTHEST, FOV_X, NEAREST, PROGRESS, RATE
-from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
-from flysplat.training.policies.flight import BodyRate, Vehicle
-from flysplat.training.policies.network import TrajectoryModule
-from flysplat.training.policies.observation import Observation, target_velocity
-from flysplat.training.policies.ray_casting import PinholeGrid
+from splatpilot.systems.policies.agile_autonomy_inference import (
+    FARTHEST,
+    FOV_X,
+    NEAREST,
+    PROGRESS,
+    RATE,
+)
+from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.training.policies.network import TrajectoryModule
+from splatpilot.training.policies.observation import Observation, target_velocity
+from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.vehicles import BodyRate, Vehicle
 
 LOOKAHEAD = 3
 """The waypoint that is tracked: at 0.4 s, as the controller's lookahead."""

@@ -5,12 +5,12 @@ from typing import cast
 
 import torch
 
-from flysplat.diagrams.configuration import load_config
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
-from flysplat.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
-from flysplat.training.policies.fields import Course, Fields
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
+from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
+from splatpilot.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
+from splatpilot.systems.configuration import load_config
+from splatpilot.training.policies.fields import Course, Fields
 
 VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
 """Worlds of the seeds from here on choose among checkpoints and are not trained in either."""

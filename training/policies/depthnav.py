@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from flysplat.systems.policies.depthnav_policy import (
+from splatpilot.systems.policies.depthnav_inference import (
     ACCELERATION_LIMITS,
     DEPTHNAV_NETWORK,
     FARTHEST,
@@ -29,14 +29,14 @@ from flysplat.systems.policies.depthnav_policy import (
     NEAREST,
     RATE,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import GRAVITY
-from flysplat.training.policies import observation
-from flysplat.training.policies.flight_trainee import FlightTraining
-from flysplat.training.policies.network import TrainableNetwork
-from flysplat.training.policies.observation import Observation
-from flysplat.training.policies.ray_casting import PinholeGrid
-from flysplat.training.policies.through_dynamics import FlightSchool, Moment
-from flysplat.training.policies.train import Schedule
+from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
+from splatpilot.training.policies import observation
+from splatpilot.training.policies.flight_trainee import FlightTraining
+from splatpilot.training.policies.network import TrainableNetwork
+from splatpilot.training.policies.observation import Observation
+from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.through_dynamics import FlightSchool, Moment
+from splatpilot.training.policies.train import Schedule
 
 
 @dataclass
@@ -70,7 +70,7 @@ class DepthNavTraining(FlightTraining):
 
 
 class DepthNavLearner:
-    """See `flysplat.training.policies.through_dynamics.Learner`."""
+    """See `splatpilot.training.policies.through_dynamics.Learner`."""
 
     rate = RATE
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from flysplat.systems.policies.diffaero_policy import (
+from splatpilot.systems.policies.diffaero_inference import (
     ACCELERATION_LIMITS,
     DIFFAERO_NETWORK,
     FARTHEST,
@@ -29,13 +29,13 @@ from flysplat.systems.policies.diffaero_policy import (
     NEAREST,
     RATE,
 )
-from flysplat.training.policies import observation
-from flysplat.training.policies.flight_trainee import FlightTraining
-from flysplat.training.policies.network import TrainableNetwork
-from flysplat.training.policies.observation import Observation
-from flysplat.training.policies.ray_casting import PinholeGrid
-from flysplat.training.policies.through_dynamics import Moment
-from flysplat.training.policies.train import Schedule
+from splatpilot.training.policies import observation
+from splatpilot.training.policies.flight_trainee import FlightTraining
+from splatpilot.training.policies.network import TrainableNetwork
+from splatpilot.training.policies.observation import Observation
+from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.through_dynamics import Moment
+from splatpilot.training.policies.train import Schedule
 
 
 @dataclass
@@ -65,7 +65,7 @@ class DiffAeroTraining(FlightTraining):
 
 
 class DiffAeroLearner:
-    """See `flysplat.training.policies.through_dynamics.Learner`."""
+    """See `splatpilot.training.policies.through_dynamics.Learner`."""
 
     rate = RATE
 

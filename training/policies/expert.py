@@ -4,17 +4,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flysplat.diagrams.add_policy import policy_named
-from flysplat.diagrams.flight import Flight, Outcome, fly, goal_of
-from flysplat.diagrams.flight_diagram import BuildFlightDiagram
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.policies.hypotheses import Hypotheses
-from flysplat.systems.policies.privileged_planner import plan
-from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
-from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.diagrams.add_policy import policy_named
+from splatpilot.diagrams.flight import Flight, Outcome, fly, goal_of
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.policies.privileged_planner import plan
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 
 @dataclass

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from flysplat.systems.collision.shapes import Shape
-from flysplat.systems.collision.trilinear import trilinear_with_gradient
-from flysplat.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from flysplat.training.policies.primitives import Primitives
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import Shape
+from splatpilot.systems.collision.trilinear import trilinear_with_gradient
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.policies.primitives import Primitives
 
 STARTS = 256
 """Places that flights of training start from, in each world."""

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from flysplat.training.policies.courses import CourseSelection, training_fields, validation_fields
-from flysplat.training.policies.fields import Fields
-from flysplat.training.policies.flights import FlightConditions, fly_courses
-from flysplat.training.policies.through_dynamics import FlightSchool, Learner, School
-from flysplat.training.policies.train import Schedule
+from splatpilot.training.policies.courses import CourseSelection, training_fields, validation_fields
+from splatpilot.training.policies.evaluation import FlightConditions, fly_courses
+from splatpilot.training.policies.fields import Fields
+from splatpilot.training.policies.through_dynamics import FlightSchool, Learner, School
+from splatpilot.training.policies.train import Schedule
 
 
 @dataclass
@@ -39,7 +39,7 @@ class FlightTraining:
 
 
 class FlightTrainee:
-    """A `flysplat.training.policies.train.Trainee` around a learner."""
+    """A `splatpilot.training.policies.train.Trainee` around a learner."""
 
     def __init__(self, policy: str, learner: Learner, config: FlightTraining) -> None:
         self.policy = policy

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from flysplat.systems.policies.agile_policy import (
+from splatpilot.systems.policies.agile_autonomy_inference import (
     MODES,
     STATE_SIZE,
     WAYPOINT_SCALE,
     TrajectoryNetworkSpec,
 )
-from flysplat.systems.policies.convolutions import LEAK, Layer
-from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS
-from flysplat.systems.policies.recurrent_network import NetworkSpec
+from splatpilot.systems.policies.convolutions import LEAK, Layer
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
+from splatpilot.systems.policies.recurrent_network import NetworkSpec
 
 
 class TrainableNetwork(nn.Module):

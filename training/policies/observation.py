@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from flysplat.training.policies.flight import Vehicle
+from splatpilot.training.policies.vehicles import Vehicle
 
 
 class Observation(NamedTuple):

@@ -1,8 +1,8 @@
 """Worlds of analytic shapes in batches: what cameras see of them and how near they are, in torch.
 
-The shapes are those of `flysplat.systems.collision.shapes`, so that training sees and hits exactly
-what the benchmark's worlds are made of. Nothing here is differentiable: images carry no gradient,
-and the gradient of a distance is the normal that is returned with it.
+The shapes are those of `splatpilot.systems.collision.shapes`, so that training sees and hits
+exactly what the benchmark's worlds are made of. Nothing here is differentiable: images
+carry no gradient, and the gradient of a distance is the normal that is returned with it.
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flysplat.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
-from flysplat.training.policies.ray_casting import (
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+from splatpilot.training.policies.ray_casting import (
     MISS,
     PinholeGrid,
     cast_boxes,

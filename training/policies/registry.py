@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from flysplat.training.policies.agile_autonomy import AgileTrainee, AgileTraining
-from flysplat.training.policies.depthnav import DepthNavLearner, DepthNavTraining
-from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
-from flysplat.training.policies.flight_trainee import FlightTrainee
-from flysplat.training.policies.train import Trainee
+from splatpilot.training.policies.agile_autonomy import AgileTrainee, AgileTraining
+from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
+from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
+from splatpilot.training.policies.flight_trainee import FlightTrainee
+from splatpilot.training.policies.train import Trainee
 
 
 class Recipe(NamedTuple):

@@ -10,9 +10,9 @@ from typing import Any, Self
 
 import torch
 
-from flysplat.diagrams.configuration import dump_config, load_config
-from flysplat.systems.files import require_writable_folder, written_atomically
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.configuration import dump_config, load_config
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class RunFolder:
         """Writes `POLICY.npz`; `best` is what was measured of these weights."""
         weights = {name: w.detach().cpu().numpy() for name, w in network.state_dict().items()}
         provenance = {
-            "command": f"flysplat train {policy}",
+            "command": f"splatpilot train {policy}",
             "config": self.config,
             "revision": self.revision,
             "torch": torch.__version__,
@@ -80,8 +80,8 @@ class RunFolder:
         )
         return f"""# {policy}
 
-Made by `flysplat train {policy} --out DIR --config CONFIG` with the configuration below at revision
-{self.revision} of the source, in {minutes:.1f} minutes of one core; {summary["updates"]}
+Made by `splatpilot train {policy} --out DIR --config CONFIG` with the configuration below at
+revision {self.revision} of the source, in {minutes:.1f} minutes of one core; {summary["updates"]}
 updates, of which the weights after {best["update"]} did best on held-out courses.
 
 | on held-out courses, simulated as in training | |

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from flysplat.systems.vehicle.flatness_controller import FlatnessControllerConfig
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from flysplat.training.policies.fields import STARTS, Fields
-from flysplat.training.policies.flight import PointMass
-from flysplat.training.policies.flights import Pilot, look
-from flysplat.training.policies.network import TrainableNetwork
-from flysplat.training.policies.observation import Observation, ObservationNoise
+from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.policies.evaluation import Pilot, look
+from splatpilot.training.policies.fields import STARTS, Fields
+from splatpilot.training.policies.network import TrainableNetwork
+from splatpilot.training.policies.observation import Observation, ObservationNoise
+from splatpilot.training.policies.vehicles import PointMass
 
 NEAREST = 4
 """Obstacles that the loss looks at, the nearest ones of each moment."""

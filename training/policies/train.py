@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import torch
 from tqdm import tqdm
 
-from flysplat.systems.files import written_atomically
-from flysplat.training.policies.run_folder import RunFolder
-from flysplat.training.policies.through_dynamics import NotFiniteError
+from splatpilot.systems.files import written_atomically
+from splatpilot.training.policies.run_folder import RunFolder
+from splatpilot.training.policies.through_dynamics import NotFiniteError
 
 
 @dataclass

@@ -7,20 +7,20 @@ import cv2
 import numpy as np
 import pytest
 
-from flysplat.diagrams.examples.splat_background import (
+from splatpilot.diagrams.examples.splat_background import (
     RADIUS,
     BuildSplatBackgroundDiagram,
     throw,
     widest_lane,
 )
-from flysplat.diagrams.worlds.forest import make_forest
-from flysplat.diagrams.worlds.forest_config import ForestConfig
+from splatpilot.diagrams.worlds.forest.config import ForestConfig
+from splatpilot.diagrams.worlds.forest.forest import make_forest
 
 
 @pytest.mark.usefixtures("opengl")
 def test_runs(tmp_path):
     """The command writes its pictures, in which red and blue come and go between trunks."""
-    module = "flysplat.diagrams.examples.splat_background"
+    module = "splatpilot.diagrams.examples.splat_background"
     command = [sys.executable, "-m", module, "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

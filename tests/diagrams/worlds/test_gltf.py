@@ -20,14 +20,14 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.gltf import write_gltf
-from flysplat.diagrams.worlds.illumination import Sunlight
-from flysplat.diagrams.worlds.light import Daylight
-from flysplat.diagrams.worlds.make_world import build
-from flysplat.diagrams.worlds.solid import Solid
-from flysplat.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
-from flysplat.systems.splats.baked_scene import BakedScene
+from splatpilot.diagrams.worlds.gltf import write_gltf
+from splatpilot.diagrams.worlds.make_world import build
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.illumination import Sunlight
+from splatpilot.diagrams.worlds.solids.light import Daylight
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from splatpilot.systems.splats.baked_scene import BakedScene
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 80.0
 

@@ -6,28 +6,28 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.diagrams.configuration import load_config
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds import feasibility
-from flysplat.diagrams.worlds.blueprint import Blueprint
-from flysplat.diagrams.worlds.clutter import ClutterConfig
-from flysplat.diagrams.worlds.feasibility import CLEARANCE, connects
-from flysplat.diagrams.worlds.inserted import GAP, InsertedConfig
-from flysplat.diagrams.worlds.light import Daylight
-from flysplat.diagrams.worlds.make_world import make_blueprint, make_world
-from flysplat.diagrams.worlds.octomap_world import OctomapConfig, voxel_gaussians
-from flysplat.diagrams.worlds.over_under import OverUnderConfig
-from flysplat.diagrams.worlds.room import RoomConfig
-from flysplat.diagrams.worlds.scene import SceneConfig, find_scene
-from flysplat.diagrams.worlds.scene_folder import write_scene_folder
-from flysplat.diagrams.worlds.walls import WallsConfig
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
-from flysplat.systems.collision.shapes import Box, Capsule, HalfSpace
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.gaussian_scene import GaussianScene
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds import feasibility
+from splatpilot.diagrams.worlds.clutter import ClutterConfig
+from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
+from splatpilot.diagrams.worlds.inserted import GAP, InsertedConfig
+from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
+from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, voxel_gaussians
+from splatpilot.diagrams.worlds.over_under import OverUnderConfig
+from splatpilot.diagrams.worlds.room import RoomConfig
+from splatpilot.diagrams.worlds.scene import SceneConfig, find_scene
+from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.light import Daylight
+from splatpilot.diagrams.worlds.walls import WallsConfig
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
+from splatpilot.systems.collision.shapes import Box, Capsule, HalfSpace
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 FILES = sorted((Path(__file__).parents[3] / "diagrams" / "scenarios").glob("*.yaml"))
 GENERATED = [file for file in FILES if file.stem.startswith("P")]
@@ -188,17 +188,17 @@ def hall(tmp_path_factory) -> Path:
 
 
 def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
-    """A scene is looked for in FLYSPLAT_SCENES; one that is not there says how to get it."""
-    monkeypatch.setenv("FLYSPLAT_SCENES", str(hall))
+    """A scene is looked for in SPLATPILOT_SCENES; one that is not there says how to get it."""
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     assert find_scene(SceneConfig(path="hall")) == hall / "hall"
-    monkeypatch.setenv("FLYSPLAT_SCENES", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match=r"hall: .*FLYSPLAT_SCENES.*; ask Ann"):
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"hall: .*SPLATPILOT_SCENES.*; ask Ann"):
         make_world(SceneConfig(path="hall", source="ask Ann"), 0)
 
 
 def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
     """Drawn ends are free, far apart, the same for the same seed and others for another."""
-    monkeypatch.setenv("FLYSPLAT_SCENES", str(hall))
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     config = SceneConfig(path="hall", draw_ends=True)
     worlds = [make_world(config, seed) for seed in (1, 1, 2)]
     np.testing.assert_array_equal(worlds[0].p_WS, worlds[1].p_WS)
@@ -212,7 +212,7 @@ def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
 def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
     """Three to five solids are put into the scene; what is seen of them is where the distance is
     zero, start and goal stay free and a way 1.3 vehicles wide is left."""
-    monkeypatch.setenv("FLYSPLAT_SCENES", str(hall))
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     before = make_world(SceneConfig(path="hall"), 0)
     world = make_world(InsertedConfig(path="hall"), 0)
     new = world.gaussians.means[len(before.gaussians) :].astype(float)

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flysplat.diagrams.worlds import scene_folder
-from flysplat.diagrams.worlds.scene_folder import (
+from splatpilot.diagrams.worlds import scene_folder
+from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
     read_scene,
     read_scene_folder,
@@ -13,11 +13,11 @@ from flysplat.diagrams.worlds.scene_folder import (
     write_scene_folder,
     write_scene_metadata,
 )
-from flysplat.diagrams.worlds.world import World
-from flysplat.systems.collision.esdf_build import esdf_from_occupancy
-from flysplat.systems.policies.time_of_arrival import time_of_arrival
-from flysplat.systems.splats.gaussian_ply import write_ply
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.splats.gaussian_ply import write_ply
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
 def box_of_gaussians(size=(6.0, 3.0, 3.0), step=0.1) -> GaussianScene:

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from flysplat.diagrams.worlds.start_and_goal import choose_start_and_goal
-from flysplat.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 
 RADIUS = 0.354
 

@@ -5,13 +5,13 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial import KDTree
 
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.distance_transform import (
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.distance_transform import (
     distance_to_voxels,
     distances_from_band,
     occupancy_distances,
 )
-from flysplat.systems.collision.shapes import Box, Capsule, Sphere
+from splatpilot.systems.collision.shapes import Box, Capsule, Sphere
 
 SIZE = 64
 INDEX = np.stack(np.meshgrid(*[np.arange(SIZE) + 0.5] * 3, indexing="ij"), -1)

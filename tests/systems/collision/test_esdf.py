@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
 
 FREE, OCCUPIED, UNKNOWN, OUTSIDE = FieldState
 LOWER_W = np.array([-1.0, 2.0, 0.5])

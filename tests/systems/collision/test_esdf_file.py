@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flysplat.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf import Esdf
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf_from_depth import (
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf_from_depth import (
     bounds_of_depth_images,
     esdf_from_depth_images,
 )
-from flysplat.systems.collision.shapes import (
+from splatpilot.systems.collision.shapes import (
     Box,
     Cylinder,
     HalfSpace,
@@ -118,7 +118,7 @@ def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
 @pytest.mark.parametrize("voxel_size", [0.1, 0.037])
 def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch, voxel_size):
     """The field is the same, bit for bit, when no block is skipped."""
-    from flysplat.systems.collision import esdf_from_depth
+    from splatpilot.systems.collision import esdf_from_depth
 
     depths, X_WCs = capture
     box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
@@ -248,9 +248,9 @@ def test_images_of_different_shapes_are_refused():
 def test_the_hospital():
     """A real capture: the free volume and unknown share are as known for it, its own depth points
     lie on the field's surface."""
-    if "FLYSPLAT_DATA" not in os.environ:
-        pytest.skip("FLYSPLAT_DATA is not set: the TartanAir hospital capture is needed")
-    folder = Path(os.environ["FLYSPLAT_DATA"]) / "tartanair" / "hospital"
+    if "SPLATPILOT_DATA" not in os.environ:
+        pytest.skip("SPLATPILOT_DATA is not set: the TartanAir hospital capture is needed")
+    folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"
     K = np.array([[320.0, 0.0, 320.0], [0.0, 320.0, 240.0], [0.0, 0.0, 1.0]])
     ned_to_world = np.diag([1.0, -1.0, -1.0])
     camera_to_ned_body = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -5,9 +5,9 @@ import pytest
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf_from_gaussians import _density, esdf_from_gaussians
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf_from_gaussians import _density, esdf_from_gaussians
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 VOXEL = 0.1
 

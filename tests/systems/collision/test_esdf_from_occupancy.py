@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.esdf_from_occupancy import (
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf_from_occupancy import (
     MAX_VOXELS,
     esdf_from_occupancy,
     grid_shape,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.collision.esdf_torch import EsdfTorch
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_torch import EsdfTorch
 
 
 def random_field() -> Esdf:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flysplat.systems.collision.distance_field import FieldState
-from flysplat.systems.collision.octomap import esdf_from_octomap, read_octomap
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.octomap import esdf_from_octomap, read_octomap
 
 FREE, OCCUPIED, UNKNOWN, _ = FieldState
 FREE_LEAF, OCCUPIED_LEAF, INNER = 1, 2, 3
@@ -134,9 +134,9 @@ def test_a_missing_file_is_reported(tmp_path):
 
 @pytest.fixture
 def maps() -> Path:
-    if "FLYSPLAT_DATA" not in os.environ:
-        pytest.skip("FLYSPLAT_DATA is not set: real OctoMaps needed")
-    return Path(os.environ["FLYSPLAT_DATA"]) / "maps"
+    if "SPLATPILOT_DATA" not in os.environ:
+        pytest.skip("SPLATPILOT_DATA is not set: real OctoMaps needed")
+    return Path(os.environ["SPLATPILOT_DATA"]) / "maps"
 
 
 @pytest.mark.parametrize(

@@ -8,17 +8,19 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies import agile_policy, depthnav_policy, diffaero_policy
-from flysplat.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
-from flysplat.systems.policies.depthnav import DepthNav, DepthNavConfig
-from flysplat.systems.policies.diffaero import DiffAero, DiffAeroConfig
-from flysplat.systems.policies.hypotheses import Hypotheses
-from flysplat.systems.policies.observation import pooled_depth
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
-from flysplat.systems.policies.recurrent_network import RecurrentNetwork
-from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
+from splatpilot.systems.policies import depthnav_inference as depthnav_policy
+from splatpilot.systems.policies import diffaero_inference as diffaero_policy
+from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
+from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.policies.observation import pooled_depth
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 SPECS = {
     "diffaero": diffaero_policy.DIFFAERO_NETWORK,

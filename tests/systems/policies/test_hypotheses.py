@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from flysplat.systems.policies.hypotheses import (
+from splatpilot.systems.policies.hypotheses import (
     Hypotheses,
     hypotheses_size,
     num_hypotheses_in,

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from flysplat.systems.policies.hypotheses import Hypotheses, unplanned
-from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
-from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.policies.hypotheses import Hypotheses, unplanned
+from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 
 
 def waypoint(selector, vector, time):

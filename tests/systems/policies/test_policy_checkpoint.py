@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
-from flysplat.systems.policies.recurrent_network import RecurrentNetwork, load_network
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.recurrent_network import RecurrentNetwork, load_network
 
 
 def some_weights(spec=DIFFAERO_NETWORK) -> dict[str, np.ndarray]:

@@ -11,23 +11,27 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import LogVectorOutput
 
-from flysplat.systems.policies import privileged_planner
-from flysplat.systems.policies.hypotheses import Hypotheses, hypotheses_size
-from flysplat.systems.policies.hypothesis_selector import HypothesisSelector
-from flysplat.systems.policies.privileged_planner import (
+from splatpilot.systems.policies import privileged_planner
+from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size
+from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
+from splatpilot.systems.policies.privileged_planner import (
     PrivilegedPlanner,
     PrivilegedPlannerConfig,
     level_acceleration,
     plan,
 )
-from flysplat.systems.policies.time_of_arrival import time_of_arrival
-from flysplat.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from flysplat.systems.vehicle.flatness_controller import (
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.vehicle.flatness_controller import (
     FlatnessController,
     FlatnessControllerConfig,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams, hover_state
-from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor_dynamics import (
+    VEHICLE_RADIUS,
+    QuadrotorParams,
+    hover_state,
+)
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 MARGIN = LatticeConfig().margin
 PARAMS = QuadrotorParams(drag=0.4, gravity=3.7)

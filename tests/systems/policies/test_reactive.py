@@ -6,9 +6,8 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F
 
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.policies.reactive import Reactive
-from flysplat.systems.policies.reactive_planner import (
+from splatpilot.systems.policies.reactive import Reactive
+from splatpilot.systems.policies.reactive_planner import (
     ReactiveConfig,
     candidate_costs,
     candidate_velocities,
@@ -16,8 +15,9 @@ from flysplat.systems.policies.reactive_planner import (
     nearest_points,
     responses,
 )
-from flysplat.systems.policies.velocity_tracking import RESPONSE_TIME
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 
 CONFIG = ReactiveConfig()
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from flysplat.systems.policies.straight import Straight, StraightConfig
-from flysplat.systems.policies.velocity_tracking import (
+from splatpilot.systems.policies.straight import Straight, StraightConfig
+from splatpilot.systems.policies.velocity_tracking import (
     MAX_ACCELERATION,
     RESPONSE_TIME,
     approach_velocity,
     tracking_acceleration,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 
 
 def test_velocity_points_to_the_goal_and_falls_near_it():

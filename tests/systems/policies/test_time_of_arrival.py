@@ -3,9 +3,9 @@ import copy
 import numpy as np
 import pytest
 
-from flysplat.systems.collision.esdf import Esdf
-from flysplat.systems.policies.time_of_arrival import slowness, time_of_arrival
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.policies.time_of_arrival import slowness, time_of_arrival
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 
 def open_space(voxel_size, size=(8.0, 6.0, 4.0)):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from flysplat.systems.policies.time_of_arrival import time_of_arrival
-from flysplat.systems.policies.trajectory_lattice import (
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.policies.trajectory_lattice import (
     LatticeConfig,
     Trajectories,
     TrajectoryLattice,
@@ -12,7 +12,7 @@ from flysplat.systems.policies.trajectory_lattice import (
     rotation_to,
     select_distinct,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 
 @pytest.mark.parametrize("derivative", [0, 1, 2])

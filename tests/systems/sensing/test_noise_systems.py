@@ -8,18 +8,18 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import VectorLogSink
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from flysplat.systems.policies.onboard_camera import OnboardCamera
-from flysplat.systems.sensing.color_noise import ColorNoise
-from flysplat.systems.sensing.delayed_pose import DelayedPose
-from flysplat.systems.sensing.depth_noise import DepthNoise
-from flysplat.systems.sensing.observation_noise import (
+from splatpilot.systems.sensing.color_noise import ColorNoise
+from splatpilot.systems.sensing.delayed_pose import DelayedPose
+from splatpilot.systems.sensing.depth_noise import DepthNoise
+from splatpilot.systems.sensing.observation_noise import (
     ObservationNoise,
     image_generator,
     noisy_color,
     noisy_depth,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
-from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 CAMERA = OnboardCamera(width=8, height=6)
 

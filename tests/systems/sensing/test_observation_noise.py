@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flysplat.systems.sensing.observation_noise import (
+from splatpilot.systems.sensing.observation_noise import (
     ObservationNoise,
     image_generator,
     noisy_color,

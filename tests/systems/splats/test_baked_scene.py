@@ -10,10 +10,10 @@ import pytest
 import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from flysplat import _native
-from flysplat.systems.splats import rasterize
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.gaussian_scene import GaussianScene
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 LEVELS = _native.simd_levels()
 WIDTH, HEIGHT = 83, 61
@@ -178,15 +178,15 @@ def test_bad_thread_counts_are_named():
 
 
 def test_environment_selects_the_simd_level():
-    """FLYSPLAT_SIMD forces a level and is refused when the machine lacks it; torch stays out."""
+    """SPLATPILOT_SIMD forces a level and is refused when the machine lacks it; torch stays out."""
     code = (
-        "import sys; from flysplat.systems.splats.baked_scene import create_renderer;"
+        "import sys; from splatpilot.systems.splats.baked_scene import create_renderer;"
         "print(create_renderer(1).simd, 'torch' in sys.modules)"
     )
     for level in LEVELS:
         done = subprocess.run(
             [sys.executable, "-c", code],
-            env={"FLYSPLAT_SIMD": level},
+            env={"SPLATPILOT_SIMD": level},
             capture_output=True,
             text=True,
             check=True,
@@ -194,7 +194,7 @@ def test_environment_selects_the_simd_level():
         assert done.stdout.split() == [level, "False"]
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={"FLYSPLAT_SIMD": "v9"},
+        env={"SPLATPILOT_SIMD": "v9"},
         capture_output=True,
         text=True,
         check=False,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from flysplat.systems.splats.camera_models import (
+from splatpilot.systems.splats.camera_models import (
     fisheye_limit,
     opencv_limit,
     project_fisheye,

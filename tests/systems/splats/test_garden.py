@@ -8,10 +8,10 @@ import reference_rasterizer as reference
 import torch
 from garden import Garden, load_garden
 
-from flysplat.systems.splats import rasterize
+from splatpilot.systems.splats import rasterize
 
 pytestmark = pytest.mark.skipif(
-    "FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set"
+    "SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set"
 )
 COUNT = 6_000  # Gaussians of 112,000: the float64 reference is slow
 REDUCED = 4  # of the image's size
@@ -21,7 +21,7 @@ CAMERAS = (0, 1, 2)
 
 @pytest.fixture(scope="module")
 def garden() -> Garden:
-    garden = load_garden(Path(os.environ["FLYSPLAT_DATA"]), COUNT)
+    garden = load_garden(Path(os.environ["SPLATPILOT_DATA"]), COUNT)
     Ks = garden.Ks.clone()
     Ks[:, :2] /= REDUCED
     # Fewer Gaussians, as much wider: the images stay as full.

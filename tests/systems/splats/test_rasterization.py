@@ -11,8 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flysplat import _native
-from flysplat.systems.splats import rasterize
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize
 
 random_scene, single_gaussian = reference.random_scene, reference.single_gaussian
 
@@ -426,7 +426,7 @@ def test_tensors_on_other_devices_are_refused():
 @pytest.mark.skipif(importlib.util.find_spec("gsplat") is not None, reason="gsplat is installed")
 def test_missing_gsplat_says_how_to_install_it():
     """CUDA tensors without gsplat get the install command."""
-    from flysplat.systems.splats.rasterization_checks import import_gsplat
+    from splatpilot.systems.splats.rasterization_checks import import_gsplat
 
-    with pytest.raises(ImportError, match=r"pip install 'flysplat\[cuda\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'splatpilot\[cuda\]'"):
         import_gsplat()

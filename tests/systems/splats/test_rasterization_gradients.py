@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from flysplat import _native
-from flysplat.systems.splats import rasterize
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize
 
 random_scene, single_gaussian = reference.random_scene, reference.single_gaussian
 

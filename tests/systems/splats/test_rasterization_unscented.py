@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from flysplat.systems.splats import rasterize
-from flysplat.systems.splats.camera_models import project_fisheye
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.camera_models import project_fisheye
 
 SIZE = (160, 120)
 K = torch.tensor([[110.0, 0, 78.0], [0, 105.0, 61.0], [0, 0, 1]], dtype=torch.float64)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from pydrake.math import RollPitchYaw
 from scipy.special import sph_harm_y
 
-from flysplat.systems.splats.spherical_harmonics import (
+from splatpilot.systems.splats.spherical_harmonics import (
     C0,
     degree_of,
     evaluate_sh,

@@ -14,9 +14,9 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.gaussian_scene import GaussianScene
-from flysplat.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
 
 INFO = CameraInfo(width=32, height=24, fov_y=np.pi / 2)
 # Camera z along body x, as on the vehicle.

@@ -35,10 +35,10 @@ from pydrake.systems.sensors import (
     RgbdSensor,
 )
 
-from flysplat.systems.splats.baked_scene import BakedScene
-from flysplat.systems.splats.gaussian_scene import GaussianScene
-from flysplat.systems.splats.splat_camera import SplatCamera
-from flysplat.systems.splats.splat_render_engine import SplatRenderEngine
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
 
 pytestmark = pytest.mark.usefixtures("opengl")
 

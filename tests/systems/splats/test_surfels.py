@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from reference_rasterizer import random_scene as random_gaussians
 from reference_rasterizer import rotation_matrices
 
-from flysplat import _native
-from flysplat.systems.splats import rasterize, surfels
-from flysplat.systems.splats.depth_normals import depth_to_normals
-from flysplat.systems.splats.surfels import rasterize_surfels
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize, surfels
+from splatpilot.systems.splats.depth_normals import depth_to_normals
+from splatpilot.systems.splats.surfels import rasterize_surfels
 
 LEVELS = _native.simd_levels()
 WIDTH, HEIGHT = 67, 45

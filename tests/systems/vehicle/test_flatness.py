@@ -6,7 +6,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flysplat.systems.vehicle.flatness import (
+from splatpilot.systems.vehicle.flatness import (
     attitude_error,
     attitude_from_thrust,
     limit_norm,
@@ -14,7 +14,7 @@ from flysplat.systems.vehicle.flatness import (
     reaching_acceleration,
     thrust_for_acceleration,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams, quadrotor_derivatives
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, quadrotor_derivatives
 
 # Vectors of ordinary and of extreme length, with exact zeros.
 elements = st.floats(-20, 20) | st.sampled_from([0.0, 1e-12, -1e6])

@@ -11,16 +11,16 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import VectorLogSink
 from scipy.spatial.transform import Rotation
 
-from flysplat.systems.vehicle.flatness_controller import (
+from splatpilot.systems.vehicle.flatness_controller import (
     FlatnessController,
     FlatnessControllerConfig,
 )
-from flysplat.systems.vehicle.quadrotor_dynamics import (
+from splatpilot.systems.vehicle.quadrotor_dynamics import (
     QuadrotorParams,
     hover_state,
     quadrotor_derivatives,
 )
-from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 CONFIG = FlatnessControllerConfig()
 

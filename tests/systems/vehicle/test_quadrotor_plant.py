@@ -10,8 +10,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import SymbolicVectorSystem, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from flysplat.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
-from flysplat.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 PERIOD = 0.02  # [s] of the commands and of the integration
 

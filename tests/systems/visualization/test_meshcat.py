@@ -14,19 +14,19 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.shapes import Sphere
-from flysplat.systems.policies.hypotheses import Hypotheses
-from flysplat.systems.splats.gaussian_scene import GaussianScene
-from flysplat.systems.vehicle.quadrotor_dynamics import hover_state
-from flysplat.systems.visualization.camera_visualizer import CameraVisualizer, picture_gltf
-from flysplat.systems.visualization.drawing import (
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.shapes import Sphere
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer, picture_gltf
+from splatpilot.systems.visualization.drawing import (
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
     draw_vehicle,
 )
-from flysplat.systems.visualization.flight_visualizer import FlightVisualizer
+from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def shared_meshcat():
 
 @pytest.fixture
 def meshcat(shared_meshcat):
-    shared_meshcat.Delete("/flysplat")
+    shared_meshcat.Delete("/splatpilot")
     return shared_meshcat
 
 
@@ -50,15 +50,15 @@ def test_flight_is_drawn_page_by_page(meshcat):
     visualizer = builder.AddSystem(FlightVisualizer(meshcat, num_hypotheses=3, period=0.1))
     builder.Connect(state.get_output_port(), visualizer.GetInputPort("state"))
     builder.Connect(hypotheses.get_output_port(), visualizer.GetInputPort("hypotheses"))
-    draw_vehicle(meshcat, "/flysplat/vehicle", radius=0.354)
+    draw_vehicle(meshcat, "/splatpilot/vehicle", radius=0.354)
     Simulator(builder.Build()).AdvanceTo(0.35)
-    assert meshcat.HasPath("/flysplat/vehicle/body")
+    assert meshcat.HasPath("/splatpilot/vehicle/body")
     for page in range(4):
-        assert meshcat.HasPath(f"/flysplat/trail/{page:05d}")
+        assert meshcat.HasPath(f"/splatpilot/trail/{page:05d}")
         for k in range(3):
-            assert meshcat.HasPath(f"/flysplat/hypotheses/{page:05d}/{k}")
-    assert not meshcat.HasPath("/flysplat/trail/00004")
-    assert not meshcat.HasPath("/flysplat/hypotheses/00000/3")
+            assert meshcat.HasPath(f"/splatpilot/hypotheses/{page:05d}/{k}")
+    assert not meshcat.HasPath("/splatpilot/trail/00004")
+    assert not meshcat.HasPath("/splatpilot/hypotheses/00000/3")
 
 
 def test_still_life_is_drawn(meshcat):
@@ -71,11 +71,11 @@ def test_still_life_is_drawn(meshcat):
         colors=np.full((3, 3), 0.5),
     )
     field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [4, 1, 2])
-    draw_gaussians(meshcat, "/flysplat/scene", scene, field.lower_W, field.upper_W)
-    draw_goal(meshcat, "/flysplat/goal", np.array([3.0, 0, 1]), radius=0.3)
-    draw_distance_slice(meshcat, "/flysplat/slice", field, height=1.0)
+    draw_gaussians(meshcat, "/splatpilot/scene", scene, field.lower_W, field.upper_W)
+    draw_goal(meshcat, "/splatpilot/goal", np.array([3.0, 0, 1]), radius=0.3)
+    draw_distance_slice(meshcat, "/splatpilot/slice", field, height=1.0)
     for name in ("scene", "goal", "slice"):
-        assert meshcat.HasPath(f"/flysplat/{name}")
+        assert meshcat.HasPath(f"/splatpilot/{name}")
 
 
 def test_camera_picture_is_hung_at_its_rate(meshcat):
@@ -86,8 +86,8 @@ def test_camera_picture_is_hung_at_its_rate(meshcat):
     picture = builder.AddSystem(CameraVisualizer(meshcat, info, RigidTransform(), 0.1, stride=2))
     builder.Connect(image.get_output_port(), picture.GetInputPort("color_image"))
     Simulator(builder.Build()).AdvanceTo(0.5)
-    assert meshcat.HasPath("/flysplat/vehicle/camera/frustum")
-    pages = [meshcat.HasPath(f"/flysplat/vehicle/camera/picture/{i:05d}") for i in range(4)]
+    assert meshcat.HasPath("/splatpilot/vehicle/camera/frustum")
+    pages = [meshcat.HasPath(f"/splatpilot/vehicle/camera/picture/{i:05d}") for i in range(4)]
     assert pages == [True, True, True, False]
 
 

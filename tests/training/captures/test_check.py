@@ -8,12 +8,12 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.analysis.cli import main
-from flysplat.diagrams.configuration import load_config
-from flysplat.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.check import check_capture
-from flysplat.training.captures.read_capture import read_capture
+from splatpilot.analysis.cli import main
+from splatpilot.systems.configuration import load_config
+from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.check import check_capture
+from splatpilot.training.captures.read_capture import read_capture
 
 WIDTH, HEIGHT = 160, 120
 K = np.array([[110.0, 0, 78.0], [0, 110.0, 61.0], [0, 0, 1]])
@@ -170,7 +170,7 @@ def test_nothing_to_compare(room):
 
 
 def test_command(tmp_path, write_room, capsys):
-    """`flysplat capture check` prints the table and ends with 0, or with 1 and the mistake."""
+    """`splatpilot capture check` prints the table and ends with 0, or with 1 and the mistake."""
     poses = [((0.8 + 0.3 * i, 0.1 * i, -1.2), 0.1 * i - 0.3, -0.05 * i) for i in range(8)]
     path = write_room(tmp_path / "room", width=160, height=120, poses=poses)
     assert main(["capture", "check", str(path)]) == 0
@@ -186,7 +186,7 @@ def test_command(tmp_path, write_room, capsys):
     assert "pairs is 0" in capsys.readouterr().err
 
 
-@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 @pytest.mark.parametrize(
     ("name", "overrides", "error", "mistake"),
     [
@@ -199,6 +199,6 @@ def test_command(tmp_path, write_room, capsys):
 def test_real_captures(name, overrides, error, mistake):
     """The real captures agree, and redkitchen read as registered is found out, with its numbers."""
     config = load_config(CaptureConfig(), overrides=overrides)
-    report = check_capture(read_capture(Path(os.environ["FLYSPLAT_DATA"]) / name, config))
+    report = check_capture(read_capture(Path(os.environ["SPLATPILOT_DATA"]) / name, config))
     assert error[0] < report.agreement.error < error[1]
     assert re.search(mistake, report.mistake) if mistake else report.agrees

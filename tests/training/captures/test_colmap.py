@@ -7,9 +7,9 @@ import pycolmap
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture_config import CaptureConfig, ScaleConfig
-from flysplat.training.captures.photographs import read_photographs
-from flysplat.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
+from splatpilot.training.captures.photographs import read_photographs
+from splatpilot.training.captures.read_capture import read_capture
 
 SHRINK = 0.25
 # The world of a registration: any rotation, any unit of length.
@@ -204,7 +204,7 @@ def _made(path):
 def test_images_can_be_written_after_pycolmap_is_loaded(tmp_path):
     """Reading captures does not break OpenCV's PNG files, which libraries of pycolmap could."""
     code = (
-        "import flysplat.training.captures.read_capture, cv2, numpy as np, sys\n"
+        "import splatpilot.training.captures.read_capture, cv2, numpy as np, sys\n"
         "image = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)\n"
         "cv2.imwrite(sys.argv[1], image)\n"
         "sys.exit(int((cv2.imread(sys.argv[1]) != image).any()))\n"

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from flysplat.training.captures.capture_config import CaptureConfig, ScaleConfig
-from flysplat.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
+from splatpilot.training.captures.read_capture import read_capture
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 DISTORTION = {"k1": -0.15, "k2": 0.03, "p1": 0.002, "p2": -0.001}

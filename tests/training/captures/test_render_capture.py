@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from flysplat.analysis.cli import main
-from flysplat.diagrams.worlds.make_world import make_blueprint
-from flysplat.diagrams.worlds.room import RoomConfig
-from flysplat.training.captures.read_capture import read_capture
-from flysplat.training.captures.render_capture import (
+from splatpilot.analysis.cli import main
+from splatpilot.diagrams.worlds.make_world import make_blueprint
+from splatpilot.diagrams.worlds.room import RoomConfig
+from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.render_capture import (
     RenderConfig,
     mesh_distance,
     run,

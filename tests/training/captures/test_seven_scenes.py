@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from flysplat.training.captures.capture_config import CaptureConfig
-from flysplat.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.read_capture import read_capture
 
 P_DC = [0.2, -0.1, 0.0]
 K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
@@ -149,10 +149,10 @@ def test_eight_bit_depth(write, config):
         read_capture(path, config()).frame(1)
 
 
-@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_redkitchen():
     """The real capture opens whole, and most colour pixels have depth, but not those at its rim."""
-    capture = read_capture(Path(os.environ["FLYSPLAT_DATA"]) / "redkitchen")
+    capture = read_capture(Path(os.environ["SPLATPILOT_DATA"]) / "redkitchen")
     assert len(capture) == 200 and not capture.dropped
     depth = capture.registered_depth(0)
     assert depth.shape == (480, 640)

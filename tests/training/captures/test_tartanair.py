@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flysplat.training.captures.tartanair import (
+from splatpilot.training.captures.tartanair import (
     is_tartanair_v1,
     is_tartanair_v2,
     read_tartanair_v1,
@@ -224,10 +224,10 @@ def test_v2(tmp_path, write_room):
     np.testing.assert_array_equal(one.K, two.K)
 
 
-@pytest.mark.skipif("FLYSPLAT_DATA" not in os.environ, reason="FLYSPLAT_DATA is not set")
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_hospital_reprojects_onto_itself():
     """In the real sequence, depth carried from frame to frame agrees to a tenth of a percent."""
-    capture = read_tartanair_v1(Path(os.environ["FLYSPLAT_DATA"]) / "tartanair" / "hospital")
+    capture = read_tartanair_v1(Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital")
     assert len(capture) == 71
     errors = []
     for i in (0, 20, 40, 60):

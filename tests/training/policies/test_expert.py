@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from flysplat.diagrams.scenario import Scenario
-from flysplat.diagrams.worlds.forest import ForestConfig
-from flysplat.diagrams.worlds.make_world import make_world
-from flysplat.diagrams.worlds.start_and_goal import draw_start_and_goal
-from flysplat.systems.policies.hypotheses import Hypotheses
-from flysplat.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from flysplat.systems.vehicle.state_to_pose import pose_from_state
-from flysplat.training.policies.expert import ExpertConfig, expert_rollout
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.training.policies.expert import ExpertConfig, expert_rollout
 
 WORLD = ForestConfig(length=12.0, width=8.0, height=4.0)
 

@@ -5,15 +5,17 @@ import pytest
 import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from flysplat.systems.policies import agile_policy, depthnav_policy, diffaero_policy
-from flysplat.systems.policies.hypotheses import NUM_WAYPOINTS
-from flysplat.systems.policies.recurrent_network import RecurrentNetwork
-from flysplat.training.policies.agile_pilot import AgilePilot
-from flysplat.training.policies.depthnav import DepthNavLearner, DepthNavLoss, quaternion_of
-from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from flysplat.training.policies.flight import BodyRate
-from flysplat.training.policies.network import TrajectoryModule
-from flysplat.training.policies.observation import Observation, ObservationNoise
+from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
+from splatpilot.systems.policies import depthnav_inference as depthnav_policy
+from splatpilot.systems.policies import diffaero_inference as diffaero_policy
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
+from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
+from splatpilot.training.policies.agile_pilot import AgilePilot
+from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavLoss, quaternion_of
+from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
+from splatpilot.training.policies.network import TrajectoryModule
+from splatpilot.training.policies.observation import Observation, ObservationNoise
+from splatpilot.training.policies.vehicles import BodyRate
 
 P_WG = np.array([9.0, 2.0, 1.5])
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from flysplat.systems.collision.analytic_distance_field import AnalyticDistanceField
-from flysplat.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
-from flysplat.systems.policies.observation import pooled_depth
-from flysplat.training.policies.primitives import Primitives
-from flysplat.training.policies.ray_casting import PinholeGrid
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from splatpilot.systems.policies.observation import pooled_depth
+from splatpilot.training.policies.primitives import Primitives
+from splatpilot.training.policies.ray_casting import PinholeGrid
 
 LOWER, UPPER = np.array([0.0, -8.0, 0.0]), np.array([20.0, 8.0, 6.0])
 R_BC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 import torch
 
-from flysplat.diagrams.configuration import load_config
-from flysplat.diagrams.worlds.feasibility import TRAINING_SEEDS
-from flysplat.systems.policies.diffaero_policy import DIFFAERO_NETWORK
-from flysplat.systems.policies.policy_checkpoint import PolicyCheckpoint
-from flysplat.training.policies import courses
-from flysplat.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
-from flysplat.training.policies.flights import FlightConditions, fly_courses
-from flysplat.training.policies.network import TrainableNetwork
-from flysplat.training.policies.registry import RECIPES
-from flysplat.training.policies.train import Schedule, run
+from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.training.policies import courses
+from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
+from splatpilot.training.policies.evaluation import FlightConditions, fly_courses
+from splatpilot.training.policies.network import TrainableNetwork
+from splatpilot.training.policies.registry import RECIPES
+from splatpilot.training.policies.train import Schedule, run
 
 TINY = [
     "courses.kinds=[P10]",
@@ -76,7 +76,7 @@ def test_run_leaves_what_it_says(finished):
 
 def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
     """After kill -9 between two checkpoints the same command ends with the same weights."""
-    program = "import sys; from flysplat.analysis.cli import main; sys.exit(main(sys.argv[1:]))"
+    program = "import sys; from splatpilot.analysis.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
     for override in TINY:
         command += ["--set", override]

@@ -1,0 +1,103 @@
+"""`splatpilot replay`: one flight of a study, flown again."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from splatpilot.analysis.benchmark.rollout import ERROR, digest, study_world
+from splatpilot.analysis.benchmark.study import RolloutSpec, scenario_of
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.diagrams.flight import Flight, fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.fly import film_flight, open_meshcat
+from splatpilot.systems.files import require_writable_folder
+
+
+class Agreement(NamedTuple):
+    """How a flight agrees with its record."""
+
+    exact: bool
+    """Whether they are equal to the last bit."""
+    deviation: float
+    """[m], the greatest distance between them at one time, as long as both last."""
+    outcome: str
+    """How the flight ended this time."""
+
+
+def run(
+    *, study: Path, id: str, out: Path | None = None, meshcat: bool = False, video: bool = False
+) -> Agreement:
+    """
+    Flies one flight of a study again, from the study's folder alone, and compares it with its
+    record.
+
+    Args:
+        study: the folder.
+        id: of the flight, as in `rollouts.csv`.
+        out: folder for what is filmed; `replays/ID` in the study by default.
+        meshcat: writes `flight.html`, the flight in Meshcat.
+        video: writes `flight.mp4`, what the onboard camera saw.
+
+    Raises:
+        FileNotFoundError: if there is no study, or the flight is not there yet.
+        ValueError: if the study has no such flight, or its file is damaged.
+    """
+    folder = StudyFolder(study)
+    spec = find_flight(folder, id)
+    row, recorded = folder.read(spec)
+    if row["outcome"] == ERROR:
+        raise ValueError(f"{id} ended in an error and cannot be compared: {row['error']}")
+    scenario = scenario_of(spec, folder.scenario(spec.scenario), folder.weights())
+    world = study_world(scenario)
+    out = out or study / "replays" / id
+    if meshcat or video:
+        require_writable_folder(out)
+        _, flight = film_flight(
+            scenario,
+            world,
+            open_meshcat(scenario, world) if meshcat else None,
+            page=out / "flight.html" if meshcat else None,
+            video=out / "flight.mp4" if video else None,
+        )
+    else:
+        flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    result = compare(flight, recorded, row["digest"])
+    print(f"{id}: {result.outcome} after {flight.times[-1]:.2f} s")
+    if result.exact:
+        print("The replay equals the recorded flight to the last bit.")
+    else:
+        print(
+            f"THE REPLAY DIFFERS from the recorded flight ({row['outcome']}) by up to "
+            f"{result.deviation:.3g} m. Another processor or other versions of libraries round "
+            "differently; study.yaml says which program flew it."
+        )
+    if meshcat or video:
+        files = {"flight.html": meshcat, "flight.mp4": video}
+        written = [name for name, wanted in files.items() if wanted]
+        print(f"Wrote {' and '.join(written)} in {out}")
+    return result
+
+
+def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:
+    """
+    The flight of a study that has this name.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    specs = {spec.id: spec for spec in folder.config().rollouts()}
+    if id not in specs:
+        raise ValueError(
+            f"{folder.path} has no flight {id!r}; its flights are named like {next(iter(specs))}, "
+            "see rollouts.csv"
+        )
+    return specs[id]
+
+
+def compare(flight: Flight, recorded: dict[str, np.ndarray], recorded_digest: str) -> Agreement:
+    """Compares a flight with the arrays and the digest that a study kept."""
+    common = min(len(flight.times), len(recorded["times"]))
+    offsets = flight.states[:common, :3] - recorded["states"][:common, :3]
+    deviation = float(np.linalg.norm(offsets, axis=1).max())
+    return Agreement(digest(flight) == recorded_digest, deviation, str(flight.outcome))

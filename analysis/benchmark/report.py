@@ -1,0 +1,274 @@
+"""The report of a study: one HTML file that needs nothing else."""
+
+import math
+from html import escape
+from itertools import combinations
+from typing import Any
+
+from splatpilot.analysis.benchmark import html_page
+from splatpilot.analysis.benchmark.figures import (
+    draw_success_against_speed,
+    draw_trajectories,
+    save_png,
+)
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, scenario_of
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.tables import (
+    PAPER,
+    PAPER_FLIGHTS,
+    compare,
+    mean_of,
+    policy_table,
+    select,
+    success_summary,
+)
+from splatpilot.diagrams.flight_diagram import goal_of
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.files import written_atomically
+
+_COMPARED = ("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")
+
+
+def write_report(
+    folder: StudyFolder,
+    config: StudyConfig,
+    rows: list[dict[str, Any]],
+    timings: list[dict[str, Any]],
+    absent: dict[str, str],
+    damaged: list[str],
+) -> None:
+    """
+    Writes `report.html` and its pictures, `success_against_speed.png` and `trajectories.png`.
+
+    Args:
+        folder, config: the study.
+        rows: of its flights.
+        timings: of the same flights.
+        absent: the scenarios that were not flown, and why.
+        damaged: files that were flown again in this run.
+    """
+    table = policy_table(rows, config, len(absent))
+    figure = draw_success_against_speed(table, config.policy_names)
+    success_png = save_png(figure, folder.path / "success_against_speed.png")
+    sections = [
+        f"<h1>Navigation benchmark</h1><p>{_scope(config, rows)}</p>",
+        _warnings(config, rows, absent, damaged),
+        "<h2>Policies</h2>" + _policies(table) + _timing(config, rows, timings),
+        "<h2>Beside the paper's Table I</h2>" + _paper(table, config),
+        "<h2>Success against speed</h2>"
+        + html_page.image(success_png, "Success rate against velocity"),
+        "<h2>Trajectories through one field</h2>" + _trajectories(folder, config, rows),
+        "<h2>Pairs of policies on the same flights</h2>" + _pairs(config, rows),
+        "<h2>Scenarios</h2>" + _scenarios(config, rows, absent),
+        "<h2>Flights</h2>" + _flights(folder, config, rows),
+        "<h2>Program</h2>" + _program(folder),
+    ]
+    with written_atomically(folder.path / "report.html") as path:
+        path.write_text(html_page.page("Navigation benchmark", sections))
+
+
+def _rate(summary: dict[str, Any]) -> str:
+    if not summary["flights"]:
+        return "not run"
+    return (
+        f"{summary['success_rate']:.0%} <span class=note>[{summary['wilson_lower']:.0%}, "
+        f"{summary['wilson_upper']:.0%}]</span>"
+    )
+
+
+def _passed(row: dict[str, Any]) -> str:
+    return f"{row['scenarios_passed']}/{row['scenarios']}"
+
+
+def _scope(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    speeds = ", ".join(f"{speed:g}" for speed in config.speeds)
+    return (
+        f"{len(rows)} flights: {len(config.scenarios)} scenarios, {len(config.policies)} policies, "
+        f"{config.seeds} seeds, nominal speeds {speeds} m/s. A flight succeeds when it reaches the "
+        "goal and its clearance at the vehicle's radius is never below zero. Brackets are 95 % "
+        "Wilson intervals."
+    )
+
+
+def _warnings(
+    config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str], damaged: list[str]
+) -> str:
+    lines = [
+        f"<b>{escape(name)} was not run</b>, and counts nowhere: {escape(reason)}"
+        for name, reason in absent.items()
+    ]
+    lines += [f"{escape(problem)}; the flight was flown again" for problem in damaged]
+    lines += [
+        f"{escape(row['id'])} ended in an error and counts as a failure: {escape(row['error'])}"
+        for row in rows
+        if "error" in row
+    ]
+    return "".join(f'<p class="warn">{line}</p>' for line in lines)
+
+
+def _policies(table: list[dict[str, Any]]) -> str:
+    header = ["policy", "speed [m/s]", "flights", "success", "collision", "timeout", "left volume"]
+    header += ["error", "not run", "scenarios passed", "min. clearance [m]"]
+    header += ["velocity [m/s]", "path excess"]
+    header += ["jerk [m/s³]", "smoothness"]
+    rows = [
+        [
+            escape(row["policy"]),
+            f"{row['speed']:g}",
+            str(row["flights"]),
+            _rate(row),
+            *(str(row[name]) for name in ("collision", "timeout", "left_volume", "error")),
+            str(row["not_run"]),
+            _passed(row),
+            html_page.number(row["min_clearance_m"], "+.2f"),
+            html_page.number(row["mean_speed_m_s"], ".2f"),
+            html_page.number(row["path_excess"], ".1%"),
+            html_page.number(row["jerk_m_s3"], ".1f"),
+            html_page.number(row["smoothness"], ".1f"),
+        ]
+        for row in table
+    ]
+    return html_page.table(header, rows)
+
+
+def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> str:
+    header = ["policy", "decision [ms]", "render [ms]", "real-time factor"]
+    names = "policy_ms", "render_ms", "real_time_factor"
+    lines = []
+    for policy in config.policy_names:
+        times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
+        lines.append(
+            [escape(policy), *(html_page.number(mean_of(times, name), ".1f") for name in names)]
+        )
+    return "<p>Mean times, of this machine and its load:</p>" + html_page.table(header, lines)
+
+
+def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
+    header = ["policy", "method in the paper", "success, paper", "success, here"]
+    header += [
+        "scenarios passed",
+        "clearance, paper [m]",
+        "here [m]",
+        "velocity, paper [m/s]",
+        "here [m/s]",
+    ]
+    rows = []
+    for policy, paper in PAPER.items():
+        there = f"{paper.successes}/{PAPER_FLIGHTS} ({paper.successes / PAPER_FLIGHTS:.0%})"
+        clearance, speed = f"{paper.min_clearance_m:+.2f}", f"{paper.mean_speed_m_s:.2f}"
+        flown = [row for row in table if row["policy"] == policy]
+        if not flown:
+            rows.append([policy, paper.method, there, "–", "–", clearance, "–", speed, "–"])
+        for row in flown:
+            ours = [html_page.number(row[name], form) for name, form in _COMPARED]
+            name = f"{policy} at {row['speed']:g} m/s"
+            here = [_rate(row), _passed(row)]
+            rows.append([name, paper.method, there, *here, clearance, ours[0], speed, ours[1]])
+    for row in table:
+        if row["policy"] not in PAPER:
+            ours = [html_page.number(row[name], form) for name, form in _COMPARED]
+            name = f"{escape(row['policy'])} at {row['speed']:g} m/s"
+            rows.append([name, "–", "–", _rate(row), _passed(row), "–", ours[0], "–", ours[1]])
+    note = (
+        '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
+        "the scenarios here are others of the same kinds, passed where most flights succeed.</p>"
+    )
+    return html_page.table(header, rows) + note
+
+
+def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    lines = []
+    for speed in config.speeds:
+        for first, second in combinations(config.policy_names, 2):
+            result = compare(rows, first, second, speed)
+            p = f"{result.p_value:.3f}" if result.p_value >= 0.001 else f"{result.p_value:.0e}"
+            pair = f"{escape(first)} and {escape(second)}"
+            lines.append([pair, f"{speed:g}", str(result.only_first), str(result.only_second), p])
+    if not lines:
+        return "<p>One policy: nothing to compare.</p>"
+    header = ["policies", "speed [m/s]", "only the first succeeds", "only the second", "p"]
+    return html_page.table(header, lines) + '<p class="note">Exact McNemar tests.</p>'
+
+
+def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]) -> str:
+    columns = [(policy, speed) for policy in config.policy_names for speed in config.speeds]
+    header = ["scenario", *(f"{escape(policy)}<br>{speed:g} m/s" for policy, speed in columns)]
+    names = list(dict.fromkeys(spec.scenario for spec in config.rollouts()))
+    lines = []
+    for name in names:
+        cells = []
+        for policy, speed in columns:
+            flown = select(rows, scenario=name, policy=policy, speed=speed)
+            cells.append(_rate(success_summary(flown)))
+        lines.append([escape(name) + (" <b>(not run)</b>" if name in absent else ""), *cells])
+    return html_page.table(header, lines)
+
+
+def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    spec = _telling_flight(rows)
+    if spec is None:
+        return "<p>Nothing was flown.</p>"
+    scenario = scenario_of(spec, folder.scenario(spec.scenario), folder.weights())
+    world = make_world(scenario.world, scenario.seed)
+    flights = {}
+    for policy in config.policy_names:
+        row, arrays = folder.read(spec._replace(policy=policy))
+        if arrays:
+            flights[policy] = arrays["states"][:, :3], row["outcome"]
+    p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
+    title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
+    figure = draw_trajectories(
+        world, flights, p_WS, goal_of(scenario, world), config.policy_names, title
+    )
+    png = save_png(figure, folder.path / "trajectories.png")
+    note = (
+        '<p class="note">Dark: obstacles at the height of the goal, cut out of the distance field; '
+        "light: where the vehicle's centre would touch them.</p>"
+    )
+    return html_page.image(png, title) + note
+
+
+def _telling_flight(rows: list[dict[str, Any]]) -> RolloutSpec | None:
+    """The field whose flights differ most in how they end, the first of equals."""
+    fields: dict[tuple, list[dict[str, Any]]] = {}
+    for row in rows:
+        fields.setdefault((row["scenario"], row["speed"], row["seed"]), []).append(row)
+
+    def variety(flown: list[dict[str, Any]]) -> tuple[int, int, float]:
+        wins = sum(row["success"] for row in flown)
+        length = sum(row.get("path_length_m", 0.0) for row in flown)
+        return min(wins, len(flown) - wins), wins, length
+
+    if not fields:
+        return None
+    row = max(fields.values(), key=variety)[0]
+    return RolloutSpec(row["scenario"], row["policy"], row["speed"], row["seed"])
+
+
+def _flights(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:
+    header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
+    sections = []
+    for name in dict.fromkeys(row["scenario"] for row in rows):
+        flown = select(rows, scenario=name)
+        lines = [
+            [
+                escape(row["id"]),
+                escape(row["outcome"]),
+                html_page.number(row.get("flight_time_s", math.nan), ".1f"),
+                html_page.number(row.get("min_clearance_m", math.nan), "+.2f"),
+                html_page.number(row.get("mean_speed_m_s", math.nan), ".2f"),
+                f"<code>splatpilot replay . {escape(row['id'])} --meshcat</code>",
+            ]
+            for row in flown
+        ]
+        sections.append(
+            f"<details><summary>{escape(name)}: {len(flown)} flights</summary>"
+            f"{html_page.table(header, lines)}</details>"
+        )
+    note = "<p>The commands run in the folder that holds this report.</p>"
+    return note + "".join(sections)
+
+
+def _program(folder: StudyFolder) -> str:
+    rows = [[escape(name), escape(value)] for name, value in folder.program().items()]
+    return html_page.table(["part", "version"], rows)

@@ -1,0 +1,221 @@
+"""A study on disk.
+
+    study.yaml       what is flown, and the program that flies it
+    scenarios/       the scenarios, every field written out
+    scenes/          the reconstructed scenes they fly in
+    weights/         of policies that were given as files
+    rollouts/        a trajectory and its measures for each flight
+    timings/         how long each took, and where: all that differs between two runs of a study
+    rollouts.csv, timings.csv, table.csv, report.html
+
+A flight is there when its file in `rollouts/` is; files appear whole.
+"""
+
+import csv
+import json
+import shutil
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from splatpilot.analysis.benchmark.rollout import ARRAYS, Rollout
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
+from splatpilot.systems.configuration import dump_config, load_config
+from splatpilot.systems.files import require_writable_folder, written_atomically
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """The files of a study."""
+
+    path: Path
+
+    def trajectory(self, id: str) -> Path:
+        """The file that holds a flight."""
+        return self.path / "rollouts" / f"{id}.npz"
+
+    def begin(
+        self, config: StudyConfig, scenarios: dict[str, Scenario], program: dict[str, str]
+    ) -> None:
+        """
+        Makes the folder, or checks that the one there is of the same study.
+
+        Args:
+            config: what is flown.
+            scenarios: by name, those that can be flown here.
+            program: `provenance.program()`.
+
+        Raises:
+            ValueError: if another study, or something else, is there.
+            OSError: if the folder cannot be written.
+        """
+        described = {
+            "format_version": FORMAT_VERSION,
+            "study": yaml.safe_load(dump_config(config)),
+            "program": program,
+        }
+        if (self.path / "study.yaml").is_file():
+            self._check_same(described)
+        elif self.path.is_dir() and any(self.path.iterdir()):
+            raise ValueError(
+                f"{self.path} is not empty and holds no study; choose another folder with --out"
+            )
+        require_writable_folder(self.path)
+        for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
+            (self.path / folder).mkdir(exist_ok=True)
+        for policy in config.policies:
+            if policy.endswith(".npz"):
+                self._keep_weights(Path(policy))
+        for name, scenario in scenarios.items():
+            self._keep_scenario(name, scenario)
+        if not (self.path / "study.yaml").is_file():
+            with written_atomically(self.path / "study.yaml") as path:
+                path.write_text(yaml.safe_dump(described, sort_keys=False))
+
+    def _check_same(self, described: dict[str, Any]) -> None:
+        there = self._described()
+        if there["study"] == described["study"]:
+            return
+        for name, value in described["study"].items():
+            if there["study"].get(name) != value:
+                raise ValueError(
+                    f"{self.path} holds a study with {name} {there['study'].get(name)}, not "
+                    f"{value}; choose another folder with --out, or ask for the same study"
+                )
+
+    def _keep_scenario(self, name: str, scenario: Scenario) -> None:
+        file = self.path / "scenarios" / f"{name}.yaml"
+        if isinstance(scenario.world, SceneSource):
+            self._keep_scene(scenario.world)
+        text = dump_config(scenario)
+        if file.is_file() and file.read_text() != text:
+            raise ValueError(
+                f"{file} differs from the scenario {name} of this program; choose another folder "
+                "with --out, or finish the study with the program that began it"
+            )
+        with written_atomically(file) as path:
+            path.write_text(text)
+
+    def _keep_scene(self, world: SceneSource) -> None:
+        """Copies a scene into the study, and lets `world` name the copy."""
+        scene = find_scene(world)
+        kept = self.path / "scenes" / scene.name
+        if not kept.exists():
+            partial = kept.with_name(f".{kept.name}.partial")
+            if scene.is_dir():
+                shutil.rmtree(partial, ignore_errors=True)
+                shutil.copytree(scene, partial)
+            else:
+                shutil.copyfile(scene, partial)
+            partial.rename(kept)
+        world.path = f"scenes/{kept.name}"
+
+    def _keep_weights(self, file: Path) -> None:
+        kept = self.path / "weights" / file.name
+        if kept.is_file() and kept.read_bytes() != file.read_bytes():
+            raise ValueError(
+                f"{file} has changed since {self.path} was begun; choose another folder with --out"
+            )
+        with written_atomically(kept) as path:
+            shutil.copyfile(file, path)
+
+    def weights(self) -> dict[str, str]:
+        """The files of the policies that were given as files, by name."""
+        return {file.stem: str(file.absolute()) for file in self.path.glob("weights/*.npz")}
+
+    def _described(self) -> dict[str, Any]:
+        file = self.path / "study.yaml"
+        try:
+            described = yaml.safe_load(file.read_text())
+            version = described["format_version"]
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{file}: there is no such file; a study is a folder that `splatpilot benchmark` "
+                "has written"
+            ) from None
+        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{file} describes no study: {error}") from None
+        if version != FORMAT_VERSION:
+            raise ValueError(
+                f"{file}: format version {version}, this program knows {FORMAT_VERSION}; use the "
+                "version of the program that made the study"
+            )
+        return described
+
+    def config(self) -> StudyConfig:
+        """What is flown.
+
+        Raises:
+            FileNotFoundError, ValueError: if the folder holds no study.
+        """
+        return StudyConfig(**self._described()["study"])
+
+    def program(self) -> dict[str, str]:
+        """What `begin` was told of the program."""
+        return self._described()["program"]
+
+    def scenario(self, name: str) -> Scenario:
+        """A scenario as this study flies it, its scene in this folder.
+
+        Raises:
+            FileNotFoundError, ValueError: if it is not there or damaged.
+        """
+        scenario = load_config(Scenario(), self.path / "scenarios" / f"{name}.yaml")
+        if isinstance(scenario.world, SceneSource):
+            scenario.world.path = str((self.path / scenario.world.path).absolute())
+        return scenario
+
+    def write(self, rollout: Rollout) -> None:
+        """Keeps a flight."""
+        id = rollout.row["id"]
+        with written_atomically(self.path / "timings" / f"{id}.json") as path:
+            path.write_text(json.dumps(rollout.timing))
+        with written_atomically(self.trajectory(id)) as path:
+            path.write_bytes(rollout.trajectory)
+
+    def read(self, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """
+        The row and the arrays of a flight; no arrays of one that an error ended.
+
+        Raises:
+            FileNotFoundError: if it is not there.
+            ValueError: if its file is damaged or of another flight.
+        """
+        file = self.trajectory(spec.id)
+        try:
+            with np.load(file) as arrays:
+                row = json.loads(str(arrays["row"]))
+                flown = {name: arrays[name] for name in ARRAYS if name in arrays}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(f"{file} is damaged: {error}") from None
+        if {name: row.get(name) for name in spec._fields} != spec._asdict():
+            raise ValueError(f"{file} is of another flight, {row}")
+        return {"id": spec.id} | row, flown
+
+    def read_timing(self, id: str) -> dict[str, Any]:
+        """How long a flight took; empty where that is not known."""
+        try:
+            return json.loads((self.path / "timings" / f"{id}.json").read_text())
+        except (OSError, ValueError):
+            return {}
+
+    def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
+        """Writes rows as CSV, with the columns of all of them."""
+        columns = list(dict.fromkeys(column for row in rows for column in row))
+        with (
+            written_atomically(self.path / name) as path,
+            path.open("w", newline="") as file,
+        ):
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)

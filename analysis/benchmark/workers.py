@@ -1,0 +1,99 @@
+"""Where the flights of a study are flown: worker processes here, or on a cluster."""
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+from splatpilot.analysis.benchmark.rollout import Rollout, chunks, fly_rollouts
+from splatpilot.analysis.benchmark.study import RolloutSpec
+
+CONNECT_TIMEOUT = 10.0
+"""[s], for a scheduler to answer."""
+
+_CHUNK = 6
+"""Most flights through one place handed out together: what of a kill is flown again."""
+
+_Work = tuple[list[RolloutSpec], str, dict[str, str]]
+"""Arguments of `fly_rollouts`."""
+
+
+def fly_all(
+    specs: list[RolloutSpec],
+    scenarios: dict[str, str],
+    jobs: int,
+    cluster: str | None = None,
+    weights: dict[str, str] | None = None,
+) -> Iterator[Rollout]:
+    """
+    Flies rollouts in worker processes and yields them as they end, in any order.
+
+    Args:
+        specs: what to fly; neighbours through the same place are flown by the same worker.
+        scenarios: by name, as YAML, without policy, speed and seed.
+        jobs: worker processes on this machine, 1 or more.
+        cluster: address of a dask scheduler, whose workers fly instead.
+        weights: files of weights by the names of their policies; others fly as they ship.
+
+    Raises:
+        OSError: if a worker process dies, or the cluster cannot be reached; all that was yielded
+            before is good.
+    """
+    work = [(chunk, scenarios[chunk[0].scenario], weights or {}) for chunk in chunks(specs, _CHUNK)]
+    if cluster is not None:
+        yield from _on_cluster(work, cluster)
+        return
+    yield from _in_processes(work, jobs)
+
+
+def _in_processes(work: list[_Work], jobs: int) -> Iterator[Rollout]:
+    from joblib import Parallel, delayed
+    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    # One more than the jobs are handed out ahead, so that no worker waits.
+    parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
+    fly = delayed(fly_rollouts)
+    try:
+        for rollouts in parallel(fly(*part) for part in work):
+            yield from rollouts
+    except TerminatedWorkerError as error:
+        raise OSError(
+            f"a worker process was killed, perhaps for want of memory ({error}); what was flown is "
+            "kept: run the same command again, with fewer --jobs if it repeats"
+        ) from None
+    finally:
+        if jobs > 1:
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+
+
+def _on_cluster(work: list[_Work], address: str) -> Iterator[Rollout]:
+    try:
+        from distributed import Client, as_completed
+        from distributed.scheduler import KilledWorker
+    except ImportError:
+        raise OSError(
+            "--cluster needs dask.distributed; pip install 'splatpilot[cluster]'"
+        ) from None
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise OSError(
+            f"no dask scheduler answers at {address} ({error}); start one with `dask scheduler` "
+            "and workers with `dask worker ADDRESS --nthreads 1`"
+        ) from None
+    with client:
+        # A chunk whose worker dies is given to another; flights are pure, so that costs only time.
+        futures = client.map(fly_rollouts, *zip(*work, strict=True), pure=False, retries=3)
+        try:
+            for _, rollouts in as_completed(futures, with_results=True):
+                yield from rollouts
+        except KilledWorker as error:
+            raise OSError(
+                f"the cluster's workers die of one and the same work ({error}); what was flown is "
+                "kept: give them more memory and run the same command again"
+            ) from None
+
+
+def default_jobs() -> int:
+    """One worker process for each core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,258 @@
+"""How far from its capture's path a scene can be trusted: the study of the paper's Fig. 7.
+
+Views beside the path are compared with the truth, which is exact where the capture was rendered
+from a world, and otherwise given by stretches of frames that are withheld from a reconstruction
+made for this. From it follows how far poses may be perturbed in training (Sec. IV-B).
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump_typed
+from pydrake.math import RigidTransform
+from tqdm import tqdm
+
+from splatpilot.analysis.fidelity.figures import write_curves, write_views
+from splatpilot.analysis.fidelity.off_path import choose_withheld, displaced_poses, without
+from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
+from splatpilot.analysis.fidelity.trust import first_crossing
+from splatpilot.analysis.fidelity.view_support import ViewSupport
+from splatpilot.analysis.reconstruction.measure_scene import (
+    SceneViews,
+    measure_scene,
+    read_measures,
+)
+from splatpilot.diagrams.worlds.scene_folder import (
+    SceneMetadata,
+    read_scene_metadata,
+    write_scene_metadata,
+)
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.render_capture import true_camera
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.reconstruct import reconstruct
+
+TrueCamera = Callable[[RigidTransform], CaptureFrame]
+"""Returns what the camera of a capture would have seen from another pose."""
+
+RECIPE = "reconstruct.yaml"
+_GRID = 0.1  # [m], steps in which the surroundings of a pose are tried
+
+
+@dataclass(kw_only=True)
+class FidelityConfig:
+    """What is tried, and what counts as trusted."""
+
+    offsets: list[float] = field(
+        default_factory=lambda: [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0]
+    )
+    """[m], to the left and right of the path, in worlds that can be rendered."""
+    clearance: float = 0.2
+    """[m], that a displaced camera keeps from everything."""
+    stretches: list[int] = field(default_factory=lambda: [1, 3, 7, 13])
+    """Lengths of the stretches of frames that are withheld, in turn, where nothing can be
+    rendered."""
+    kept: int = 5
+    """Frames kept between them."""
+    max_depth_error: float = 0.05
+    """Relative error of depth, mean over a view, of which the median view is still trusted."""
+    max_psnr_drop: float = 6.0
+    """[dB] below the held-out frames on the path that is still trusted: errors twice as large."""
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    """How to reconstruct without the withheld frames."""
+
+    def validate(self) -> None:
+        """Raises ValueError for values that make no sense."""
+        self.reconstruct.validate()
+        if sorted(set(self.offsets)) != self.offsets or not self.offsets or self.offsets[0] < 0:
+            raise ValueError(f"offsets are {self.offsets}; at least one, rising from 0 is needed")
+        if not self.stretches or min(self.stretches) < 1 or self.kept < 1:
+            raise ValueError(
+                f"stretches are {self.stretches} and kept is {self.kept}: at least 1 is needed"
+            )
+        for name in ("clearance", "max_depth_error", "max_psnr_drop"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, more than 0 is needed")
+
+
+def run(
+    scenes: Sequence[Path],
+    out: Path,
+    config: FidelityConfig,
+    find_camera: Callable[[Path], TrueCamera | None] = true_camera,
+) -> list[FidelityStudy]:
+    """Studies each scene folder, stores the bounds in its `scene.yaml` and writes figures.
+
+    `find_camera` returns, for the folder of a capture that was rendered, the camera that can render
+    the truth from anywhere, and None for others.
+
+    `out` gets `fidelity.png`, `fidelity.csv` and, for each scene, a sheet of views. What is
+    reconstructed without some frames is kept in `out/SCENE`, and used again.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: for a scene that is damaged, has no capture with
+            depth, or two of one name; settings that make no sense; a folder that cannot be written.
+    """
+    config.validate()
+    require_writable_folder(out)
+    names = [scene.resolve().name for scene in scenes]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two scenes have one name ({', '.join(names)}); rename one folder")
+    studies = []
+    for scene, name in zip(scenes, names, strict=True):
+        study = study_scene(scene, out / name, config, find_camera)
+        bounds = store_bounds(scene, study)
+        low, middle, high = np.percentile(bounds.pose_perturbation_bounds, [10, 50, 90])
+        print(study)
+        print(
+            f"perturbation bound {bounds.perturbation_bound:.2f} m; of single poses {low:.2f}, "
+            f"{middle:.2f}, {high:.2f} m (10, 50, 90 %)"
+        )
+        studies.append(study)
+    write_curves(out / "fidelity.png", studies)
+    _write_csv(out / "fidelity.csv", studies)
+    return studies
+
+
+def study_scene(
+    scene: Path,
+    out: Path,
+    config: FidelityConfig,
+    find_camera: Callable[[Path], TrueCamera | None] = true_camera,
+) -> FidelityStudy:
+    """Measures a scene beside the path of its capture; see `run`."""
+    views = SceneViews(scene)
+    capture = views.capture
+    if not capture.has_depth or not capture.metric:
+        raise ValueError(
+            f"{scene}: its capture {capture.source} has no metric depth, without which no depth "
+            "error can be measured"
+        )
+    camera = find_camera(Path(views.metadata.capture))
+    if camera is not None:
+        frames = _rendered_frames(views, scene, camera, config)
+    else:
+        views, frames = _withheld_frames(views, out, config)
+    support = _support(views)
+    samples, shown = [], []
+    for i, offset, frame in frames:
+        frame = views.shrunk(frame)
+        found = views.measure(frame)
+        if found.depth_mae_m is None:
+            continue
+        if offset is None:
+            offset = support.distance(frame.X_WC.translation())
+        unseen = 1 - support.of(frame.X_WC)
+        samples.append(Sample.of(i, offset, unseen, found))
+        shown.append(frame)
+    if len(samples) < 2:
+        raise ValueError(
+            f"{scene}: {len(samples)} views beside the path can be compared, at least 2 are "
+            "needed; try smaller offsets, a smaller clearance or shorter stretches"
+        )
+    write_views(out.with_name(f"{out.name}_views.png"), views, samples, shown)
+    measures = read_measures(scene) or measure_scene(scene, capture)
+    return FidelityStudy(
+        name=out.name,
+        kind="withheld" if camera is None else "rendered",
+        on_path_psnr_db=measures.mean("psnr_db") or float("nan"),
+        samples=samples,
+        max_depth_error=config.max_depth_error,
+        max_psnr_drop=config.max_psnr_drop,
+    )
+
+
+def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
+    """Returns how far each pose of the capture may be displaced [m].
+
+    A pose may go left, right, up and down (`displaced_poses`) as long as no more of its view is
+    unseen than the study found to be within the limits, and at most as far as was measured.
+    """
+    support = _support(views)
+    farthest = study.column("offset").max()
+    grid = np.append(np.arange(0, farthest - 1e-9, _GRID), farthest)
+    bounds = []
+    X_WCs = views.capture.X_WCs
+    for i in tqdm(range(len(X_WCs)), "bounds", unit="pose"):
+        sides = zip(*(displaced_poses(X_WCs, i, offset) for offset in grid), strict=True)
+        bounds.append(
+            min(
+                first_crossing(grid, (1 - support.of(X_WC) for X_WC in side), study.unseen_limit)
+                for side in sides
+            )
+        )
+    return bounds
+
+
+def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
+    """Writes how far poses may be perturbed into `scene.yaml`: each pose, and any pose.
+
+    The latter is the offset to which the median view stays within the limits where the truth was
+    rendered; a few poses bear less, as their own bounds say. Withheld frames do not say this
+    directly, for taking them away takes views away too: there it is the median over the poses.
+    """
+    bounds = pose_bounds(SceneViews(scene), study)
+    metadata = replace(
+        read_scene_metadata(scene),
+        perturbation_bound=study.reach if study.kind == "rendered" else float(np.median(bounds)),
+        pose_perturbation_bounds=bounds,
+    )
+    write_scene_metadata(scene, metadata)
+    return metadata
+
+
+def _write_csv(path: Path, studies: Sequence[FidelityStudy]) -> None:
+    text = io.StringIO()
+    names = [field.name for field in fields(Sample)]
+    writer = csv.writer(text)
+    writer.writerow(["scene", *names])
+    for study in studies:
+        writer.writerows([study.name, *asdict(sample).values()] for sample in study.samples)
+    with written_atomically(path) as partial:
+        partial.write_text(text.getvalue())
+
+
+def _support(views: SceneViews) -> ViewSupport:
+    capture = views.capture
+    return ViewSupport(views.renderer, capture.K, capture.width, capture.height, views.fitted_poses)
+
+
+def _rendered_frames(
+    views: SceneViews, scene: Path, camera: TrueCamera, config: FidelityConfig
+) -> Iterator[tuple[int, float, CaptureFrame]]:
+    """Yields the truth at the held-out poses and beside them, wherever a camera fits."""
+    esdf = Esdf.load(scene / "esdf.npz").conservative()
+    X_WCs = views.capture.X_WCs
+    numbers = views.metadata.held_out or range(len(X_WCs))
+    for i in tqdm(numbers, "rendering", unit="pose"):
+        for offset in config.offsets:
+            for X_WC in displaced_poses(X_WCs, i, offset)[: 2 if offset else 1]:
+                way = np.linspace(X_WCs[i].translation(), X_WC.translation(), 11)
+                if offset and esdf.distance(way[1:]).min() < config.clearance:
+                    continue
+                yield i, offset, camera(X_WC)
+
+
+def _withheld_frames(
+    views: SceneViews, out: Path, config: FidelityConfig
+) -> tuple[SceneViews, Iterator[tuple[int, None, CaptureFrame]]]:
+    """Reconstructs without stretches of frames and yields those."""
+    whole = views.capture
+    withheld = choose_withheld(len(whole), config.stretches, config.kept)
+    representation = views.metadata.representation
+    settings = replace(config.reconstruct, representation=representation, hold_out=0)
+    recipe = f"{yaml_dump_typed(settings)}withheld: {withheld}\n"
+    file = out / RECIPE
+    part = without(whole, withheld)
+    if not file.is_file() or file.read_text() != recipe:
+        reconstruct(part, out, settings)
+        with written_atomically(file) as partial:
+            partial.write_text(recipe)
+    frames = ((i, None, whole.frame(i)) for i in tqdm(withheld, "measuring", unit="frame"))
+    return SceneViews(out, part), frames

@@ -1,0 +1,157 @@
+"""Where things stand in a procedural forest: the one description that is both seen and hit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from splatpilot.diagrams.worlds.forest.config import TrunksConfig
+from splatpilot.diagrams.worlds.plot import Plot
+from splatpilot.diagrams.worlds.poisson_disk import poisson_disk
+from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
+from splatpilot.systems.collision.shapes import Capsule, HalfSpace, Sphere
+
+MARGIN = 14.0
+"""[m], width of the belt of trees around the flyable volume."""
+
+BURIED = 1.0
+"""[m], how deep trunks reach into the ground."""
+
+
+BARK = {OAK: "oak", PINE: "pine", BIRCH: "birch"}
+
+
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """N trees with round, straight trunks."""
+
+    base: NDArray[np.float64]  # (N, 2) [m], where the axis meets the ground
+    lean: NDArray[np.float64]  # (N, 2), way of the axis in x and y per metre of height
+    radius: NDArray[np.float64]  # (N,) [m]
+    height: NDArray[np.float64]  # (N,) [m], of the tip
+    species: NDArray[np.int64]  # (N,), OAK, PINE or BIRCH
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+    def at(self, z: float) -> NDArray[np.float64]:
+        """Returns where the axes are at height z: points (N, 3)."""
+        return np.column_stack([self.base + z * self.lean, np.full(len(self), z)])
+
+
+@dataclass(frozen=True, eq=False)
+class ForestLayout(Plot):
+    """Trees, rocks and fallen logs on the ground z = 0."""
+
+    trees: Trees
+    rocks: NDArray[np.float64]  # (M, 4) [m], spheres: centre and radius
+    logs: NDArray[np.float64]  # (L, 7) [m], capsules: two ends and radius
+
+    def room(self, p: ArrayLike) -> NDArray[np.float64]:
+        """Returns how far p (N, 2 or more) [m] are, in plan, from what stands or lies on the
+        ground, (N,), negative where it is covered."""
+        p = np.asarray(p)[:, :2]
+        gap, nearest = KDTree(self.trees.base).query(p)
+        room = gap - self.trees.radius[nearest]
+        for rock in self.rocks:  # cut by the ground in a smaller circle
+            foot = np.sqrt(rock[3] ** 2 - rock[2] ** 2)
+            room = np.minimum(room, np.linalg.norm(p - rock[:2], axis=1) - foot)
+        for log in self.logs:
+            way = log[3:5] - log[:2]
+            along = np.clip((p - log[:2]) @ way / (way @ way), 0, 1)
+            foot = np.sqrt(log[6] ** 2 - log[2] ** 2)
+            gap = np.linalg.norm(p - log[:2] - along[:, None] * way, axis=1)
+            room = np.minimum(room, gap - foot)
+        return room
+
+    def solids(self) -> tuple[list[Solid], list[Solid]]:
+        """Returns everything that can be the nearest surface to a point of the volume; and the
+        trees that cannot, and what of trunks is further up.
+
+        The ground is never further from such a point than the volume is high, so the distances are
+        exact without what stands further from the volume than that.
+        """
+        ceiling = self.upper[2]
+        trees = self.trees
+        near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
+        foot, top = trees.at(-BURIED), trees.at(ceiling + 2)
+        trunks = [
+            Solid(Capsule(p_A, p_B, float(r)), BARK[species], k)
+            for k, (p_A, p_B, r, species) in enumerate(
+                zip(foot, top, trees.radius, trees.species, strict=True)
+            )
+        ]
+        ground = Solid(HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0), "forest_floor")
+        logs = (Capsule(log[:3], log[3:6], float(log[6])) for log in self.logs)
+        rocks = (Sphere(rock[:3], float(rock[3])) for rock in self.rocks)
+        solids = [
+            ground,
+            *(trunk for trunk, is_near in zip(trunks, near, strict=True) if is_near),
+            *(Solid(log, "oak", k) for k, log in enumerate(logs)),
+            *(Solid(rock, "stone", k) for k, rock in enumerate(rocks)),
+        ]
+        tips = trees.base + 0.85 * trees.height[:, None] * trees.lean
+        upper = [
+            Solid(Capsule(p_A, np.array([*tip, 0.85 * h]), float(0.55 * r)), trunk.material, k)
+            for k, (p_A, tip, h, r, trunk) in enumerate(
+                zip(top, tips, trees.height, trees.radius, trunks, strict=True)
+            )
+            if 0.85 * h > ceiling + 2.5
+        ]
+        far = [trunk for trunk, is_near in zip(trunks, near, strict=True) if not is_near]
+        return solids, far + upper
+
+
+def lay_out(
+    config: TrunksConfig, rng: np.random.Generator, clear: ArrayLike, clearance: float
+) -> ForestLayout:
+    """Places everything, leaving discs of radius `clearance` [m] about `clear` (K, 2) open."""
+    clear = np.asarray(clear)
+    lower = np.array([0.0, -config.width / 2, 0.0])
+    upper = np.array([config.length, config.width / 2, config.height])
+    base = poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
+    N = len(base)
+    radius = rng.uniform(config.radius_min, config.radius_max, N)
+    angle, slope = rng.uniform(0, 2 * np.pi, N), np.tan(np.deg2rad(config.lean_max))
+    lean = slope * rng.uniform(0, 1, (N, 1)) * np.column_stack([np.cos(angle), np.sin(angle)])
+    trees = Trees(
+        base=base,
+        lean=lean,
+        radius=radius,
+        height=config.height + 14 * radius * rng.uniform(0.8, 1.6, N) + 3.0,
+        species=rng.choice([PINE, OAK, BIRCH], size=N, p=[0.5, 0.35, 0.15]),
+    )
+    blocked = radius + config.height * np.linalg.norm(lean, axis=1) + clearance
+    gap = np.linalg.norm(base[:, None] - clear, axis=-1)
+    open_ = (gap > blocked[:, None]).all(axis=1)
+    trees = Trees(*(getattr(trees, name)[open_] for name in Trees.__dataclass_fields__))
+
+    # Rocks and logs: apart from everything else, and so low that nobody has to fly around them.
+    taken = [*np.column_stack([trees.base, trees.radius]), *([*p, clearance] for p in clear)]
+    rocks, logs = [], []
+    for _ in range(config.rocks):
+        r = rng.uniform(0.25, 0.6)
+        p = _free_spot(rng, lower, upper, np.array(taken), r)
+        if p is not None:
+            rocks.append([*p, -0.5 * r, r])
+            taken.append([*p, r])
+    for _ in range(config.logs):
+        r, half, angle = rng.uniform(0.1, 0.18), rng.uniform(0.6, 1.1), rng.uniform(0, np.pi)
+        p = _free_spot(rng, lower, upper, np.array(taken), half + r)
+        if p is not None:
+            d = half * np.array([np.cos(angle), np.sin(angle)])
+            logs.append([*(p - d), 0.6 * r, *(p + d), 0.6 * r, r])
+            taken.append([*p, half + r])
+    return ForestLayout(lower, upper, trees, np.reshape(rocks, (-1, 4)), np.reshape(logs, (-1, 7)))
+
+
+def _free_spot(
+    rng: np.random.Generator, lower: NDArray, upper: NDArray, taken: NDArray, radius: float
+) -> NDArray[np.float64] | None:
+    """Draws the centre (2,) of a disc that meets none of the discs `taken` (K, 3): x, y, radius."""
+    draws = rng.uniform(lower[:2], upper[:2], (100, 2))
+    gap = np.linalg.norm(draws[:, None] - taken[:, :2], axis=-1) - taken[:, 2] - radius
+    free = (gap > 0.15).all(axis=1)
+    return draws[np.argmax(free)] if free.any() else None

@@ -1,0 +1,121 @@
+"""Daylight baked into colours: sun, sky and light thrown back by the ground."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatpilot.diagrams.worlds.solids.textures import fbm, smoothstep
+
+GAMMA = 2.2
+
+HAZE_RANGE = 16.0
+"""[m], way through the surroundings in which light fades by a factor e."""
+
+type Sunlit = Callable[[NDArray], NDArray]
+"""Maps points (N, 3) [m] to the part of the sun that reaches them, (N,) in [0, 1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Daylight:
+    """Irradiance, linear red, green, blue; a white surface under 1 shows as bright as it can."""
+
+    direction: NDArray[np.float64]  # (3,), unit vector from the ground to the sun, in W
+    sun: NDArray[np.float64]  # (3,) linear rgb
+    sky: NDArray[np.float64]  # (3,) linear rgb
+    ground: NDArray[np.float64]  # (3,) linear rgb
+    haze: NDArray[np.float64]  # (3,) sRGB, what everything fades to with distance
+
+    @classmethod
+    def sampled(cls, rng: np.random.Generator) -> "Daylight":
+        """Draws the hour: the lower the sun, the warmer its light."""
+        azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(32, 58))
+        warmth = 0.8 * float(smoothstep(58, 32, np.rad2deg(elevation)))
+        return cls(
+            direction=np.array(
+                [
+                    np.cos(elevation) * np.cos(azimuth),
+                    np.cos(elevation) * np.sin(azimuth),
+                    np.sin(elevation),
+                ]
+            ),
+            sun=2.6 * np.array([1.0, 0.93 - 0.08 * warmth, 0.80 - 0.22 * warmth]),
+            sky=0.74 * np.array([0.93, 1.0, 0.99]),
+            ground=0.33 * np.array([1.05, 1.0, 0.72]),
+            haze=np.array([0.80, 0.86, 0.86]) + warmth * np.array([0.05, 0.0, -0.06]),
+        )
+
+    def shaded(
+        self, albedo: ArrayLike, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
+    ) -> NDArray[np.float32]:
+        """Returns the colours, sRGB (N, 3), of surfaces in this light.
+
+        Args:
+            albedo: (N, 3), sRGB.
+            normal: (N, 3), unit, in W.
+            sunlit: (N,) in [0, 1], the part of the sun that reaches the surface.
+            leafy: leaves let light through, so both their sides are lit by sun on either.
+        """
+        linear = np.asarray(albedo) ** GAMMA * self.irradiance(normal, sunlit, leafy)
+        return developed(linear)
+
+    def irradiance(
+        self, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
+    ) -> NDArray[np.float64]:
+        """Returns the light, linear (N, 3), that falls on surfaces; arguments as of `shaded`."""
+        normal = np.asarray(normal)
+        facing = normal @ self.direction
+        facing = 0.35 + 0.65 * np.abs(facing) if leafy else np.clip(facing, 0, None)
+        up = 0.5 + 0.5 * normal[:, 2:]
+        return (
+            self.sun * (np.asarray(sunlit) * facing)[:, None]
+            + self.sky * (0.35 + 0.65 * up)
+            + self.ground * (1 - up)
+        )
+
+    def through_canopy(self, p: ArrayLike, height: float, seed: int) -> NDArray[np.float32]:
+        """Part of the sun that gaps in the leaves at `height` [m] let through to p (N, 3) [m]."""
+        p = np.asarray(p)
+        climb = np.clip(height - p[:, 2:], 0, None) / self.direction[2]
+        hit = p[:, :2] + climb * self.direction[:2]
+        gaps = fbm(hit * 0.42, 2, seed) + 0.55 * fbm(hit * 1.7, 2, seed + 7)
+        return smoothstep(0.0, 0.22, gaps)
+
+    def past_trunks(
+        self, p: ArrayLike, trunks: ArrayLike, radii: ArrayLike, height: float
+    ) -> NDArray[np.float32]:
+        """Part of the sun that upright trunks leave to the points p (N, 3) [m].
+
+        Args:
+            trunks: (M, 2) [m], where they stand.
+            radii: (M,) [m].
+            height: [m], where the crowns begin and trunks throw no shadow of their own.
+        """
+        p = np.asarray(p, dtype=np.float32)
+        flat = self.direction[:2] / np.linalg.norm(self.direction[:2])
+        reach = (height - p[:, 2]) * np.float32(np.hypot(*self.direction[:2]) / self.direction[2])
+        along_p = p[:, :2] @ flat.astype(np.float32)
+        across_p = p[:, :2] @ np.array([-flat[1], flat[0]], dtype=np.float32)
+        lit = np.ones(len(p), dtype=np.float32)
+        for trunk, radius in zip(np.asarray(trunks), np.asarray(radii), strict=True):
+            along = np.float32(trunk @ flat) - along_p
+            across = np.abs(np.float32(trunk @ (-flat[1], flat[0])) - across_p)
+            near = np.flatnonzero(
+                (along > 1.2 * radius) & (along < reach) & (across < radius + 0.3)
+            )
+            blur = 0.04 + 0.02 * along[near]  # penumbra widens with the way
+            edge = np.clip((across[near] - radius) / blur, -1, 1)
+            lit[near] = np.minimum(lit[near], 0.5 + 0.5 * edge)
+        return lit
+
+
+def developed(linear: ArrayLike) -> NDArray[np.float32]:
+    """Returns the sRGB colours of linear light: exposed like film, so that nothing clips."""
+    return ((1 - np.exp(-1.25 * np.asarray(linear))) ** (1 / GAMMA)).astype(np.float32)
+
+
+def hazed(colors: ArrayLike, haze: ArrayLike, distance: ArrayLike, range_: float) -> NDArray:
+    """Fades `colors` (N, 3) to `haze` (3,) as exp(-distance / range_); distance (N,) [m]."""
+    clear = np.exp(-np.asarray(distance, dtype=np.float64) / range_)[:, None]
+    return np.asarray(colors) * clear + np.asarray(haze) * (1 - clear)

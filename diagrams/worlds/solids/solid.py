@@ -1,0 +1,177 @@
+"""Solids: shapes that can be hit, made of a material that can be seen.
+
+A solid's surface is cut into faces, each with coordinates (u, v) in metres. Gaussians and meshes
+are both drawn from these faces and ask the same material for colours, so they look alike.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatpilot.diagrams.worlds.solids.materials import MATERIALS
+from splatpilot.diagrams.worlds.solids.surfaces import perpendicular
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A shape in W and what it is made of."""
+
+    shape: Shape
+    material: str
+    """A key of `MATERIALS`."""
+    seed: int = 0
+    """Solids of different seeds show different parts and tones of their material."""
+
+    def __post_init__(self) -> None:
+        if self.material not in MATERIALS:
+            raise ValueError(
+                f"material is {self.material!r}; it must be one of {', '.join(MATERIALS)}"
+            )
+
+    def albedo(self, uv: Array, p_W: Array) -> NDArray[np.floating]:
+        """Colours (N, 3), sRGB, of the points p_W (N, 3) [m] with face coordinates uv (N, 2)."""
+        return MATERIALS[self.material].albedo(uv, self._own(p_W), self.seed)
+
+    def _own(self, p_W: Array) -> Array:
+        """Points p_W (N, 3) in the solid's own frame: z along what is long, anywhere else in the
+        pattern for another seed."""
+        shape = self.shape
+        shift = 7.3 * np.array([self.seed % 61, self.seed % 53, 0.0])
+        match shape:
+            case Sphere():
+                return p_W - np.asarray(shape.p_WS) + shift
+            case Box():
+                return shape.X_WS.inverse().multiply(p_W.T).T + shift
+            case Capsule() | Cylinder():
+                p_WA = np.asarray(shape.p_WA, dtype=float)
+                e_1, e_2, axis, _ = _axes(shape)
+                return (p_W - p_WA) @ np.column_stack([e_1, e_2, axis]) + shift
+            case HalfSpace():
+                return p_W
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A piece of surface with coordinates u from 0 to size[0] and v from 0 to size[1] [m]."""
+
+    size: tuple[float, float]
+    at: Callable[[Array], tuple[Array, Array, Array]]
+    """Maps uv (N, 2) to points (N, 3), unit normals (N, 3) and unit directions of u (N, 3), in W;
+    coordinates beyond the face are continued or brought back to its edge."""
+    curved: tuple[float, float] = (np.inf, np.inf)
+    """Radii of curvature [m] along u and v: how finely a mesh must follow."""
+    round: bool = False
+    """Whether lines of constant u meet at poles, or the face is a disc: not for lattices."""
+
+
+def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
+    """Cuts the surface of `shape` into faces.
+
+    A half space must be horizontal; its face ends 28 m beyond the plan of [lower, upper] (3,).
+
+    Raises:
+        ValueError: for a half space that is not horizontal.
+    """
+    match shape:
+        case Sphere():
+            up = np.array([0.0, 0.0, 1.0])
+            return [_dome(np.asarray(shape.p_WS, float), np.eye(3)[0], up, shape.radius, -1.0)]
+        case Box():
+            return _box_faces(shape)
+        case Capsule() | Cylinder():
+            e_1, _, axis, length = _axes(shape)
+            p_WA, p_WB = np.asarray(shape.p_WA, float), np.asarray(shape.p_WB, float)
+            side = _side(p_WA, e_1, axis, shape.radius, length)
+            end = _dome if isinstance(shape, Capsule) else _disc
+            return [
+                side,
+                end(p_WA, e_1, -axis, shape.radius, 0.0),
+                end(p_WB, e_1, axis, shape.radius, 0.0),
+            ]
+        case HalfSpace():
+            if not np.allclose(np.asarray(shape.normal)[:2], 0):
+                raise ValueError(
+                    f"HalfSpace.normal is {shape.normal}; only horizontal ones can be seen"
+                )
+            up = float(np.sign(np.asarray(shape.normal)[2]))
+            low, high = np.asarray(lower)[:2] - 28.0, np.asarray(upper)[:2] + 28.0
+            corner = np.array([*low, up * shape.offset])
+            x, y = np.eye(3)[0], np.eye(3)[1]
+            return [_flat(corner, x, y, np.array([0, 0, up]), high[0] - low[0], high[1] - low[1])]
+
+
+def _flat(corner: Array, e_u: Array, e_v: Array, n: Array, width: float, height: float) -> Face:
+    def at(uv):
+        p = corner + uv[:, :1] * e_u + uv[:, 1:] * e_v
+        return p, np.tile(n, (len(uv), 1)), np.tile(e_u, (len(uv), 1))
+
+    return Face((width, height), at)
+
+
+def _box_faces(box: Box) -> list[Face]:
+    R, p = box.X_WS.rotation().matrix(), box.X_WS.translation()
+    half = np.asarray(box.size, float) / 2
+    faces = []
+    for k in range(3):
+        for sign in (-1.0, 1.0):
+            # Seen from outside u runs to the right and, on upright faces, v upwards.
+            u, v = ((1, 2), (0, 2), (0, 1))[k]
+            flip = -sign if k == 1 else sign
+            e_u, e_v, n = flip * R[:, u], R[:, v], sign * R[:, k]
+            corner = p + half[k] * n - half[u] * e_u - half[v] * e_v
+            faces.append(_flat(corner, e_u, e_v, n, 2 * half[u], 2 * half[v]))
+    return faces
+
+
+def _axes(shape: Capsule | Cylinder) -> tuple[Array, Array, Array, float]:
+    """Two unit vectors across the axis, the unit axis and the length [m]."""
+    way = np.asarray(shape.p_WB, float) - np.asarray(shape.p_WA, float)
+    length = float(np.linalg.norm(way))
+    e_1 = perpendicular(way / length)
+    return e_1, np.cross(way / length, e_1), way / length, length
+
+
+def _side(p_WA: Array, e_1: Array, axis: Array, radius: float, length: float) -> Face:
+    e_2 = np.cross(axis, e_1)
+
+    def at(uv):
+        angle = uv[:, :1] / radius
+        n = np.cos(angle) * e_1 + np.sin(angle) * e_2
+        p = p_WA + uv[:, 1:] * axis + radius * n
+        return p, n, -np.sin(angle) * e_1 + np.cos(angle) * e_2
+
+    return Face((2 * np.pi * radius, length), at, curved=(radius, np.inf))
+
+
+def _dome(center: Array, e_1: Array, axis: Array, radius: float, low: float) -> Face:
+    """The part of a sphere that is more than `low` radii along the axis: -1 for all, 0 for half."""
+    e_2 = np.cross(axis, e_1)
+    first = float(np.arcsin(low))
+
+    def at(uv):
+        longitude = uv[:, :1] / radius
+        latitude = np.clip(first + uv[:, 1:] / radius, first, np.pi / 2)
+        around = np.cos(longitude) * e_1 + np.sin(longitude) * e_2
+        n = np.cos(latitude) * around + np.sin(latitude) * axis
+        return center + radius * n, n, -np.sin(longitude) * e_1 + np.cos(longitude) * e_2
+
+    size = (2 * np.pi * radius, (np.pi / 2 - first) * radius)
+    return Face(size, at, curved=(radius, radius), round=True)
+
+
+def _disc(center: Array, e_1: Array, axis: Array, radius: float, _: float) -> Face:
+    """A flat end: u runs around, v outwards from the middle."""
+    e_2 = np.cross(axis, e_1)
+
+    def at(uv):
+        angle = uv[:, :1] / radius
+        out = np.clip(uv[:, 1:], 0, radius) * (np.cos(angle) * e_1 + np.sin(angle) * e_2)
+        along = -np.sin(angle) * e_1 + np.cos(angle) * e_2
+        return center + out, np.tile(axis, (len(uv), 1)), along
+
+    return Face((2 * np.pi * radius, radius), at, curved=(radius, np.inf), round=True)

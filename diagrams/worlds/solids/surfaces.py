@@ -1,0 +1,155 @@
+"""Shapes turned into flat Gaussians that lie on their surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+
+COVERAGE = 0.62
+"""Standard deviation over spacing at which a single layer of splats leaves no holes: midway between
+four neighbours, 0.71 spacings away, each still covers half of what lies behind it."""
+
+THICKNESS = 0.002
+"""[m], standard deviation of a splat across its surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """N elliptic patches of surface in W, not coloured yet."""
+
+    p: NDArray[np.float64]  # (N, 3) [m], centres
+    n: NDArray[np.float64]  # (N, 3), unit normals, outwards
+    t: NDArray[np.float64]  # (N, 3), unit directions of the first extent, in the surface
+    extent: NDArray[np.float64]  # (N, 2) [m], standard deviations along t and along n x t
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def __getitem__(self, rows: ArrayLike) -> Self:
+        """Returns the patches of a mask or of indices."""
+        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: list[Surfels]) -> Surfels:
+        """Returns all patches of `parts` in order."""
+        return cls(*(np.concatenate([getattr(s, f.name) for s in parts]) for f in fields(cls)))
+
+
+def colored(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike = 0.99) -> GaussianScene:
+    """Returns the patches as Gaussians with `colors` (N, 3) and `opacity`, a number or (N,)."""
+    N = len(surfels)
+    R_WP = np.stack([surfels.t, np.cross(surfels.n, surfels.t), surfels.n], axis=-1)
+    return GaussianScene.from_colors(
+        means=surfels.p,
+        quats=np.roll(Rotation.from_matrix(R_WP).as_quat(), 1, axis=1),
+        scales=np.column_stack([surfels.extent, np.full(N, THICKNESS)]),
+        opacities=np.broadcast_to(opacity, N),
+        colors=np.clip(colors, 0, 1),
+    )
+
+
+def merged(scenes: list[GaussianScene]) -> GaussianScene:
+    """Returns the Gaussians of all `scenes`, which share one degree of harmonics, in order."""
+    names = [f.name for f in fields(GaussianScene)]
+    return GaussianScene(**{n: np.concatenate([getattr(s, n) for s in scenes]) for n in names})
+
+
+def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
+    """Returns a unit vector perpendicular to each d (..., 3)."""
+    d = np.asarray(d, dtype=np.float64)
+    helper = np.where(np.abs(d[..., 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    v = np.cross(helper, d)
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def rectangle(
+    lower: ArrayLike, upper: ArrayLike, spacing: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Samples points (N, 2) on a jittered triangular grid that fills [lower, upper] in a plane."""
+    lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    row_spacing = spacing * np.sqrt(3) / 2
+    n = np.maximum(np.ceil((upper - lower) / (spacing, row_spacing)).astype(int), 1)
+    i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
+    cells = np.stack([i + 0.5 * (j % 2) + 0.25, j + 0.5], axis=-1).reshape(-1, 2)
+    return lower + (cells + rng.uniform(-0.22, 0.22, cells.shape)) * (upper - lower) / n
+
+
+def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLike) -> Surfels:
+    """Lays patches flat on a horizontal plane.
+
+    Args:
+        p: (N, 2) [m], where.
+        angle: (N,) [rad], direction of the first extent, from x towards y.
+        extent: (N, 2) or (2,) [m], standard deviations.
+        height: [m], a number or (N,), z of the patches.
+    """
+    p, angle = np.asarray(p, dtype=np.float64), np.asarray(angle, dtype=np.float64)
+    N, zeros = len(p), np.zeros(len(p))
+    return Surfels(
+        p=np.column_stack([p, np.broadcast_to(height, N)]),
+        n=np.tile((0.0, 0.0, 1.0), (N, 1)),
+        t=np.column_stack([np.cos(angle), np.sin(angle), zeros]),
+        extent=np.broadcast_to(extent, (N, 2)),
+    )
+
+
+def tube(
+    p_A: ArrayLike,
+    p_B: ArrayLike,
+    radius: float,
+    spacing: tuple[float, float],
+    rng: np.random.Generator,
+    taper: float = 1.0,
+) -> Surfels:
+    """Covers the side of the cylinder from p_A (3,) to p_B (3,) with staggered columns of patches.
+
+    Args:
+        radius: [m].
+        spacing: [m], around and along the axis.
+        taper: radius at p_B over radius at p_A; other than 1 makes a slender cone.
+
+    Returns:
+        The patches, first extent along the axis.
+    """
+    p_A, p_B = np.asarray(p_A, dtype=np.float64), np.asarray(p_B, dtype=np.float64)
+    length = float(np.linalg.norm(p_B - p_A))
+    axis = (p_B - p_A) / length
+    columns = max(6, round(2 * np.pi * radius / spacing[0]))
+    rows = max(1, round(length / spacing[1]))
+    i, j = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
+    jitter = rng.uniform(-0.25, 0.25, (2, columns, rows))
+    offset = rng.uniform(-0.5, 0.5, (columns, 1))  # no rings: every column starts elsewhere
+    angle = ((i + jitter[0]) * (2 * np.pi / columns)).ravel()
+    s = np.clip((j + 0.5 + offset + jitter[1]) / rows, 0, 1).ravel()
+    width = 1 + (taper - 1) * s
+    e_1 = perpendicular(axis)
+    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(axis, e_1))
+    across = COVERAGE * 2 * np.pi * radius / columns
+    return Surfels(
+        p=p_A + np.outer(s * length, axis) + (radius * width)[:, None] * normal,
+        n=normal,
+        t=np.tile(axis, (len(s), 1)),
+        extent=np.column_stack([np.full(len(s), COVERAGE * length / rows), across * width]),
+    )
+
+
+def sphere(p_C: ArrayLike, radius: float, spacing: float) -> Surfels:
+    """Covers the sphere about p_C (3,) evenly, along a spiral of golden angles."""
+    N = max(12, round(4 * np.pi * radius**2 / spacing**2))
+    k = np.arange(N)
+    z = 1 - (2 * k + 1) / N
+    angle = k * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z * z)
+    normal = np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
+    return Surfels(
+        p=np.asarray(p_C) + radius * normal,
+        n=normal,
+        t=perpendicular(normal),
+        extent=np.full((N, 2), COVERAGE * spacing),
+    )

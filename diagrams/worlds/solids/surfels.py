@@ -1,0 +1,181 @@
+"""Solids as Gaussians: flat patches on their faces, in the colours of their materials."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.illumination import Illumination, shade
+from splatpilot.diagrams.worlds.solids.materials import MATERIALS, Marks
+from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
+from splatpilot.diagrams.worlds.solids.surfaces import COVERAGE, Surfels, colored, rectangle
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.shapes import HalfSpace
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+
+Array = NDArray[np.float64]
+
+RAISED = 0.004
+"""[m], height of marks over the closed layer."""
+
+SOIL = 0.04
+"""[m], depth of the patches of the ground under it. Seen at a slant, the near half of each is drawn
+first, which brings the ground nearer than it is."""
+
+_BURIED = 0.05
+"""[m], depth inside another solid at which a patch cannot be seen any more."""
+
+
+def draw(blueprint: Blueprint, solids: list[Solid], light: Illumination) -> GaussianScene:
+    """Covers `solids`, all or some of the blueprint's, with Gaussians."""
+    rng = np.random.default_rng([blueprint.seed, 99])
+    scenes = []
+    for solid in solids:
+        patches, albedo, opacity = _patches(solid, blueprint, rng)
+        scenes.append((patches, albedo, opacity, solid))
+    surfels = Surfels.joined([patches for patches, *_ in scenes])
+    albedo = np.concatenate([albedo for _, albedo, *_ in scenes])
+    opacity = np.concatenate([opacity for _, _, opacity, _ in scenes])
+    seen = _seen(blueprint, surfels)
+    surfels, albedo, opacity = surfels[seen], albedo[seen], opacity[seen]
+    irradiance = light.irradiance(surfels.p, surfels.n)
+    colors = shade(albedo, irradiance, light.haze, blueprint.plot.outside(surfels.p))
+    return colored(surfels, colors, opacity)
+
+
+def _patches(
+    solid: Solid, blueprint: Blueprint, rng: np.random.Generator
+) -> tuple[Surfels, Array, Array]:
+    """Surfels of one solid with their albedo (N, 3) and opacity (N,)."""
+    material = MATERIALS[solid.material]
+    is_ground = isinstance(solid.shape, HalfSpace)
+    layers = []  # of patches, opacity, and the points at which the pattern is asked
+    for face in faces_of(solid.shape, blueprint.lower_W, blueprint.upper_W):
+        if is_ground:
+            uv, extent = _ground(face, material.spacing, blueprint, rng)
+        elif face.round:
+            uv, extent = _spiral(face, material.spacing, rng)
+        else:
+            uv, extent = _closed(face, material.spacing, rng)
+        facing = _faces(blueprint, *face.at(uv)[:2])
+        if not facing.any():
+            continue
+        uv, extent = uv[facing], extent[facing]
+        p, n, t = face.at(uv)
+        depth = SOIL if is_ground else 0.0
+        # Means of the pattern at two places: thin lines tint all the patches they cross instead of
+        # dotting some.
+        near = [uv + corner * extent for corner in _CORNERS]
+        layers.append((Surfels(p - depth * n, n, t, extent), 0.99, face, near))
+        for marks in () if face.round else material.marks:
+            low, high = np.zeros(2), np.array(face.size)
+            if is_ground:
+                low, high = np.full(2, 27.5), high - 27.5
+            uv, extent = _marked(marks, low, high, rng)
+            p, n, t = face.at(uv)
+            raised = Surfels(p + (RAISED - depth / 2) * n, n, t, extent)
+            layers.append((raised, 0.93, face, [uv]))
+    if not layers:
+        zero = np.zeros((0, 3))
+        return Surfels(zero, zero, zero, zero[:, :2]), zero, zero[:, 0]
+    uv = np.concatenate([q for *_, samples in layers for q in samples])
+    p = np.concatenate([face.at(q)[0] for *_, face, samples in layers for q in samples])
+    colors = solid.albedo(uv, p)  # all at once: patterns cost more by the call than by the point
+    albedo, start = [], 0
+    for patches, _, _, samples in layers:
+        stop = start + len(patches) * len(samples)
+        albedo.append(colors[start:stop].reshape(len(samples), len(patches), 3).mean(axis=0))
+        start = stop
+    tinted = np.concatenate(albedo)
+    tinted = tinted * rng.uniform(0.95, 1.05, (len(tinted), 1))
+    opacity = np.concatenate([np.full(len(patches), o) for patches, o, *_ in layers])
+    return Surfels.joined([patches for patches, *_ in layers]), tinted, opacity
+
+
+_CORNERS = ((0.4, 0.7), (-0.4, -0.7))
+"""Places about the middle of a patch, in standard deviations."""
+
+
+def _closed(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Coordinates uv (N, 2) [m] of a jittered lattice that divides the face evenly, and standard
+    deviations (N, 2) [m] with which it leaves no holes."""
+    size = np.array(face.size)
+    n = np.maximum(np.ceil(size / spacing - 1e-6).astype(int), 1)
+    if np.isfinite(face.curved[0]):
+        n[0] = max(n[0], 6)
+    step = size / n
+    i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
+    uv = np.stack([i + 0.5, j + 0.5], axis=-1).reshape(-1, 2)
+    uv = (uv + rng.uniform(-0.2, 0.2, uv.shape)) * step
+    return uv, np.tile(COVERAGE * step, (len(uv), 1))
+
+
+def _marked(marks: Marks, low: Array, high: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Coordinates uv (N, 2) [m] of the marks between the corners `low` and `high` (2,) of a face,
+    and their standard deviations (N, 2) [m]; they stand where the pattern has them."""
+    cell = np.array(marks.cell)
+    first, last = np.floor(low / cell).astype(int), np.ceil(high / cell).astype(int)
+    i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
+    places = np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1).reshape(-1, 2) + marks.first
+    extent = np.tile(cell * marks.fill, (len(places), 1))
+    if marks.jitter:
+        places = places + rng.uniform(-marks.jitter, marks.jitter, places.shape)
+        extent = extent * rng.uniform(0.6, 1.25, extent.shape)
+    uv = places * cell
+    on_it = ((uv > low + 0.5 * extent) & (uv < high - 0.5 * extent)).all(axis=1)
+    return uv[on_it], extent[on_it]
+
+
+def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Coordinates (N, 2) and standard deviations (N, 2) that cover a round face evenly, along a
+    spiral of golden angles: equal steps in area from the rim to the pole."""
+    radius, (around, height) = face.curved[0], face.size
+    flat = not np.isfinite(face.curved[1])
+    whole = height > 0.4 * around  # a full sphere, not half
+    area = np.pi * radius**2 * (1 if flat else 4 if whole else 2)
+    N = max(6, round(area / spacing**2))
+    part = (np.arange(N) + 0.5) / N
+    angle = np.arange(N) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
+    if flat:
+        v = radius * np.sqrt(part)
+    else:
+        first = -1.0 if whole else 0.0
+        latitude = np.arcsin(first + (1 - first) * part)
+        v = radius * (latitude - np.arcsin(first))
+    step = np.sqrt(area / N)
+    return np.column_stack([radius * angle, v]), np.full((N, 2), COVERAGE * step)
+
+
+def _ground(
+    face: Face, spacing: float, blueprint: Blueprint, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Covers a horizontal plane: finely in the volume, coarsely far out."""
+    lower, upper = blueprint.lower_W[:2], blueprint.upper_W[:2]
+    corner = lower - 28.0
+    uv, extent = [], []
+    inner = 0.0
+    for outer, coarse in ((0.5, 1.0), (4.0, 2.0), (9.0, 4.0), (16.0, 7.0), (28.0, 12.0)):
+        p = rectangle(lower - outer, upper + outer, coarse * spacing, rng)
+        p = p[blueprint.plot.outside(p) >= inner] if inner else p
+        uv.append(p - corner)
+        extent.append(COVERAGE * coarse * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
+        inner = outer
+    return np.concatenate(uv), np.concatenate(extent)
+
+
+def _faces(blueprint: Blueprint, p_W: Array, n_W: Array) -> NDArray[np.bool_]:
+    """Whether surfaces at p_W (N, 3) [m] with normals n_W (N, 3) face any point of the volume."""
+    corner = np.where(n_W > 0, blueprint.upper_W, blueprint.lower_W)
+    return np.einsum("nk,nk->n", n_W, corner - p_W) > 1e-9
+
+
+def _seen(blueprint: Blueprint, surfels: Surfels) -> NDArray[np.bool_]:
+    """Whether a patch faces the volume and lies in no other solid."""
+    faces = _faces(blueprint, surfels.p, surfels.n)
+    field = AnalyticDistanceField(
+        [solid.shape for solid in blueprint.solids],
+        blueprint.lower_W - 40.0,
+        blueprint.upper_W + 40.0,
+    )
+    rows = np.flatnonzero(faces)
+    faces[rows] = field.distance(surfels.p[rows]) > -_BURIED
+    return faces

@@ -1,0 +1,1 @@
+"""Learned drone flight inside Gaussian-splat reconstructions of real places, as Drake systems."""

@@ -1,0 +1,293 @@
+"""Studies, whole, interrupted and damaged."""
+
+import csv
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpilot.analysis.benchmark import replay
+from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.cli import main
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory) -> tuple[StudyConfig, Path]:
+    """A study flown without interruption in this process, and its folder; not to be changed."""
+    folder = tmp_path_factory.mktemp("study")
+    scenario = folder / "short.yaml"
+    scenario.write_text(
+        "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
+        "timeout: 1.5\n"
+    )
+    config = StudyConfig([str(scenario)], ["straight", "planner"], [2.0], seeds=3)
+    benchmark.run(config=config, out=folder / "out", jobs=1)
+    return config, folder / "out"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files that must be the same in two runs of a study."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not re.match(r"timings|report\.html", str(path.relative_to(folder)))
+    }
+
+
+def rows_of(file: Path) -> list[dict[str, str]]:
+    with file.open() as lines:
+        return list(csv.DictReader(lines))
+
+
+def test_study_leaves_what_it_promises(study):
+    """Each flight has a row, a trajectory that agrees with it and a timing; the report holds its
+    pictures.
+    """
+    config, out = study
+    rows = rows_of(out / "rollouts.csv")
+    assert [row["id"] for row in rows] == [spec.id for spec in config.rollouts()]
+    for row, spec in zip(rows, config.rollouts(), strict=True):
+        _, arrays = StudyFolder(out).read(spec)
+        assert arrays["times"][-1] == pytest.approx(float(row["flight_time_s"]))
+        least = float(np.nanmin(arrays["clearances"]))
+        assert least == pytest.approx(float(row["min_clearance_m"]), abs=1e-6)
+    assert {row["id"] for row in rows_of(out / "timings.csv")} == {row["id"] for row in rows}
+    table = rows_of(out / "table.csv")
+    assert [row["policy"] for row in table] == config.policies
+    assert all(int(row["flights"]) == 3 for row in table)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "http" not in page.replace("http-equiv", "")
+    assert all(f"splatpilot replay . {row['id']} --meshcat" in page for row in rows)
+    assert not [path for path in out.rglob(".*")]
+
+
+def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_path):
+    """A study with two workers is killed without warning after its first flight; finished by
+    another number of workers, all its files but the timings equal the uninterrupted study's.
+    """
+    config, whole = study
+    out = tmp_path / "killed"
+    command = [
+        sys.executable,
+        "-c",
+        "from splatpilot.analysis.cli import main; main()",
+        "benchmark",
+    ]
+    command += ["--scenarios", config.scenarios[0], "--policies", ",".join(config.policies)]
+    process = subprocess.Popen(
+        [*command, "--seeds", "3", "--jobs", "2", "--out", str(out)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while process.poll() is None and not list(out.glob("rollouts/*.npz")):
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
+    flown = {path.name: path.stat().st_mtime_ns for path in out.glob("rollouts/*.npz")}
+    assert 0 < len(flown) < 6
+    assert not (out / "report.html").exists()
+
+    benchmark.run(config=config, out=out, jobs=1)
+    assert contents(out) == contents(whole)
+    for name, when in flown.items():
+        assert (out / "rollouts" / name).stat().st_mtime_ns == when
+
+
+def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys):
+    """A truncated trajectory, and one of another flight, are named, flown again and equal what was
+    there; nothing else is flown.
+    """
+    config, whole = study
+    out = tmp_path / "damaged"
+    shutil.copytree(whole, out)
+    files = [out / "rollouts" / f"{spec.id}.npz" for spec in config.rollouts()]
+    files[0].write_bytes(files[0].read_bytes()[:-100])
+    shutil.copyfile(files[4], files[3])
+    untouched = files[1].stat().st_mtime_ns
+    benchmark.run(config=config, out=out, jobs=1)
+    printed = capsys.readouterr().out
+    assert f"{files[0]} is damaged" in printed
+    assert f"{files[3]} is of another flight" in printed
+    assert "4 of 6 flights are there already" in printed
+    assert contents(out) == contents(whole)
+    assert files[1].stat().st_mtime_ns == untouched
+    assert "is damaged" in (out / "report.html").read_text()
+
+
+def test_folder_of_another_study_is_refused(study, tmp_path):
+    """Another specification, another program and a folder that holds something else are refused,
+    and nothing in them changes.
+    """
+    config, whole = study
+    before = contents(whole)
+    with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 4"):
+        benchmark.run(config=replace(config, seeds=4), out=whole, jobs=1)
+    with pytest.raises(ValueError, match=r"study with overrides \[\], not \['timeout=2'\]"):
+        benchmark.run(config=replace(config, overrides=["timeout=2"]), out=whole, jobs=1)
+    assert contents(whole) == before
+    other = tmp_path / "other"
+    shutil.copytree(whole, other)
+    next(other.glob("rollouts/*")).unlink()
+    text = (other / "study.yaml").read_text()
+    (other / "study.yaml").write_text(re.sub(r"numpy: .*", "numpy: 0.1", text))
+    with pytest.raises(ValueError, match=r"begun with numpy 0.1, this is"):
+        benchmark.run(config=config, out=other, jobs=1)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("")
+    with pytest.raises(ValueError, match="is not empty and holds no study"):
+        benchmark.run(config=config, out=tmp_path / "full", jobs=1)
+
+
+def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, capsys):
+    """A scenario without its scene is reported with what to do, and counts neither as flown nor as
+    failed.
+    """
+    absent = tmp_path / "R99.yaml"
+    absent.write_text(f"world: !SceneConfig {{path: {tmp_path / 'nowhere'}}}\n")
+    config = StudyConfig([str(short_scenario), str(absent)], ["straight"], [2.0], seeds=2)
+    table = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    assert (table[0]["flights"], table[0]["not_run"]) == (2, 2)
+    printed = capsys.readouterr().out
+    assert f"R99 is not flown: {tmp_path / 'nowhere'}: there is no such scene" in printed
+    assert "R99 was not run" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_flight_that_cannot_start_is_a_failure_with_a_reason(short_scenario, tmp_path, capsys):
+    """An error of one flight ends neither the study nor hides: its row tells it."""
+    config = StudyConfig([str(short_scenario)], ["straight"], [2.0], 1, ["goal=[50, 0, 1.8]"])
+    table = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    assert (table[0]["flights"], table[0]["successes"], table[0]["error"]) == (1, 0, 1)
+    assert "is outside the world" in rows_of(tmp_path / "out" / "rollouts.csv")[0]["error"]
+    assert "is outside the world" in capsys.readouterr().out
+
+
+def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
+    """From a copy of the folder elsewhere a flight replays to the last bit, and a record that was
+    changed by a millimetre does not agree.
+    """
+    config, whole = study
+    copy = tmp_path / "elsewhere"
+    shutil.copytree(whole, copy)
+    spec = config.rollouts()[1]
+    assert main(["replay", str(copy), spec.id, "--meshcat", "--video"]) == 0
+    assert "equals the recorded flight to the last bit" in capsys.readouterr().out
+    assert (copy / "replays" / spec.id / "flight.html").stat().st_size > 1e5
+    assert (copy / "replays" / spec.id / "flight.mp4").stat().st_size > 1e3
+
+    file = StudyFolder(copy).trajectory(spec.id)
+    with np.load(file) as arrays:
+        changed = dict(arrays)
+    changed["states"][-1, 0] += 0.001
+    changed["row"] = np.array(str(changed["row"]).replace('"digest": "', '"digest": "0'))
+    np.savez(file, **changed)
+    result = replay.run(study=copy, id=spec.id)
+    assert not result.exact
+    assert result.deviation == pytest.approx(0.001, rel=0.01)
+    assert "THE REPLAY DIFFERS" in capsys.readouterr().out
+
+
+def test_weights_of_ones_own_fly_in_a_study_that_keeps_them(short_scenario, tmp_path):
+    """A policy given as a file of weights is named after it, flies by them and not by those that
+    ship, replays without the file, and the study is refused when the file changes.
+    """
+    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+
+    def write(thrust: float) -> None:
+        weights = {**shipped.weights, "head.weight": 0.0 * shipped.weights["head.weight"]}
+        weights["head.bias"] = np.array([0.0, 0.0, thrust], np.float32)
+        PolicyCheckpoint("diffaero", shipped.spec, weights, {}).save(tmp_path / "mine.npz")
+
+    write(2.0)
+    policies = ["diffaero", str(tmp_path / "mine.npz")]
+    config = StudyConfig([str(short_scenario)], policies, seeds=1)
+    folder = StudyFolder(tmp_path / "out")
+    benchmark.run(config=config, out=folder.path, jobs=1)
+    rows = rows_of(folder.path / "rollouts.csv")
+    assert [row["policy"] for row in rows] == ["diffaero", "mine"]
+    risen = [folder.read(spec)[1]["states"] for spec in config.rollouts()][1]
+    z, v_z = risen[-1, 2] - risen[0, 2], risen[-1, 5]
+    assert z > 1.0 and v_z > 2.0  # straight up, as these weights say
+
+    write(-2.0)
+    with pytest.raises(ValueError, match=r"mine.npz has changed since"):
+        benchmark.run(config=config, out=folder.path, jobs=1)
+    (tmp_path / "mine.npz").unlink()
+    assert replay.run(study=folder.path, id="short-mine-2-000").exact
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["replay", "{out}", "short-planner-2-999"], "has no flight 'short-planner-2-999'"),
+        (["replay", "{out}/rollouts", "a"], "study.yaml: there is no such file"),
+        (["benchmark", "--out", "{out}", "--scenarios", "P99"], "there is no scenario 'P99'"),
+        (["benchmark", "--out", "{out}", "--speeds", "fast"], "the speed 'fast' is no number"),
+        (
+            ["benchmark", "--out", "{out}", "--scenarios", "{scenario}", "--policies", "nobody"],
+            "there is no policy 'nobody'",
+        ),
+        (
+            ["benchmark", "--out", "{out}", "--scenarios", "{scenario}", "--jobs", "0"],
+            "--jobs is 0",
+        ),
+    ],
+)
+def test_bad_command_is_one_message(study, arguments, message, capsys):
+    """Every user error ends with one message and exit status 1."""
+    config, out = study
+    words = [word.format(out=out, scenario=config.scenarios[0]) for word in arguments]
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("splatpilot: ")
+    assert message in error
+
+
+def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(study, tmp_path):
+    """Two worker processes of a dask cluster fly the study; one is killed once both have begun, and
+    the files equal those of the study flown here.
+    """
+    distributed = pytest.importorskip("distributed")
+    config, whole = study
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        with distributed.Client(cluster) as client:
+            victim, _ = client.run(os.getpid).values()
+        killed = []
+
+        def write_and_kill(folder: StudyFolder, rollout) -> None:
+            StudyFolder.write_there(folder, rollout)
+            if not killed:
+                killed.append(os.kill(victim, signal.SIGKILL))
+
+        patch = pytest.MonkeyPatch()
+        patch.setattr(StudyFolder, "write_there", StudyFolder.write, raising=False)
+        patch.setattr(StudyFolder, "write", write_and_kill)
+        try:
+            out = tmp_path / "cluster"
+            benchmark.run(config=config, out=out, cluster=cluster.scheduler_address)
+        finally:
+            patch.undo()
+    assert killed
+    assert contents(out) == contents(whole)
+
+
+def test_cluster_that_is_not_there_is_named(study, tmp_path, monkeypatch):
+    """An address nobody answers at is named with what to start."""
+    config, _ = study
+    monkeypatch.setattr("splatpilot.analysis.benchmark.workers.CONNECT_TIMEOUT", 0.5)
+    with pytest.raises(OSError, match=r"tcp://127.0.0.1:1 .*dask worker"):
+        benchmark.run(config=config, out=tmp_path / "out", cluster="tcp://127.0.0.1:1")

@@ -1,0 +1,38 @@
+"""Tables of flights made up by hand."""
+
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.tables import format_table, policy_table, scenarios_passed
+
+
+def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:
+    return [
+        {
+            "policy": policy,
+            "scenario": scenario,
+            "speed": 2.0,
+            "success": success,
+            "outcome": "goal" if success else "timeout",
+            "min_clearance_m": 0.5 if success else 0.1,
+        }
+        for success in successes
+    ]
+
+
+def test_scenario_is_passed_where_most_flights_succeed():
+    """Two of three flights pass a scenario, one of two does not, nor does none."""
+    rows = flights("a", "P01", [True, True, False]) + flights("a", "P02", [True, False])
+    rows += flights("a", "P03", [False])
+    assert scenarios_passed(rows) == {"scenarios": 3, "scenarios_passed": 1}
+
+
+def test_table_has_a_row_for_each_policy():
+    """Each row counts its own policy's flights alone, and says so in the terminal."""
+    rows = flights("planner", "P01", [True, True]) + flights("straight", "P01", [True, False])
+    config = StudyConfig(["P01"], ["planner", "straight"], [2.0], seeds=2)
+    table = policy_table(rows, config)
+    assert [row["successes"] for row in table] == [2, 1]
+    assert [row["scenarios_passed"] for row in table] == [1, 0]
+    assert [row["timeout"] for row in table] == [0, 1]
+    assert [round(row["min_clearance_m"], 6) for row in table] == [0.5, 0.3]
+    planner, straight = format_table(table).splitlines()[1:]
+    assert "2/2" in planner and "1/1" in planner and "0/1" in straight

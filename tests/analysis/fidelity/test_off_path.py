@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.analysis.fidelity.off_path import choose_withheld, displaced_poses, without
+
+
+def test_withheld_stretches():
+    """Stretches come in turn, with as many kept frames before, between and after them."""
+    assert choose_withheld(16, [1, 3], 2) == [2, 5, 6, 7, 10]
+    assert choose_withheld(5, [1], 2) == [2]
+    with pytest.raises(ValueError, match="4 frames are too few to withhold 1 between 2"):
+        choose_withheld(4, [1], 2)
+
+
+def test_capture_without_frames(place):
+    """The rest of a capture has the other frames, in order, with their images and depths."""
+    rest = without(place.capture, [0, 2, 3])
+    assert len(rest) == 13
+    for k, i in ((0, 1), (1, 4), (12, 15)):
+        assert rest.X_WCs[k] is place.capture.X_WCs[i]
+        np.testing.assert_array_equal(rest.load_image(k), place.capture.load_image(i))
+        np.testing.assert_array_equal(rest.load_depth(k), place.capture.load_depth(i))
+    assert rest.has_depth
+
+
+def test_displaced_poses():
+    """Along a path, left is horizontal and at right angles to it, up is up, and the camera keeps
+    looking the same way."""
+    R_WC = RotationMatrix.MakeZRotation(0.3)
+    path = [RigidTransform(R_WC, [1.0 * i, 2.0 * i, 0.5 * i]) for i in range(4)]
+    p_WC = path[1].translation()
+    left = np.array([-2, 1, 0]) / np.sqrt(5)
+    expected = (0.4 * left, -0.4 * left, [0, 0, 0.4], [0, 0, -0.4])
+    for X_WC, step in zip(displaced_poses(path, 1, 0.4), expected, strict=True):
+        np.testing.assert_allclose(X_WC.translation(), p_WC + step, atol=1e-12)
+        np.testing.assert_array_equal(X_WC.rotation().matrix(), R_WC.matrix())
+
+
+def test_displaced_poses_without_a_way():
+    """Where a path stands still or climbs, left is to the left of the camera."""
+    R_WC = RotationMatrix.MakeZRotation(0.3)
+    climb = [RigidTransform(R_WC, [0.0, 0.0, 1.0 * i]) for i in range(3)]
+    for path in (climb[:1], climb):
+        left = displaced_poses(path, 0, 0.5)[0].translation() - path[0].translation()
+        np.testing.assert_allclose(left, -0.5 * R_WC.matrix()[:, 0], atol=1e-12)

@@ -1,0 +1,122 @@
+import csv
+from dataclasses import asdict
+
+import cv2
+import numpy as np
+import pytest
+
+from splatpilot.analysis.cli import main
+from splatpilot.analysis.reconstruction import ablation
+from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
+from splatpilot.analysis.reconstruction.measure_scene import SceneMeasures
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.measures import ViewMeasures
+
+SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=0.2")
+
+
+def ablate(place) -> int:
+    settings = [word for setting in SETTINGS for word in ("--set", setting)]
+    return main(["ablate", "room", "--out", str(place.folder), *settings])
+
+
+def test_ablation_end_to_end(place, capsys, monkeypatch):
+    """Four arms are made and measured on held-out frames, the paper's table stands beside ours, and
+    a second run makes nothing again."""
+    assert ablate(place) == 0
+    printed = capsys.readouterr().out
+    assert "paper    3DGS + depth (ours)  28.89      0.8676  0.184" in printed
+    table = (place.folder / "ablation.md").read_text()
+    assert "| paper | Vanilla 2DGS | 29.07 | 0.8656 | 0.228 | 1.466 | 13.00% |" in table
+    with open(place.folder / "ablation.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["arm"] for row in rows] == [arm.key for arm in ARMS] * 2
+    for arm, row in zip(ARMS, rows, strict=False):
+        metadata = read_scene_metadata(place.folder / "room" / arm.key)
+        assert metadata.representation == arm.representation
+        assert metadata.held_out == [0, 8]
+        assert float(row["psnr_db"]) > 5 and row["lpips"] == ""
+        assert f"{float(row['psnr_db']):.2f}" in printed
+    assert np.shape(cv2.imread(str(place.folder / "room.png")))[1] > 5 * 64
+
+    def fail(*args, **kwargs):
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(ablation, "reconstruct", fail)
+    assert ablate(place) == 0
+    assert (
+        capsys.readouterr().out
+        == printed.replace("".join(f"room: {arm.title}\n" for arm in ARMS), "")
+        or "made again" not in printed
+    )
+    # An arm that is missing would be made.
+    (place.folder / "room" / "2dgs" / "reconstruct.yaml").unlink()
+    with pytest.raises(AssertionError, match="made again"):
+        ablate(place)
+
+
+def test_arms_of_other_settings_are_not_mixed(place, capsys):
+    """Arms that were made with other settings are refused, not reported as if of these."""
+    arm = place.scene("3dgs")
+    (place.folder / "room").mkdir()
+    arm.rename(place.folder / "room" / "3dgs")
+    (place.folder / "room" / "3dgs" / "reconstruct.yaml").write_text("iterations: 1\n")
+    assert ablate(place) == 1
+    assert "this arm was made with other settings" in capsys.readouterr().err
+
+
+def test_photometric_arms_see_no_depth():
+    """Only the arms with depth start from it and have a depth term; all share steps and sizes."""
+    config = ReconstructConfig(iterations=123)
+    for arm in ARMS:
+        settings = arm_config(arm, config)
+        assert settings.representation == arm.representation
+        assert (settings.iterations, settings.hold_out) == (123, config.hold_out)
+        assert (settings.depth_weight > 0) == arm.depth
+        assert settings.initialization == ("depth" if arm.depth else "points")
+        changed = {k for k, v in asdict(config).items() if asdict(settings)[k] != v}
+        assert changed <= {
+            "representation",
+            "initialization",
+            "depth_weight",
+            "strategy",
+            "distance_field",
+        }
+
+
+def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
+    view = ViewMeasures(psnr, 0.9, None, mae, mae / 2, share, 1.0)
+    return SceneMeasures(True, 8, 8, {0: view}, "none")
+
+
+def test_means_and_spreads():
+    """Over several captures come means with the sample standard deviation, and what depth did."""
+    one = {arm.key: measures(30, 1.0, 0.1) for arm in ARMS}
+    one["3dgs_depth"] = measures(29.75, 0.1, 0.005)
+    two = {arm.key: measures(34, 3.0, 0.3) for arm in ARMS}
+    result = AblationResult({"one": one, "two": two})
+    rows = {(row[0], row[1]): row[2:] for row in result.table()}
+    assert rows["mean ± spread", "Vanilla 3DGS"][0] == "32.00 ± 2.83"
+    assert rows["mean ± spread", "Vanilla 3DGS"][2] == "-"
+    assert rows["one", "3DGS + depth (ours)"] == ["29.75", "0.9000", "-", "0.100", "0.50%"]
+    assert result.verdicts()[0] == (
+        "one, 3DGS: depth supervision divides the depth error by 10.0 and floaters by 20.0, "
+        "PSNR -0.25 dB"
+    )
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [("hold_out=0", "hold_out is 0"), ("iterations=0", "iterations 0"), ("hold_out=1", "hold_out")],
+)
+def test_bad_settings(place, capsys, setting, message):
+    """Without held-out frames or steps there is nothing to compare."""
+    assert main(["ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_two_captures_of_one_name(place, capsys):
+    """Two captures of one name would overwrite each other."""
+    assert main(["ablate", "room", "room", "--out", str(place.folder)]) == 1
+    assert "two captures are called room" in capsys.readouterr().err

@@ -1,0 +1,83 @@
+"""Solids: faces on their surfaces, Gaussians and meshes from them."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from splatpilot.diagrams.worlds.solids.materials import MATERIALS
+from splatpilot.diagrams.worlds.solids.solid import Solid, faces_of
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+
+BOX = Box(RigidTransform(RollPitchYaw(0.2, -0.4, 1.0), [1.0, 0, 2]), [1.0, 2.0, 0.5])
+SHAPES = {
+    "sphere": Sphere([1.0, 2, 3], 0.7),
+    "capsule": Capsule([0.0, 0, 1], [1.0, 0.5, 2], 0.3),
+    "cylinder": Cylinder([0.0, 0, 1], [1.0, 0.5, 2], 0.3),
+    "box": BOX,
+    "ground": HalfSpace([0.0, 0, 1], 0.0),
+}
+AREAS = {
+    "sphere": 4 * np.pi * 0.7**2,
+    "capsule": 2 * np.pi * 0.3 * 1.5 + 4 * np.pi * 0.3**2,
+    "cylinder": 2 * np.pi * 0.3 * 1.5 + 2 * np.pi * 0.3**2,
+    "box": 2 * (2.0 + 1.0 + 0.5),
+    "ground": (10 + 56) * (4 + 56),
+}
+BOUNDS = np.array([0.0, -2, 0]), np.array([10.0, 2, 5])
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_faces_lie_on_the_surface_and_look_outwards(kind):
+    """Points of all faces have distance zero and the distance's gradient as their normal."""
+    shape = SHAPES[kind]
+    rng = np.random.default_rng(0)
+    for face in faces_of(shape, *BOUNDS):
+        p, n, t = face.at(rng.uniform(0.02, 0.98, (200, 2)) * face.size)
+        np.testing.assert_allclose(type(shape).distances(p, *shape.parameters()), 0, atol=1e-12)
+        outwards = type(shape).gradients(p + 1e-6 * n, *shape.parameters())
+        np.testing.assert_allclose(outwards, n, atol=1e-4)
+        np.testing.assert_allclose(np.einsum("nk,nk->n", n, t), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_faces_cover_the_whole_surface(kind):
+    """The area that the faces' coordinates span is the surface's."""
+    area = 0.0
+    s = (np.stack(np.meshgrid(*2 * [np.arange(40)], indexing="ij"), -1).reshape(-1, 2) + 0.5) / 40
+    for face in faces_of(SHAPES[kind], *BOUNDS):
+        step = 1e-5
+        p, *_ = face.at(s * face.size)
+        d_u = (face.at(s * face.size + (step, 0))[0] - p) / step
+        d_v = (face.at(s * face.size + (0, step))[0] - p) / step
+        area += np.linalg.norm(np.cross(d_u, d_v), axis=1).mean() * np.prod(face.size)
+    assert area == pytest.approx(AREAS[kind], rel=2e-3)
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_materials_have_colours_and_something_to_see(material):
+    """Every material gives colours, the same for the same place, that vary over 2 by 2 metres and
+    between solids."""
+    rng = np.random.default_rng(1)
+    uv = rng.uniform(0, 2, (4000, 2))
+    ground = material in ("grass", "paving", "forest_floor")
+    shape, height = (HalfSpace([0.0, 0, 1], 0.0), 0 * uv[:, 0]) if ground else (BOX, 3 + uv[:, 1])
+    p = np.column_stack([uv, height])
+    colors, again, other = (Solid(shape, material, seed).albedo(uv, p) for seed in (3, 3, 5))
+    assert colors.shape == (4000, 3)
+    assert np.min(colors) > -0.05 and np.max(colors) < 1.3
+    np.testing.assert_array_equal(colors, again)
+    assert np.std(colors, axis=0).max() > 0.02
+    if not ground:
+        assert np.abs(colors - other).mean() > 0.01
+
+
+def test_unknown_material_is_refused():
+    """A material that does not exist is an error that lists those that do."""
+    with pytest.raises(ValueError, match=r"material is 'gold'; .*brick, concrete"):
+        Solid(SHAPES["sphere"], "gold")
+
+
+def test_tilted_ground_is_refused():
+    """Only horizontal half spaces can be drawn."""
+    with pytest.raises(ValueError, match=r"only horizontal"):
+        faces_of(HalfSpace([0.1, 0, 1], 0.0), *BOUNDS)

@@ -1,0 +1,109 @@
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from splatpilot.diagrams.worlds.solids.surfaces import (
+    THICKNESS,
+    Surfels,
+    colored,
+    merged,
+    on_ground,
+    rectangle,
+    sphere,
+    tube,
+)
+
+P_A, P_B = np.array([1.0, 2.0, -0.5]), np.array([1.4, 1.8, 4.0])
+
+
+def _tube(taper=1.0) -> Surfels:
+    return tube(P_A, P_B, 0.4, (0.1, 0.2), np.random.default_rng(0), taper)
+
+
+def _along_and_radial(p: NDArray) -> tuple[NDArray, NDArray]:
+    axis = (P_B - P_A) / np.linalg.norm(P_B - P_A)
+    along = (p - P_A) @ axis
+    return along, p - P_A - np.outer(along, axis)
+
+
+def test_patches_of_a_tube_lie_on_the_cylinder():
+    """Centres are one radius from the axis between its ends, normals outwards, tangents along."""
+    surfels = _tube()
+    along, radial = _along_and_radial(surfels.p)
+    length = np.linalg.norm(P_B - P_A)
+    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), 0.4, atol=1e-12)
+    assert along.min() >= -1e-12 and along.max() <= length + 1e-12
+    np.testing.assert_allclose(surfels.n, radial / 0.4, atol=1e-12)
+    np.testing.assert_allclose(surfels.t, np.tile((P_B - P_A) / length, (len(surfels), 1)))
+
+
+def test_a_tapered_tube_narrows_linearly():
+    """The radius falls linearly along the axis to `taper` times that at the start."""
+    along, radial = _along_and_radial(_tube(taper=0.25).p)
+    expected = 0.4 * (1 - 0.75 * along / np.linalg.norm(P_B - P_A))
+    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), expected, atol=1e-12)
+
+
+def test_patches_of_a_sphere_lie_on_it():
+    """Centres are one radius from the centre; normals point outwards, tangents lie in it."""
+    surfels = sphere((1, 2, 3), 0.7, 0.1)
+    np.testing.assert_allclose(surfels.p, np.array([1, 2, 3]) + 0.7 * surfels.n, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(surfels.n, axis=1), 1)
+    np.testing.assert_allclose(np.sum(surfels.t * surfels.n, axis=1), 0, atol=1e-12)
+
+
+def _transmittance(surfels: Surfels, p: NDArray, n: NDArray) -> NDArray:
+    """What passes straight through a layer of patches of opacity 0.99 at p (M, 3) along n."""
+    offset = p[:, None] - surfels.p
+    u = np.sum(offset * surfels.t, axis=-1) / surfels.extent[:, 0]
+    v = np.sum(offset * np.cross(surfels.n, surfels.t), axis=-1) / surfels.extent[:, 1]
+    front = n @ surfels.n.T > 0
+    return np.prod(1 - 0.99 * np.exp(-(u**2 + v**2) / 2) * front, axis=1)
+
+
+def test_layers_have_no_holes():
+    """Tubes, spheres and grids on the ground let almost nothing through at any place."""
+    rng = np.random.default_rng(1)
+    angle, s = rng.uniform(0, 2 * np.pi, 300), rng.uniform(0.1, 0.9, 300)
+    axis = (P_B - P_A) / np.linalg.norm(P_B - P_A)
+    e_1 = np.cross(axis, (0, 1, 0)) / np.linalg.norm(np.cross(axis, (0, 1, 0)))
+    n = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(axis, e_1))
+    p = P_A + np.outer(s, P_B - P_A) + 0.4 * n
+    assert _transmittance(_tube(), p, n).max() < 0.2
+    assert _transmittance(_tube(), p, n).mean() < 0.05
+
+    n = rng.normal(size=(300, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    assert _transmittance(sphere((0, 0, 0), 0.7, 0.1), 0.7 * n, n).max() < 0.2
+
+    grid = rectangle((0, 0), (3, 2), 0.1, rng)
+    ground = on_ground(grid, np.zeros(len(grid)), (0.062, 0.062), 0.0)
+    p = np.column_stack([rng.uniform(0.2, 1.8, (300, 2)), np.zeros(300)])
+    assert _transmittance(ground, p, np.tile((0, 0, 1.0), (300, 1))).max() < 0.2
+
+
+def test_gaussians_are_as_flat_and_oriented_as_their_patches():
+    """Means and colours are kept, the axes of the Gaussians are t, n x t and n, in that order."""
+    surfels = _tube()
+    colors = np.random.default_rng(2).uniform(size=(len(surfels), 3))
+    scene = colored(surfels, colors, 0.7)
+    np.testing.assert_allclose(scene.means, surfels.p, atol=1e-6)
+    np.testing.assert_allclose(scene.base_colors, colors, atol=1e-6)
+    np.testing.assert_allclose(scene.opacities, 0.7)
+    np.testing.assert_allclose(scene.scales[:, :2], surfels.extent, rtol=1e-6)
+    np.testing.assert_allclose(scene.scales[:, 2], THICKNESS)
+    R = Rotation.from_quat(np.roll(scene.quats, -1, axis=1)).as_matrix()
+    np.testing.assert_allclose(R[..., 0], surfels.t, atol=1e-6)
+    np.testing.assert_allclose(R[..., 2], surfels.n, atol=1e-6)
+
+
+def test_merging_keeps_every_gaussian_in_order():
+    """The merged scene is the concatenation of its parts."""
+    surfels = _tube()
+    parts = [
+        colored(surfels[np.arange(10)], np.full((10, 3), 0.2)),
+        colored(surfels[np.arange(10, 14)], np.ones((4, 3))),
+    ]
+    scene = merged(parts)
+    np.testing.assert_array_equal(scene.means, np.concatenate([s.means for s in parts]))
+    np.testing.assert_array_equal(scene.sh, np.concatenate([s.sh for s in parts]))

@@ -1,0 +1,33 @@
+"""The camera of a policy."""
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+
+
+def test_rays_agree_with_drakes_intrinsics():
+    """A ray's point, projected with the intrinsics that Drake is given, falls on its pixel."""
+    camera = OnboardCamera(width=6, height=4, fov_x=70.0)
+    pixels = camera.ray_slopes() @ camera.camera_info().intrinsic_matrix().T  # (4, 6, 3)
+    columns, rows = np.meshgrid(np.arange(6) + 0.5, np.arange(4) + 0.5)
+    np.testing.assert_allclose(pixels[..., 0], columns)
+    np.testing.assert_allclose(pixels[..., 1], rows)
+    assert np.rad2deg(camera.camera_info().fov_x()) == pytest.approx(70.0)
+
+
+def test_mount_looks_ahead_and_up():
+    """The optical axis is the body's x axis, turned up by the pitch; image x is its right."""
+    R_BC = OnboardCamera(pitch=30.0).X_BC().rotation().matrix()
+    np.testing.assert_allclose(R_BC[:, 2], [np.cos(np.pi / 6), 0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(R_BC[:, 0], [0, -1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("width", 0), ("fov_x", 180.0), ("max_depth", 0.05), ("p_BC", [1.0, 2.0]), ("pitch", 91.0)],
+)
+def test_bad_config_is_named(field, value):
+    """A value out of range names the field."""
+    with pytest.raises(ValueError, match=rf"OnboardCamera.{field} is"):
+        OnboardCamera(**{field: value}).validate()

@@ -1,0 +1,114 @@
+"""Configurations from YAML and from the command line."""
+
+import pytest
+
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.make_world import SceneConfig
+from splatpilot.systems.configuration import dump_config, load_config
+
+
+def test_file_and_overrides_set_only_what_they_name(tmp_path):
+    """Overrides come after the file, the file after the defaults, and nothing else changes."""
+    path = tmp_path / "scenario.yaml"
+    path.write_text("timeout: 9\nworld: {spacing: 2.5}\npolicy: {lattice: {speed: 3.0}}\n")
+    scenario = load_config(
+        Scenario(seed=4), path, ["policy.lattice.speed=4", "goal=[1, 2, 3]", "camera.fps=30"]
+    )
+    assert (scenario.seed, scenario.timeout, scenario.world.spacing) == (4, 9.0, 2.5)
+    assert scenario.world.width == Scenario().world.width
+    assert scenario.policy.lattice.speed == 4.0
+    assert scenario.policy.rate == Scenario().policy.rate
+    assert scenario.goal == [1.0, 2.0, 3.0]
+    assert (scenario.camera.fps, scenario.camera.width) == (30.0, 320)
+
+
+def test_dumped_scenario_loads_as_itself(tmp_path):
+    """A dumped scenario, of another kind of world too, loads into an equal scenario."""
+    scenario = Scenario(seed=7, world=SceneConfig(path="some/where"), start=[1.0, 2.0, 3.0])
+    path = tmp_path / "scenario.yaml"
+    path.write_text(dump_config(scenario))
+    loaded = load_config(Scenario(), path)
+    assert loaded.world == scenario.world
+    assert dump_config(loaded) == dump_config(scenario)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("wrld.spacing=3", r"'wrld.spacing=3': there is no field wrld; did you mean world"),
+        ("policy.lattice.sped=3", r"no field policy.lattice.sped; did you mean policy.lattice.sp"),
+        ("policy.speed=3", r"no field policy.speed; .*policy.lattice"),
+        ("camera.fpss=3", r"no field camera.fpss; did you mean camera.fps"),
+        ("qqqqqq=3", r"no field qqqqqq; the fields are .*timeout"),
+        ("policy=3", "'policy=3': policy is 3; it must be fields"),
+        ("world=foo", "'world=foo': world is foo; it must be fields"),
+        ("camera=null", "'camera=null': null stands where fields belong"),
+        ("start=5", "'start=5': "),
+        ("camera.X_PB.translation=[1, 2]", "'camera.X_PB.translation=.1, 2.': "),
+        ("timeout=soon", "'timeout=soon': .*soon"),
+        ("timeout", "'timeout' has no value; write FIELD=VALUE"),
+        ("goal=[1, 2", "'goal=.1, 2' is not YAML"),
+    ],
+)
+def test_bad_override_is_named(override, message):
+    """An unknown field, a value of another type and broken YAML name the override and the field."""
+    with pytest.raises(ValueError, match=message):
+        load_config(Scenario(), overrides=[override])
+
+
+def test_bad_file_is_named(tmp_path):
+    """Errors in a file name the file; so does its absence."""
+    path = tmp_path / "scenario.yaml"
+    with pytest.raises(FileNotFoundError, match=r"scenario.yaml: there is no such file"):
+        load_config(Scenario(), path)
+    path.write_text("timout: 3\n")
+    with pytest.raises(ValueError, match=r"scenario.yaml: there is no field timout; did"):
+        load_config(Scenario(), path)
+    path.write_text("timeout: [\n")
+    with pytest.raises(ValueError, match=r"scenario.yaml is not YAML"):
+        load_config(Scenario(), path)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("timeout=0", "timeout is 0.0; it must be more than 0"),
+        ("seed=-1", "seed is -1; it must be at least 0"),
+        ("goal_radius=-1", "goal_radius is -1.0; it must be positive"),
+        ("start_radius=.inf", "start_radius is inf; it must be 0 to 1 m"),
+        ("start=[1, 2]", r"start is \[1.0, 2.0\]; it must be three finite numbers"),
+        ("goal=[1, .nan, 2]", r"goal is \[1.0, nan, 2.0\]; it must be three finite numbers"),
+        ("world.rocks=1000000000", "rocks = 1000000000 must be 0 to 1000"),
+        ("world=!SceneConfig {}", "world.path is empty"),
+        ("camera.width=0", "camera is 0x240 pixels"),
+        ("camera.width=1000000", "camera is 1000000x240 pixels"),
+        ("camera.center_x=-1", "principal point is .*inside the image"),
+        ("camera.fps=.inf", "camera.fps is inf; it must be more than 0"),
+        ("camera.focal=!FocalLength {x: 0}", "camera.focal is .*; it must be positive"),
+        ("camera.lcm_bus=other", "camera.lcm_bus is 'other'; it must be left out"),
+        ("simulator.integration_scheme=foo", "integration_scheme is foo; .*runge_kutta3"),
+        ("simulator.max_step_size=0", "max_step_size is 0.0; it must be 1e-5 to 1 s"),
+        ("simulator.max_step_size=.nan", "max_step_size is nan"),
+        ("simulator.accuracy=0", "accuracy is 0.0"),
+        ("simulator.start_time=5", "start_time is 5.0; it must be 0"),
+    ],
+)
+def test_scenario_refuses_what_cannot_be_flown(override, message):
+    """Values out of range are refused by field, value and limit."""
+    with pytest.raises(ValueError, match=message):
+        load_config(Scenario(), overrides=[override]).validate()
+
+
+def test_default_scenario_is_valid():
+    """The defaults can be flown."""
+    Scenario().validate()
+
+
+def test_override_keeps_the_type_that_a_file_chose(tmp_path):
+    """An override of a field of another policy or world than the default's sets that field."""
+    path = tmp_path / "scenario.yaml"
+    path.write_text("world: !SceneConfig {path: a}\npolicy: !ReactiveConfig {speed: 1.5}\n")
+    overrides = ["world.path=b", "policy.camera.width=32"]
+    scenario = load_config(Scenario(), path, overrides)
+    assert scenario.world == SceneConfig(path="b")
+    assert (scenario.policy.speed, scenario.policy.camera.width) == (1.5, 32)

@@ -1,0 +1,155 @@
+"""Batched vehicles against exact solutions and against the controller and plant that fly."""
+
+import numpy as np
+import pytest
+import torch
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from splatpilot.systems.vehicle.flatness_controller import (
+    FlatnessController,
+    FlatnessControllerConfig,
+)
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.training.policies.vehicles import (
+    BodyRate,
+    PointMass,
+    attitude_from_thrust,
+    flatness_command,
+    rotation_of,
+)
+
+CONTROL = FlatnessControllerConfig()
+
+
+def point_masses(count: int) -> PointMass:
+    generator = torch.Generator().manual_seed(0)
+    p, v, a = (torch.randn(count, 3, generator=generator, dtype=torch.float64) for _ in "pva")
+    yaw = torch.rand(count, generator=generator, dtype=torch.float64)
+    return PointMass(p, v, a, yaw, torch.full((count, 1), 0.13, dtype=torch.float64))
+
+
+def test_point_mass_solves_its_equation_exactly():
+    """One step equals a thousand small ones, to rounding."""
+    start, a_cmd = point_masses(5), torch.tensor([[3.0, -2.0, 1.0]], dtype=torch.float64)
+    once = start.step(a_cmd, 0.2, CONTROL)
+    many = start
+    for _ in range(1000):
+        many = many.step(a_cmd, 0.0002, CONTROL)
+    for name in "pva":
+        torch.testing.assert_close(getattr(once, name), getattr(many, name), rtol=0, atol=1e-10)
+    # And the equation itself: the acceleration's rate is what it lacks over the lag.
+    rate = (start.step(a_cmd, 1e-6, CONTROL).a - start.a) / 1e-6
+    torch.testing.assert_close(rate, (a_cmd - start.a) / start.lag, rtol=1e-4, atol=1e-4)
+
+
+def test_gradient_decay_scales_gradients_alone():
+    """`decayed` leaves the state as it is and multiplies its gradient."""
+    a = torch.ones(1, 3, requires_grad=True)
+    zero = torch.zeros(1, 3)
+    vehicle = PointMass(zero, zero, a, torch.zeros(1), torch.full((1, 1), 0.1))
+    faded = vehicle.decayed(0.3)
+    torch.testing.assert_close(faded.a, a)
+    faded.a.sum().backward()
+    torch.testing.assert_close(a.grad, torch.full((1, 3), 0.3))
+
+
+def test_point_mass_turns_its_nose_along_its_motion():
+    """The yaw approaches the direction of flight at the controller's gain."""
+    zero = torch.zeros(1, 3)
+    v, lag = torch.tensor([[0.0, 2.0, 0.0]]), torch.ones(1, 1)
+    vehicle = PointMass(zero, v, zero, torch.zeros(1), lag)
+    vehicle = vehicle.step(zero, 0.01, CONTROL)
+    assert float(vehicle.yaw) == pytest.approx(0.01 * CONTROL.max_yaw_rate, rel=1e-3)
+    for _ in range(300):
+        vehicle = vehicle.step(zero, 0.01, CONTROL)
+    assert float(vehicle.yaw) == pytest.approx(np.pi / 2, abs=1e-2)
+
+
+def test_attitude_carries_the_thrust_and_the_yaw():
+    """z lies along the thrust, and x seen from above along the yaw."""
+    f, yaw = torch.tensor([[2.0, -3.0, 9.0]]), torch.tensor([0.7])
+    R = attitude_from_thrust(f, yaw)[0]
+    torch.testing.assert_close(R[:, 2], f[0] / f.norm())
+    assert float(torch.atan2(R[1, 0], R[0, 0])) == pytest.approx(0.7, abs=1e-5)
+    torch.testing.assert_close(R.T @ R, torch.eye(3), rtol=0, atol=1e-6)
+
+
+def controller_command(state: np.ndarray, a_WB: np.ndarray, heading: float | None) -> np.ndarray:
+    builder = DiagramBuilder()
+    controller = builder.AddSystem(FlatnessController())
+    values = {"state": state, "acceleration": a_WB}
+    if heading is not None:
+        values["heading"] = np.array([heading])
+    for name, value in values.items():
+        source = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(source.get_output_port(), controller.GetInputPort(name))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.001)
+    context = controller.GetMyContextFromRoot(simulator.get_context())
+    return np.array(controller.GetOutputPort("command").Eval(context))
+
+
+@pytest.mark.parametrize("heading", [None, 0.4])
+def test_commands_are_the_controllers(heading):
+    """Thrust and rates equal `FlatnessController`'s, level and tilted."""
+    rng = np.random.default_rng(3)
+    for tilt in (0.0, 0.3):
+        state = hover_state(rng.normal(size=3), yaw=0.2)
+        state[3:6] = [1.5, 0.4, -0.3]
+        q = state[6:10] + tilt * np.array([0.0, 0.3, -0.2, 0.0])
+        state[6:10] = q / np.linalg.norm(q)
+        a_WB = np.array([2.0, -1.0, 0.5])
+        expected = controller_command(state, a_WB, heading)
+        batch = torch.tensor(state)[None]
+        at = None if heading is None else torch.tensor([heading], dtype=torch.float64)
+        found = flatness_command(batch, torch.tensor(a_WB)[None], CONTROL, QuadrotorParams(), at)
+        np.testing.assert_allclose(found[0], expected, atol=1e-6)
+
+
+def test_body_rate_vehicle_flies_as_plant_and_controller_do():
+    """Two seconds of a turn end within 5 cm of where the Drake diagram ends."""
+    a_WB = np.array([1.0, 0.8, 0.2])
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(QuadrotorPlant())
+    controller = builder.AddSystem(FlatnessController())
+    source = builder.AddSystem(ConstantVectorSource(a_WB))
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("state"))
+    builder.Connect(source.get_output_port(), controller.GetInputPort("acceleration"))
+    builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    plant.GetMyMutableContextFromRoot(root).SetContinuousState(hover_state([0, 0, 2]))
+    simulator.AdvanceTo(2.0)
+    expected = np.array(plant.GetOutputPort("state").Eval(plant.GetMyContextFromRoot(root)))
+
+    vehicle = BodyRate.hovering(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1))
+    for _ in range(30):
+        vehicle = vehicle.step(torch.tensor(a_WB, dtype=torch.float32)[None], 1 / 15, CONTROL)
+    np.testing.assert_allclose(vehicle.p[0], expected[:3], atol=0.05)
+    np.testing.assert_allclose(vehicle.v[0], expected[3:6], atol=0.05)
+    R_WB = pose_from_state(vehicle.state[0].double().numpy()).rotation().matrix()
+    np.testing.assert_allclose(rotation_of(vehicle.state[:, 6:10])[0], R_WB, atol=1e-5)
+
+
+def test_gradients_flow_through_the_body_rate_vehicle():
+    """The derivative of where it ends by what was commanded is that of finite differences."""
+
+    def end(a: torch.Tensor) -> torch.Tensor:
+        vehicle = BodyRate.hovering(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1))
+        vehicle = vehicle._replace(state=vehicle.state.double())
+        for _ in range(6):
+            vehicle = vehicle.step(a, 0.04, CONTROL)
+        return vehicle.p[0, 0]
+
+    a = torch.tensor([[1.0, 0.5, 0.3]], dtype=torch.float64, requires_grad=True)
+    end(a).backward()
+    step = torch.tensor([[1e-5, 0.0, 0.0]], dtype=torch.float64)
+    with torch.no_grad():
+        difference = (end(a + step) - end(a - step)) / 2e-5
+    assert a.grad is not None
+    assert float(a.grad[0, 0]) == pytest.approx(float(difference), rel=1e-4)

@@ -1,0 +1,72 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.reconstruction.initial_gaussians import (
+    SHELL,
+    Detail,
+    gaussians_from_depth,
+    gaussians_from_points,
+    random_points,
+    with_shell,
+)
+from splatpilot.training.reconstruction.overlap import View
+from splatpilot.training.reconstruction.photometry import estimate_photometry
+
+
+def test_what_is_beyond_range_stands_on_a_shell(write_room, tmp_path):
+    """Infinite depth becomes points at one distance from the camera; unknown depth stays unknown,
+    and all else as it is."""
+    frame = read_tartanair_v1(write_room(tmp_path / "room")).frame(0)
+    depth = frame.depth.copy()
+    depth[:10], depth[10:12], depth[12:14] = np.inf, 0, 1e4
+    far = with_shell(replace(frame, depth=depth))
+    rows, columns = np.mgrid[0:48, 0:64] + 0.5
+    distance = np.linalg.norm(far.back_project(columns, rows, far.depth), axis=-1)
+    beyond = (depth > SHELL) & (np.arange(48)[:, None] < 14)
+    np.testing.assert_allclose(distance[beyond], SHELL, rtol=1e-6)
+    assert (far.depth[10:12] == 0).all()
+    np.testing.assert_array_equal(far.depth[14:], frame.depth[14:])
+
+
+def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
+    """Where even the coarsest cells are too many, exactly as many as allowed are drawn, mostly
+    large ones, each of them one of all; without optimisation it is an error."""
+    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+    frames = list(capture.frames())
+    photometry = estimate_photometry([View.of(frame) for frame in frames], 0)
+    coarse = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
+    detail = Detail(max_gaussians=100_000, optimized=True, **coarse)
+    every, _ = gaussians_from_depth(frames, photometry, detail)
+    some, _ = gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20))
+    assert len(some) == 20 < len(every)
+    assert set(map(tuple, some.means)) <= set(map(tuple, every.means))
+    assert np.linalg.norm(some.scales, axis=1).mean() > np.linalg.norm(every.scales, axis=1).mean()
+    with pytest.raises(ValueError, match="20 Gaussians are too few"):
+        gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20, optimized=False))
+
+
+def test_points_become_gaussians_of_their_spacing():
+    """On a grid of points, Gaussians have half its spacing, the points' places and colours."""
+    p_WQ = np.stack(np.meshgrid(*[0.2 * np.arange(5)] * 3), axis=-1).reshape(-1, 3)
+    colors = np.random.default_rng(0).uniform(size=p_WQ.shape)
+    scene = gaussians_from_points(p_WQ, colors)
+    np.testing.assert_allclose(scene.scales, 0.1, rtol=1e-5)
+    np.testing.assert_allclose(scene.means, p_WQ, rtol=1e-6)
+    np.testing.assert_allclose(scene.base_colors, colors, atol=1e-5)
+    with pytest.raises(ValueError, match="3 points are too few"):
+        gaussians_from_points(p_WQ[:3], colors[:3])
+
+
+def test_random_points_lie_in_view(write_room, tmp_path):
+    """Each random point is seen by the camera that it was drawn for, within the given depths, and
+    has the colour of its pixel."""
+    frame = read_tartanair_v1(write_room(tmp_path / "room")).frame(2)
+    p_WQ, colors = random_points([frame], 500, 0.5, 8.0, seed=1)
+    assert p_WQ.shape == (500, 3)
+    x, y, z = frame.X_WC.inverse().multiply(p_WQ.T)
+    u, v = frame.K[0, 0] * x / z + frame.K[0, 2], frame.K[1, 1] * y / z + frame.K[1, 2]
+    assert (0.5 <= z.min()) and (z.max() <= 8) and z.max() > 4
+    np.testing.assert_array_equal(frame.image[v.astype(int), u.astype(int)], colors * 255)

@@ -1,0 +1,313 @@
+"""Photometric and log-depth losses."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import correlate1d
+
+from splatpilot import _native
+from splatpilot.training.reconstruction.losses import (
+    depth_edge_weights,
+    log_depth_loss,
+    log_depth_loss_torch,
+    photometric_loss,
+    photometric_loss_torch,
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Torch's threads cost more than they give on images this small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def image_pair(shape, seed=0):
+    """A true image with flat parts and texture, and a noisy render of it."""
+    rng = torch.Generator().manual_seed(seed)
+    target = torch.rand(shape, generator=rng)
+    target[..., : shape[-2] // 3, :] = 0.25
+    rendered = (target + 0.1 * torch.randn(shape, generator=rng)).clamp(0, 1)
+    return rendered, target
+
+
+def depth_pair(shape, seed=0):
+    """A true depth of 0 to 200 m, of which some pixels are unknown, and a noisy render of it."""
+    rng = torch.Generator().manual_seed(seed)
+    depth = 200 * torch.rand(shape, generator=rng) ** 3
+    rendered = depth * torch.exp(0.1 * torch.randn(shape, generator=rng))
+    flat = depth.view(-1)
+    flat[::7], flat[1::11], flat[2::13] = 0.0, math.nan, math.inf
+    return rendered.contiguous(), depth
+
+
+def value_and_gradient(loss, rendered, *others, **options):
+    rendered = rendered.detach().clone().requires_grad_()
+    value = loss(rendered, *others, **options)
+    value.backward()
+    assert rendered.grad is not None
+    return value.item(), rendered.grad
+
+
+def ssim_by_scipy(x: np.ndarray, y: np.ndarray) -> float:
+    """Mean SSIM of images (H, W, C) straight from the paper's definition, in float64."""
+    k = np.arange(-5, 6)
+    window = np.exp(-(k**2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def mean(z):
+        along_y = correlate1d(z, window, axis=0, mode="constant")
+        return correlate1d(along_y, window, axis=1, mode="constant")
+
+    mx, my = mean(x), mean(y)
+    vx, vy, cxy = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
+    luminance = (2 * mx * my + 1e-4) / (mx**2 + my**2 + 1e-4)
+    structure = (2 * cxy + 9e-4) / (vx + vy + 9e-4)
+    return float(np.mean(luminance * structure))
+
+
+SHAPES = [(1, 1, 1), (1, 40, 3), (40, 1, 3), (5, 7, 1), (11, 11, 4), (17, 16, 1), (3, 2, 19, 23, 3)]
+
+
+@pytest.mark.parametrize("simd", _native.simd_levels())
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_photometric_agrees_with_autograd_in_float64(shape, weight, simd, monkeypatch):
+    """On every SIMD level, for images smaller and larger than the window, value and gradient are
+    those of torch in float64.
+    """
+    monkeypatch.setenv("SPLATPILOT_SIMD", simd)
+    x, y = image_pair(shape)
+    value, gradient = value_and_gradient(photometric_loss, x, y, weight)
+    expected, expected_gradient = value_and_gradient(
+        photometric_loss_torch, x.double(), y.double(), weight
+    )
+    assert value == pytest.approx(expected, rel=1e-5)
+    error = (gradient - expected_gradient).abs().max()
+    assert error <= 1e-5 * expected_gradient.abs().max()
+
+
+def test_photometric_agrees_with_scipy():
+    """L1 and SSIM are those of numpy and scipy."""
+    x, y = image_pair((24, 31, 3))
+    a, b = x.double().numpy(), y.double().numpy()
+    assert photometric_loss(x, y, 0.0).item() == pytest.approx(np.abs(a - b).mean(), rel=1e-6)
+    expected = 1 - ssim_by_scipy(a, b)
+    assert photometric_loss(x, y, 1.0).item() == pytest.approx(expected, rel=1e-5)
+    assert photometric_loss(x.double(), y.double(), 1.0).item() == pytest.approx(expected, 1e-12)
+
+
+def test_equal_images_have_no_loss_and_no_gradient():
+    """Of equal images, value and gradient are exactly 0."""
+    _, y = image_pair((20, 33, 3))
+    value, gradient = value_and_gradient(photometric_loss, y, y)
+    assert value == 0.0 and not gradient.any()
+
+
+def test_constant_images():
+    """Of two flat images a and b, away from the border, L1 is |a - b| and SSIM its luminance term
+    (2ab + C1) / (a^2 + b^2 + C1); moving a by one unit moves L1 by one.
+    """
+    a, b = 0.6, 0.5
+    x, y = torch.full((24, 24, 1), a), torch.full((24, 24, 1), b)
+    value, gradient = value_and_gradient(photometric_loss, x, y, 0.0)
+    assert value == pytest.approx(0.1, rel=1e-5)
+    torch.testing.assert_close(gradient, torch.full_like(x, 1 / x.numel()))
+    # The sum of the gradients is the derivative for moving all pixels together.
+    moved = photometric_loss(x.double() + 1e-6, y.double(), 1.0)
+    still = photometric_loss(x.double() - 1e-6, y.double(), 1.0)
+    _, gradient = value_and_gradient(photometric_loss, x, y, 1.0)
+    assert gradient.sum().item() == pytest.approx((moved - still).item() / 2e-6, rel=1e-3)
+    luminance = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    large = torch.full((200, 200, 1), a), torch.full((200, 200, 1), b)
+    assert photometric_loss(*large, 1.0).item() == pytest.approx(1 - luminance, rel=0.1)
+
+
+@pytest.mark.parametrize("loss", ["photometric", "depth"])
+def test_gradient_is_that_of_finite_differences(loss):
+    """In float64, torch's gradcheck passes for the formulas that the kernels are held against."""
+    if loss == "photometric":
+        x, y = image_pair((6, 7, 2))
+        y = y.double()
+        x = (x.double() + 0.003).requires_grad_()  # nowhere equal: the L1 has a kink there
+        assert torch.autograd.gradcheck(lambda x: photometric_loss(x, y, 0.3), x, fast_mode=True)
+    else:
+        x, d = depth_pair((6, 7))
+        x = x.double().requires_grad_()
+        assert torch.autograd.gradcheck(lambda x: log_depth_loss(x, d.double()), x)
+
+
+@pytest.mark.parametrize("simd", _native.simd_levels())
+@pytest.mark.parametrize("shape", [(1,), (15,), (16,), (2, 31, 33)])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_log_depth_agrees_with_autograd_in_float64(shape, weighted, simd, monkeypatch):
+    """On every SIMD level, value and gradient are those of torch in float64, with and without
+    weights, and only known depths count.
+    """
+    monkeypatch.setenv("SPLATPILOT_SIMD", simd)
+    x, d = depth_pair(shape)
+    d.view(-1)[-1] = 3.0
+    w = torch.rand(shape, generator=torch.Generator().manual_seed(1)) if weighted else None
+    value, gradient = value_and_gradient(log_depth_loss, x, d, w)
+    w = None if w is None else w.double()
+    expected, expected_gradient = value_and_gradient(
+        log_depth_loss_torch, x.double(), d.double(), w, 1e-3, 150.0
+    )
+    assert value == pytest.approx(expected, rel=1e-5)
+    torch.testing.assert_close(gradient.double(), expected_gradient, rtol=1e-5, atol=1e-12)
+    unknown = ~((d > 1e-3) & (d < 150))
+    assert not gradient[unknown].any()
+
+
+def test_log_depth_of_a_constant_factor():
+    """Depths too large by one factor cost its logarithm at any range, and too small as much; the
+    gradient is sign / (count rendered).
+    """
+    depth = torch.tensor([0.1, 1.0, 10.0, 100.0])
+    for factor in (1.25, 0.8):
+        value, gradient = value_and_gradient(log_depth_loss, factor * depth, depth)
+        assert value == pytest.approx(math.log(1.25), rel=1e-5)
+        torch.testing.assert_close(gradient, math.copysign(1, factor - 1) / (4 * factor * depth))
+    assert log_depth_loss(depth, depth).item() == 0.0
+    assert log_depth_loss(2 * depth, depth, 3 * torch.ones(4)).item() == pytest.approx(
+        3 * math.log(2)
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_depth_below_epsilon_counts_as_epsilon(dtype):
+    """A render of 0, where nothing was drawn, costs log(depth / epsilon) and has no gradient."""
+    rendered, depth = torch.tensor([0.0, 2.0], dtype=dtype), torch.tensor([1.0, 2.0], dtype=dtype)
+    value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
+    assert value == pytest.approx(math.log(1e3) / 2, rel=1e-6)
+    assert gradient.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nothing_to_compare_costs_nothing(dtype):
+    """Without a single known depth, value and gradient are 0, whatever was rendered."""
+    depth = torch.tensor([math.nan, 0.0, -1.0, math.inf, 150.0, 1e-3], dtype=dtype)
+    rendered = torch.tensor([1.0, math.nan, 2.0, math.inf, 3.0, 0.0], dtype=dtype)
+    value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
+    assert value == 0.0 and not gradient.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("mistake", [math.nan, math.inf])
+def test_mistakes_in_a_render_are_not_hidden(dtype, mistake):
+    """NaN or infinity in a render makes the loss NaN."""
+    rendered, depth = torch.ones(20, dtype=dtype), torch.ones(20, dtype=dtype)
+    rendered[3] = mistake
+    assert math.isnan(log_depth_loss(rendered, depth).item())
+    x, y = (t.to(dtype) for t in image_pair((20, 20, 3)))
+    x[3, 4, 1] = mistake
+    assert math.isnan(photometric_loss(x, y).item())
+
+
+@settings(max_examples=40)
+@given(
+    shape=st.tuples(st.integers(1, 14), st.integers(1, 40), st.integers(1, 5)),
+    seed=st.integers(0, 999),
+)
+def test_any_size(shape, seed):
+    """For any size, all values of the gradient are written, and twice the same bits come out."""
+    x, y = image_pair(shape, seed)
+    first, second = (value_and_gradient(photometric_loss, x, y, 0.5) for _ in range(2))
+    assert first[0] == second[0] and torch.equal(first[1], second[1])
+    _, expected = value_and_gradient(photometric_loss_torch, x.double(), y.double(), 0.5)
+    assert (first[1] - expected).abs().max() <= 1e-5 * expected.abs().max()
+
+
+def test_number_of_threads_changes_nothing():
+    """The same bits come out whatever torch's number of threads is."""
+    x, y = image_pair((48, 64, 3))
+    results = []
+    for count in (1, 2, 4):
+        torch.set_num_threads(count)
+        results.append(value_and_gradient(photometric_loss, x, y))
+    for value, gradient in results[1:]:
+        assert value == results[0][0] and torch.equal(gradient, results[0][1])
+
+
+def test_layout_in_memory_does_not_matter():
+    """Channels-first memory and one channel cut from an image give what contiguous tensors give."""
+    x, y = image_pair((9, 12, 3))
+    planar = x.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    value, gradient = value_and_gradient(photometric_loss, x, y)
+    other = value_and_gradient(
+        lambda t, y: photometric_loss(t.permute(1, 2, 0), y), planar.permute(2, 0, 1), y
+    )
+    assert value == other[0] and torch.equal(gradient, other[1].permute(1, 2, 0))
+    image = image_pair((9, 12, 4))[0].clamp(0.1, 0.9).requires_grad_()
+    log_depth_loss(image[..., 3], torch.ones(9, 12)).backward()
+    assert image.grad is not None
+    assert image.grad[..., 3].all() and not image.grad[..., :3].any()
+
+
+def test_gradient_is_scaled_by_what_follows():
+    """The chain rule: half the loss has half the gradient."""
+    x, y = image_pair((9, 12, 3))
+    _, whole = value_and_gradient(photometric_loss, x, y)
+    _, half = value_and_gradient(lambda *a: 0.5 * photometric_loss(*a), x, y)
+    torch.testing.assert_close(half, 0.5 * whole)
+
+
+def test_slanted_planes_have_no_edges():
+    """Planes of any slant weigh 1 everywhere, however steeply their depth grows."""
+    v, u = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
+    plane = 1 / (0.002 + 0.01 * v + 0.001 * u)  # 2.9 m to 150 m and beyond, as a floor
+    assert torch.equal(depth_edge_weights(plane, far=1e6), torch.ones(30, 40))
+
+
+def test_thin_structures_weigh_more():
+    """A branch one pixel wide before the sky weighs 1 + gain, as does what is within the radius; a
+    pixel of unknown depth does not.
+    """
+    depth = torch.full((2, 20, 30), math.inf)
+    depth[0, :, 12] = 5.0
+    depth[1, 10, 12] = math.nan
+    weights = depth_edge_weights(depth, radius=2, gain=4.0)
+    columns = torch.arange(30)
+    expected = torch.where((columns >= 9) & (columns <= 15), 5.0, 1.0).expand(20, 30)
+    torch.testing.assert_close(weights[0], expected)
+    assert torch.equal(weights[1], torch.ones(20, 30))
+
+
+@pytest.mark.parametrize("factor, edge", [(1.05, False), (1.25, True)])
+def test_jump_is_the_least_step(factor, edge):
+    """A step in depth is an edge if it is larger than the given fraction."""
+    depth = torch.full((10, 20), 4.0)
+    depth[:, 10:] *= factor
+    assert bool((depth_edge_weights(depth, jump=0.1) > 1).any()) == edge
+
+
+IMAGE = torch.full((4, 5, 3), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: photometric_loss(IMAGE, IMAGE[:3]), r"shape \(4, 5, 3\) but target \(3, 5, 3\)"),
+        (lambda: photometric_loss(IMAGE, IMAGE.double()), "target is torch.float64"),
+        (lambda: photometric_loss(IMAGE.int(), IMAGE.int()), "divided by 255"),
+        (lambda: photometric_loss(IMAGE[..., 0], IMAGE[..., 0]), r"must be \(..., H, W, C\)"),
+        (lambda: photometric_loss(IMAGE[:0], IMAGE[:0]), "at least one"),
+        (lambda: photometric_loss(IMAGE, IMAGE, 1.5), "ssim_weight is 1.5"),
+        (lambda: photometric_loss(IMAGE, IMAGE.clone().requires_grad_()), "target wants a grad"),
+        (lambda: log_depth_loss(IMAGE, IMAGE[:3]), r"but depth \(3, 5, 3\)"),
+        (lambda: log_depth_loss(IMAGE, IMAGE, IMAGE[:3]), r"but weights \(3, 5, 3\)"),
+        (lambda: log_depth_loss(IMAGE, IMAGE, far=0.0), "depth range is 0.001 to 0.0"),
+        (lambda: depth_edge_weights(IMAGE[0, 0]), r"must be floating-point \(..., H, W\)"),
+        (lambda: depth_edge_weights(IMAGE, radius=-1), "radius -1"),
+    ],
+)
+def test_mistakes_are_named(call, message):
+    """What cannot be compared is refused with its name, its value and what it must be."""
+    with pytest.raises(ValueError, match=message):
+        call()

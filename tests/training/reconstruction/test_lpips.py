@@ -1,0 +1,206 @@
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import conv2d, max_pool2d
+
+from splatpilot.training.reconstruction.lpips import Lpips
+
+FIRES = {
+    3: (64, 16, 64),
+    4: (128, 16, 64),
+    6: (128, 32, 128),
+    7: (256, 32, 128),
+    9: (256, 48, 192),
+    10: (384, 48, 192),
+    11: (384, 64, 256),
+    12: (512, 64, 256),
+}
+
+
+@pytest.fixture(scope="module")
+def weights() -> dict:
+    """Random weights in the layout of the file, of a size that keeps features alive."""
+    generator = torch.Generator().manual_seed(0)
+
+    def convolution(name: str, n_out: int, n_in: int, size: int) -> dict:
+        std = (2 / (n_in * size**2)) ** 0.5
+        w = torch.randn(n_out, n_in, size, size, generator=generator) * std
+        return {f"{name}.weight": w, f"{name}.bias": torch.zeros(n_out)}
+
+    backbone = convolution("features.0", 64, 3, 3)
+    for i, (n_in, squeeze, expand) in FIRES.items():
+        backbone |= convolution(f"features.{i}.squeeze", squeeze, n_in, 1)
+        backbone |= convolution(f"features.{i}.expand1x1", expand, squeeze, 1)
+        backbone |= convolution(f"features.{i}.expand3x3", expand, squeeze, 3)
+    channels = (64, 128, 256, 384, 384, 512, 512)
+    linear = {
+        f"lin{i}.model.1.weight": torch.rand(1, n, 1, 1, generator=generator)
+        for i, n in enumerate(channels)
+    }
+    return {"squeezenet1_1": backbone, "lin": linear}
+
+
+@pytest.fixture
+def weights_file(tmp_path, weights) -> Path:
+    torch.save(weights, tmp_path / "lpips.pt")
+    return tmp_path / "lpips.pt"
+
+
+def reference(weights: dict, a: torch.Tensor, b: torch.Tensor) -> float:
+    """LPIPS v0.1 of two images (H, W, 3), written out layer by layer."""
+    w = weights["squeezenet1_1"]
+
+    def layer(x, name, padding=0, stride=1):
+        weight, bias = w[f"features.{name}.weight"], w[f"features.{name}.bias"]
+        return conv2d(x, weight, bias, padding=padding, stride=stride).clamp(min=0)
+
+    def features(image):
+        # Images in [-1, 1], shifted and scaled as LPIPS v0.1 does.
+        shift = torch.tensor([-0.030, -0.088, -0.188])
+        scale = torch.tensor([0.458, 0.448, 0.450])
+        x = (((2 * image - 1) - shift) / scale).permute(2, 0, 1)[None]
+        x = layer(x, "0", stride=2)
+        found = [x]
+        for i in range(2, 13):
+            if i in FIRES:
+                squeezed = layer(x, f"{i}.squeeze")
+                sides = (
+                    layer(squeezed, f"{i}.expand1x1"),
+                    layer(squeezed, f"{i}.expand3x3", padding=1),
+                )
+                x = torch.cat(sides, dim=1)
+            else:
+                x = max_pool2d(x, 3, stride=2, ceil_mode=True)
+            if i in (4, 7, 9, 10, 11, 12):
+                found.append(x)
+        return [f / (f.norm(dim=1, keepdim=True) + 1e-10) for f in found]
+
+    total = 0.0
+    for i, (x, y) in enumerate(zip(features(a), features(b), strict=True)):
+        lin = weights["lin"][f"lin{i}.model.1.weight"]
+        total += float(((x - y) ** 2 * lin).sum(dim=1).mean())
+    return total
+
+
+def images(height: int = 40, width: int = 51) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    a = torch.rand(height, width, 3, generator=generator)
+    return a, (a + 0.2 * torch.rand(height, width, 3, generator=generator)).clamp(0, 1)
+
+
+def test_distance_is_that_of_the_definition(weights, weights_file):
+    """The distance equals the published formula written out layer by layer."""
+    a, b = images()
+    expected = reference(weights, a, b)
+    assert expected > 1e-3
+    assert Lpips(weights_file)(a, b).item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_batches_are_averaged(weights_file):
+    """Of several pairs of images it is the mean."""
+    lpips = Lpips(weights_file)
+    a, b = images()
+    other = b.flip(0)
+    pairs = lpips(torch.stack([a, a]), torch.stack([b, other]))
+    assert pairs.item() == pytest.approx((lpips(a, b) + lpips(a, other)).item() / 2, rel=1e-5)
+
+
+def test_gradient(weights_file):
+    """The gradient in the first image predicts what a small step does."""
+    lpips = Lpips(weights_file)
+    a, b = images()
+    a.requires_grad_()
+    value = lpips(a, b)
+    value.backward()
+    assert a.grad is not None
+    step = 1e-3 * a.grad / a.grad.abs().max()
+    with torch.no_grad():
+        change = lpips(a + step, b) - lpips(a - step, b)
+    assert change.item() == pytest.approx(2 * (a.grad * step).sum().item(), rel=0.05)
+    assert lpips(a.detach(), a.detach()).item() == 0
+
+
+def test_weights_are_read_once(weights_file):
+    """A second network from the same file needs the file no more."""
+    a, b = images()
+    first = Lpips(weights_file)(a, b)
+    content = weights_file.read_bytes()
+    weights_file.write_bytes(b"")
+    assert Lpips(weights_file)(a, b) == first
+    weights_file.write_bytes(content)
+
+
+def test_absent_weights(tmp_path, monkeypatch):
+    """Without weights the error says where they are looked for and how to get them."""
+    monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    with pytest.raises(
+        FileNotFoundError, match=r"no weights.*lpips_squeeze\.pt.*pip install lpips"
+    ):
+        Lpips()
+    monkeypatch.delenv("SPLATPILOT_DATA")
+    with pytest.raises(FileNotFoundError, match="no weights"):
+        Lpips()
+    with pytest.raises(FileNotFoundError, match=r"mine\.pt: no such file"):
+        Lpips(tmp_path / "mine.pt")
+
+
+def test_places_where_weights_are_found(tmp_path, monkeypatch, weights):
+    """Weights are taken from SPLATPILOT_DATA, or else from torchvision's and lpips' own files."""
+    a, b = images()
+    expected = pytest.approx(reference(weights, a, b), rel=1e-4)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path / "data"))
+    (tmp_path / "data" / "weights").mkdir(parents=True)
+    torch.save(weights, tmp_path / "data" / "weights" / "lpips_squeeze.pt")
+    assert Lpips()(a, b).item() == expected
+
+    monkeypatch.delenv("SPLATPILOT_DATA")
+    checkpoints = tmp_path / "torch" / "hub" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    with_classifier = weights["squeezenet1_1"] | {"classifier.1.bias": torch.zeros(1000)}
+    torch.save(with_classifier, checkpoints / "squeezenet1_1-b8a52dc0.pth")
+    layers = tmp_path / "packages" / "lpips" / "weights" / "v0.1"
+    layers.mkdir(parents=True)
+    torch.save(weights["lin"], layers / "squeeze.pth")
+    (tmp_path / "packages" / "lpips" / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path / "packages"))
+    assert Lpips()(a, b).item() == expected
+
+
+@pytest.mark.parametrize("content", [b"x", None])
+def test_other_files_are_refused(tmp_path, weights, content):
+    """A file that holds no such weights is refused by name."""
+    file = tmp_path / "other.pt"
+    if content is None:
+        torch.save({"squeezenet1_1": weights["lin"], "lin": weights["lin"]}, file)
+    else:
+        file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"other\.pt: no LPIPS-squeeze weights"):
+        Lpips(file)
+
+
+@pytest.mark.parametrize("shape", [(16, 40, 3), (40, 40, 4), (40, 40)])
+def test_bad_images(weights_file, shape):
+    """What is no image of three colours, or too small, is refused with its shape."""
+    with pytest.raises(ValueError, match=r"images have shapes .* at least 17 pixels"):
+        Lpips(weights_file)(torch.zeros(shape), torch.zeros(shape))
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+def test_real_weights_rank_what_people_see():
+    """With the trained weights, blur of a photograph is farther from it than a slight brightening
+    of equal mean squared error.
+    """
+    import cv2
+
+    folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital" / "image_left"
+    image = cv2.imread(str(sorted(folder.iterdir())[20]))[::2, ::2, ::-1] / 255.0
+    blurred = cv2.GaussianBlur(image, (0, 0), 2)
+    error = ((blurred - image) ** 2).mean() ** 0.5
+    brighter = image + error
+    a, b, c = (torch.tensor(x.copy(), dtype=torch.float32) for x in (image, blurred, brighter))
+    lpips = Lpips()
+    assert lpips(b, a) > 5 * lpips(c, a) > 0

@@ -1,0 +1,176 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.reconstruction.measures import (
+    ViewRenderer,
+    depth_mae_m,
+    depth_relative,
+    fit_exposure,
+    floater_fraction,
+    floaters,
+    measure_view,
+    psnr_db,
+    ssim,
+    vignette,
+)
+from splatpilot.training.reconstruction.photometry import Photometry
+
+HEIGHT, WIDTH = 24, 32
+K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])
+
+
+def noise(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.2, 0.8, (HEIGHT, WIDTH, 3))
+
+
+@pytest.mark.parametrize(("difference", "expected"), [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0)])
+def test_psnr_of_a_known_difference(difference, expected):
+    """A difference of d everywhere has a PSNR of -20 log10 d; equal images have infinity."""
+    truth = np.zeros((HEIGHT, WIDTH, 3))
+    assert psnr_db(truth + difference, truth) == pytest.approx(expected)
+    assert psnr_db(truth, truth) == np.inf
+
+
+def test_ssim_of_flat_images():
+    """Images without structure have only SSIM's luminance term, far from the borders; equal images
+    have 1."""
+    a, b = np.full((64, 64, 3), 0.4), np.full((64, 64, 3), 0.6)
+    luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
+    assert ssim(a, b) == pytest.approx(luminance, abs=0.03)
+    assert ssim(a, a) == pytest.approx(1, abs=1e-6)
+    assert ssim(noise(0), noise(1)) < 0.3
+
+
+def test_depth_error_counts_pixels_with_true_depth():
+    """Depth errors are means over the pixels whose true depth lies in range; nothing drawn (0) is
+    wrong by the whole depth; without true depth there is no error."""
+    truth = np.array([[2.0, 4.0, 0.0, np.inf, 149.0, 200.0]], np.float32)
+    depth = np.array([[2.5, 0.0, 9.0, 9.0, 148.0, 9.0]], np.float32)
+    assert depth_mae_m(depth, truth) == pytest.approx((0.5 + 4 + 1) / 3)
+    assert depth_relative(depth, truth) == pytest.approx((0.25 + 1 + 1 / 149) / 3)
+    nothing = np.zeros((2, 2))
+    assert depth_mae_m(nothing, nothing) is None
+    assert depth_relative(nothing, nothing) is None
+    assert floater_fraction(nothing, nothing, nothing) is None
+
+
+def test_floaters_stand_in_front_by_the_margin_and_cover():
+    """A pixel is a floater beyond max(0.1 m, 10 %) in front, not behind, with alpha over 1/2."""
+    cases = [  # true depth, rendered depth, alpha, floater
+        (0.5, 0.41, 1.0, False),
+        (0.5, 0.39, 1.0, True),  # 0.1 m below 1 m
+        (5.0, 4.51, 1.0, False),
+        (5.0, 4.49, 1.0, True),  # 10 % above 1 m
+        (5.0, 9.0, 1.0, False),
+        (5.0, 1.0, 0.5, False),
+        (5.0, 1.0, 0.51, True),
+        (0.0, 1.0, 1.0, False),
+        (np.inf, 1.0, 1.0, False),
+    ]
+    truth, depth, alpha, expected = map(np.array, zip(*cases, strict=True))
+    np.testing.assert_array_equal(floaters(depth, alpha, truth), expected.astype(bool))
+    assert floater_fraction(depth, alpha, truth) == pytest.approx(3 / 7)
+
+
+def plane(distance: float, opacity: float = 0.99, size: float = 8.0) -> GaussianScene:
+    """A plane of flat Gaussians across the optical axis of the camera at the origin."""
+    x, y = (g.ravel() for g in np.meshgrid(*[np.arange(-size, size, 0.1)] * 2))
+    count = len(x)
+    return GaussianScene.from_colors(
+        np.column_stack([x, y, np.full(count, distance)]),
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.tile([0.1, 0.1, 1e-4], (count, 1)),
+        np.full(count, opacity),
+        np.full((count, 3), 0.6),
+    )
+
+
+@pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
+def test_a_plane_in_front_is_all_floater(representation):
+    """A plane rendered in its place has no depth error and no floaters; one drawn half a metre in
+    front errs by that and is a floater in every pixel."""
+    camera = (K, WIDTH, HEIGHT, RigidTransform(), (0.0, 0.0, 0.0))
+    truth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    for distance, error, fraction in ((3.0, 0.0, 0.0), (2.5, 0.5, 1.0)):
+        view = ViewRenderer(plane(distance), representation).render(*camera)
+        assert view.alpha.min() > 0.99
+        assert view.color == pytest.approx(np.full((HEIGHT, WIDTH, 3), 0.6), abs=0.01)
+        assert depth_mae_m(view.depth, truth) == pytest.approx(error, abs=2e-3)
+        assert floater_fraction(view.depth, view.alpha, truth) == fraction
+
+
+@pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
+def test_both_representations_stand_where_the_camera_is_told(representation):
+    """A camera moved towards a plane sees it nearer by that much, whatever the representation."""
+    X_WC = RigidTransform([0.3, -0.2, 1.0])
+    view = ViewRenderer(plane(3.0), representation).render(K, WIDTH, HEIGHT, X_WC, (0, 0, 0))
+    np.testing.assert_allclose(view.depth, 2.0, atol=2e-3)
+
+
+def test_a_veil_that_draws_depth_forward_is_a_floater():
+    """Before a plane at 3 m, a veil at 1 m becomes a floater once it draws the expected depth
+    forward by 0.3 m: with 15 % of the weight or more, long before it is the median."""
+    truth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    found = []
+    for weight in (0.1, 0.2):
+        depth = weight * 1.0 + (1 - weight) * truth
+        found.append(floater_fraction(depth, np.ones_like(depth), truth))
+    assert found == [0.0, 1.0]
+
+
+def test_vignette_is_that_of_the_photometry():
+    """The darkening of corners is the factor by which reconstruction divides its images."""
+    expected = Photometry(np.array([1.0]), -0.3).factor(0, HEIGHT, WIDTH)
+    np.testing.assert_allclose(vignette(-0.3, WIDTH, HEIGHT), expected, rtol=1e-6)
+
+
+def test_exposure_is_fitted():
+    """An image that is the scene darkened towards the corners and exposed otherwise is matched, and
+    the gain found; what cannot be matched stays the least-squares way off."""
+    scene = 0.5 * noise()
+    truth = 1.4 * scene * vignette(-0.5, WIDTH, HEIGHT)[..., None]
+    image, gain = fit_exposure(scene, truth, -0.5)
+    assert gain == pytest.approx(1.4)
+    np.testing.assert_allclose(image, truth, atol=1e-12)
+    black, gain = fit_exposure(np.zeros_like(scene), truth, -0.5)
+    assert gain == 1.0 and not black.any()
+    other = noise(1)
+    _, best = fit_exposure(scene, other, 0.0)
+    errors = [np.sum((g * scene - other) ** 2) for g in (best - 0.01, best, best + 0.01)]
+    assert errors[1] < min(errors[0], errors[2])
+
+
+def test_measures_of_a_view():
+    """A view is compared with its frame, whose exposure and vignetting do not count."""
+    color = noise().astype(np.float32)
+    exposed = 1.2 * color * vignette(-0.2, WIDTH, HEIGHT)[..., None]
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    frame = CaptureFrame(np.round(255 * exposed).astype(np.uint8), depth, RigidTransform(), K)
+    near = depth.copy()
+    near[:6] = 1.0  # a quarter
+    found = measure_view(RenderedView(color, near, np.ones_like(depth)), frame, vignetting=-0.2)
+    assert found.psnr_db > 50 and found.ssim > 0.999
+    assert found.gain == pytest.approx(1.2, rel=1e-3)
+    assert found.lpips is None
+    assert found.depth_mae_m == pytest.approx(0.25)
+    assert found.depth_relative == pytest.approx(0.125)
+    assert found.floater_fraction == pytest.approx(0.25)
+
+
+def test_lpips_is_of_the_exposed_image():
+    """The perceptual distance is asked of the image in the frame's exposure."""
+    color = noise().astype(np.float32)
+    frame = CaptureFrame(
+        np.round(255 * 1.2 * color).astype(np.uint8), np.ones((HEIGHT, WIDTH)), RigidTransform(), K
+    )
+    view = RenderedView(color, np.ones((HEIGHT, WIDTH)), np.ones((HEIGHT, WIDTH)))
+
+    def difference(a, b):
+        assert a.shape == (HEIGHT, WIDTH, 3)
+        return (a - b).abs().max()
+
+    assert measure_view(view, frame, lpips=difference).lpips == pytest.approx(0, abs=0.01)

@@ -1,0 +1,120 @@
+"""Reconstruction by optimisation, on a small room."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
+from splatpilot.systems.splats.gaussian_ply import read_ply
+from splatpilot.training.captures.capture import SfmPoints, no_depth
+from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.reconstruct import reconstruct, run
+
+CONFIG = ReconstructConfig(iterations=60, image_width=0, hold_out=6, voxel_size=0.1, threads=1)
+
+
+# A walk in small steps, with the frames 0 and 6, which will be withheld, in the midst of it.
+POSES = [
+    ((1.0 + 0.1 * i, 0.2 * np.sin(i), -1.2), -0.5 + 0.1 * i, -0.1)
+    for i in (4, 0, 1, 2, 3, 5, 7, 6, 8, 9, 10, 11)
+]
+
+
+@pytest.fixture
+def room(tmp_path, write_room):
+    return write_room(tmp_path / "room", poses=POSES)
+
+
+@pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
+def test_held_out_frames_come_out(tmp_path, room, representation):
+    """Frames that nothing was fitted to are rendered with the right colours and depth."""
+    config = replace(CONFIG, representation=representation)
+    start = run(capture=room, out=tmp_path / "start", config=replace(config, iterations=1))
+    summary = run(capture=room, out=tmp_path / "scene", config=config)
+    assert start.held_out is not None and summary.held_out is not None
+    assert summary.held_out.psnr_db > max(30, start.held_out.psnr_db + 2)
+    assert summary.held_out.depth_mae_m < 0.1
+    metadata = read_scene_metadata(tmp_path / "scene")
+    assert (metadata.held_out, metadata.representation) == ([0, 6], representation)
+    assert (metadata.capture, metadata.image_width) == (str(room), 0)
+    scales = read_ply(tmp_path / "scene" / "gaussians.ply").scales
+    assert (scales[:, 2] < 2e-6).all() == (representation == "2dgs")
+
+
+def test_same_seed_same_scene_whatever_the_threads(tmp_path, room):
+    """Two runs with different numbers of threads end in the same bytes."""
+    for name, threads in (("a", 1), ("b", 2)):
+        config = replace(CONFIG, iterations=20, threads=threads)
+        run(capture=room, out=tmp_path / name, config=config)
+    for file in ("gaussians.ply", "scene.yaml", "esdf.npz"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_metric_depth_is_what_places_surfaces(tmp_path, room):
+    """From random Gaussians, the depth term brings depth much nearer to the truth."""
+    config = replace(CONFIG, initialization="random", initial_gaussians=3000, iterations=300)
+    errors = []
+    for weight in (0.0, 0.2):
+        weighted = replace(config, depth_weight=weight)
+        summary = run(capture=room, out=tmp_path / "scene", config=weighted)
+        assert summary.held_out is not None
+        errors.append(summary.held_out.depth_mae_m)
+    assert 0 < errors[1] < 0.5 * errors[0]
+
+
+def test_gaussians_are_added_where_depth_puts_none(tmp_path, room):
+    """Left to itself, a reconstruction adds Gaussians where they start at random, but none where
+    they start from depth."""
+    config = replace(CONFIG, initial_gaussians=300, iterations=80, refine_start=5, refine_every=10)
+
+    def count(**changes) -> int:
+        return run(
+            capture=room, out=tmp_path / "scene", config=replace(config, **changes)
+        ).gaussians
+
+    assert count(initialization="random") > 300
+    assert count(initialization="random", strategy="none") == 300
+    config = replace(config, initial_gaussians=3000)
+    assert count() == count(strategy="none")
+
+
+def test_without_depth_from_points(tmp_path, write_room):
+    """A capture without depth is reconstructed from points: withheld images come out, and the gains
+    of all images are found."""
+    factors = np.where(np.arange(12) % 3 == 1, 0.8, 1.0)
+    dim = write_room(
+        tmp_path / "dim", poses=POSES, brightness=lambda i, rho: np.full(1, factors[i])
+    )
+    capture = read_capture(dim)
+    rows, columns = np.mgrid[2:48:4, 2:64:4]
+    p_WQ, colors = [], []
+    for frame in capture.frames():
+        p_CQ = frame.back_project(columns + 0.5, rows + 0.5, frame.depth[rows, columns])
+        p_WQ.append(frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T)
+        colors.append(frame.image[rows, columns].reshape(-1, 3) / 255)
+    points = SfmPoints(np.concatenate(p_WQ), np.concatenate(colors))
+    capture = replace(capture, load_depth=no_depth, points=points)
+    summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=250))
+    assert summary.held_out is not None
+    assert summary.held_out.psnr_db > 32
+    assert np.isnan(summary.held_out.depth_mae_m)
+    gains = np.array(read_scene_metadata(tmp_path / "scene").gains)
+    np.testing.assert_allclose(gains / gains[0], factors / factors[0], rtol=0.03)
+
+
+def test_unknown_scale_is_never_flown_in(tmp_path, room):
+    """A capture of unknown scale becomes a scene that says so and that `read_scene` refuses."""
+    capture = replace(read_capture(room), metric=False)
+    summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=5))
+    assert "cannot be flown in: its scale is unknown" in str(summary)
+    with pytest.raises(ValueError, match=r"scene\.yaml: the scale of this scene is unknown"):
+        read_scene(tmp_path / "scene")
+
+
+def test_what_a_capture_lacks_is_said(tmp_path, room):
+    """Asked to start from points that are not there, it says what there is."""
+    with pytest.raises(ValueError, match="initialization is 'points', but room has none; choose"):
+        run(capture=room, out=tmp_path / "scene", config=replace(CONFIG, initialization="points"))
+    assert not (tmp_path / "scene").exists()

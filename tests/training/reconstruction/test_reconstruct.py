@@ -1,0 +1,156 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.photometry import Photometry
+from splatpilot.training.reconstruction.reconstruct import run
+
+CONFIG = ReconstructConfig(iterations=0, voxel_size=0.1)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def test_room_end_to_end(tmp_path, write_room, room_in_W, capsys):
+    """From a capture of a room comes a scene that looks, measures and flies like the room."""
+    room = write_room(tmp_path / "room", width=128, height=96)
+    summary = run(capture=room, out=tmp_path / "scene", config=CONFIG)
+    assert f"Gaussians          {summary.gaussians}\n" in capsys.readouterr().out
+    world = read_scene(tmp_path / "scene")
+    metadata = read_scene_metadata(tmp_path / "scene")
+    assert (world.name, len(world.gaussians)) == ("room", summary.gaussians)
+    assert "TartanAir V1" in metadata.provenance and len(metadata.gains) == 12
+
+    # It collides like the room: 6 x 3 x 2.5 m, of which not all was seen.
+    lower, upper = room_in_W
+    assert 30 < metadata.observed_free_volume <= 6 * 3 * 2.5 * 1.05
+    p_WQ = np.array([[2.0, 0.0, 1.2], [4.0, 0.3, 1.4]])
+    truth = np.minimum(p_WQ - lower, upper - p_WQ).min(axis=-1)
+    np.testing.assert_allclose(world.esdf.distance(p_WQ), truth, atol=0.06)
+    assert (world.esdf.query(p_WQ).state == FieldState.FREE).all()
+
+    # Start and goal are far apart in it and free.
+    assert summary.geodesic > 3
+    ends = np.array([world.p_WS, world.p_WG])
+    assert (np.minimum(ends - lower, upper - ends) > VEHICLE_RADIUS).all()
+    assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
+
+    # It looks like the room.
+    capture = read_tartanair_v1(room)
+    baked = BakedScene(world.gaussians)
+    photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
+    for i in range(len(capture)):
+        frame = capture.frame(i)
+        view = baked.render(frame.K, 128, 96, frame.X_WC, background=world.background)
+        assert psnr(view.color * photometry.factor(i, 96, 128)[..., None], frame.image / 255) > 28
+        assert np.median(np.abs(view.depth / frame.depth - 1)) < 0.04
+        assert view.alpha.mean() > 0.98
+
+
+def test_same_capture_same_scene(tmp_path, write_room):
+    """Reconstructing twice gives the same bytes."""
+    room = write_room(tmp_path / "room")
+    for name in ("a", "b"):
+        run(capture=room, out=tmp_path / name, config=CONFIG)
+    for file in ("gaussians.ply", "scene.yaml"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_number_of_gaussians_is_kept(tmp_path, write_room):
+    """No more Gaussians than allowed are made, and too tight a limit is an error."""
+    room = write_room(tmp_path / "room")
+    free = run(capture=room, out=tmp_path / "a", config=CONFIG).gaussians
+    limited = run(
+        capture=room, out=tmp_path / "b", config=replace(CONFIG, max_gaussians=free // 3)
+    ).gaussians
+    assert 0 < limited <= free // 3
+    with pytest.raises(ValueError, match="10 Gaussians are too few for 12 frames"):
+        run(capture=room, out=tmp_path / "c", config=replace(CONFIG, max_gaussians=10))
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"iterations": -1}, "iterations is -1"),
+        ({"max_gaussians": 0}, "max_gaussians is 0, at least 1"),
+        ({"max_cell": 3}, "max_cell is 3, a power of two"),
+        ({"opacity": 0.0}, r"opacity is 0\.0, it must be in \(0, 1\]"),
+        ({"voxel_size": 0.0}, r"voxel_size is 0\.0, at least 0\.005"),
+        ({"voxel_size": float("nan")}, "voxel_size is nan"),
+        ({"max_range": 0.0}, r"max_range is 0\.0 m, more than the voxel size"),
+        ({"contrast": -1.0}, r"contrast is -1\.0, at least 0\.001"),
+    ],
+)
+def test_bad_config(tmp_path, write_room, change, message):
+    """Values that make no sense are refused before any work, with value and limit."""
+    with pytest.raises(ValueError, match=message):
+        run(capture=tmp_path, out=tmp_path / "scene", config=replace(CONFIG, **change))
+
+
+def test_bad_capture_leaves_nothing(tmp_path, write_room):
+    """A capture with too many unreadable frames is an error that names one; nothing is written."""
+    room = write_room(tmp_path / "room")
+    for i in (4, 5, 6):
+        (room / "image_left" / f"{i:06d}_left.png").write_bytes(b"x")
+    with pytest.raises(ValueError, match=r"000004_left\.png: not a readable image"):
+        run(capture=room, out=tmp_path / "scene", config=CONFIG)
+    assert list(tmp_path.iterdir()) == [room]
+
+
+def test_unknown_capture(tmp_path):
+    """A folder that is no capture, or none at all, is refused."""
+    with pytest.raises(ValueError, match="no capture of a known kind; known are TartanAir V1"):
+        run(capture=tmp_path, out=tmp_path / "scene", config=CONFIG)
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
+        run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=CONFIG)
+
+
+def test_occupied_output_is_refused_before_any_work(tmp_path, write_room):
+    """A folder that holds something else is refused at once."""
+    with pytest.raises(ValueError, match="exists and is no scene"):
+        run(capture=tmp_path / "nowhere", out=write_room(tmp_path / "room"), config=CONFIG)
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+def test_hospital(tmp_path):
+    """Part of the real hospital, coarsely: images match, corners are found to be darkened."""
+    capture = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"
+    part = tmp_path / "part"
+    numbers = range(8, 36, 2)
+    for folder, name in (
+        ("image_left", "{:06d}_left.png"),
+        ("depth_left", "{:06d}_left_depth.npy"),
+    ):
+        (part / folder).mkdir(parents=True)
+        files = sorted((capture / folder).iterdir())
+        for new, number in enumerate(numbers):
+            (part / folder / name.format(new)).symlink_to(files[number])
+    poses = (capture / "pose_left.txt").read_text().splitlines()
+    (part / "pose_left.txt").write_text("\n".join(poses[number] for number in numbers))
+
+    config = ReconstructConfig(iterations=0, max_gaussians=100_000, voxel_size=0.1)
+    summary = run(capture=part, out=tmp_path / "scene", config=config)
+    assert summary.geodesic > 6
+    assert -0.4 < summary.vignetting < -0.2
+    world, sequence = read_scene(tmp_path / "scene"), read_tartanair_v1(part)
+    baked = BakedScene(world.gaussians)
+    photometry = Photometry(
+        np.array(read_scene_metadata(tmp_path / "scene").gains), summary.vignetting
+    )
+    for i in (0, 5, 10):
+        frame = sequence.frame(i)
+        view = baked.render(frame.K, 640, 480, frame.X_WC, background=world.background)
+        color = view.color * photometry.factor(i, 480, 640)[..., None]
+        assert psnr(np.clip(color, 0, 1), frame.image / 255) > 23
+        assert np.median(np.abs(view.depth / frame.depth - 1)) < 0.01

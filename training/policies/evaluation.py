@@ -1,0 +1,145 @@
+"""Flights of a policy along courses, many at once: how it does without being trained."""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.policies.fields import Fields
+from splatpilot.training.policies.observation import Observation, ObservationNoise
+from splatpilot.training.policies.primitives import Primitives
+from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.vehicles import BodyRate, PointMass, Vehicle
+
+CAMERA_AHEAD = 0.1
+"""[m], of the camera before the vehicle's centre, along body x."""
+
+
+class Pilot(Protocol):
+    """What observes through a camera and decides, for N vehicles at once."""
+
+    rate: float  # [Hz]
+    grid: PinholeGrid
+
+    def initial_memory(self, count: int) -> Tensor:
+        """What N vehicles remember at first, (N, ...)."""
+        ...
+
+    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
+        """Accelerations (N, 3) [m/s^2] in W, headings (N,) [rad] or None, and the memory after."""
+        ...
+
+
+def look(
+    vehicle: Vehicle, primitives: Primitives, grid: PinholeGrid, distances: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Depth (N, R) [m] from the vehicles' cameras, and their attitudes R_WB (N, 3, 3)."""
+    R_WB = vehicle.attitude()
+    with torch.no_grad():
+        x, y, z = R_WB.unbind(2)
+        R_WC = torch.stack([-y, -z, x], 2)
+        return primitives.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, grid, distances), R_WB
+
+
+class Outcomes(NamedTuple):
+    """How N flights went."""
+
+    reached: Tensor  # (N,) bool
+    collided: Tensor  # (N,) bool
+    left: Tensor  # (N,) bool, the volume
+    least_clearance: Tensor  # (N,) [m]
+    mean_speed: Tensor  # (N,) [m/s]
+
+    def measures(self, kinds: list[str] | None = None) -> dict[str, float]:
+        """Parts of the flights that reached the goal, collided and left; what remains took too
+        long. Means of least clearance [m] and speed [m/s]. Flight n is of kind n modulo their
+        number, and success is also given for each of `kinds`."""
+        kinds = kinds or []
+        flown: dict[str, list[bool]] = {}
+        for n, reached in enumerate(self.reached.tolist() if kinds else []):
+            flown.setdefault(kinds[n % len(kinds)], []).append(reached)
+        return {
+            "success": float(self.reached.float().mean()),
+            "collisions": float(self.collided.float().mean()),
+            "left": float(self.left.float().mean()),
+            "least_clearance": float(self.least_clearance.mean()),
+            "speed": float(self.mean_speed.mean()),
+            **{kind: sum(reached) / len(reached) for kind, reached in flown.items()},
+        }
+
+
+@dataclass
+class FlightConditions:
+    """Of the flights that measure a policy."""
+
+    # [m/s] Asked of the policy.
+    speed: float = 2.0
+    # [m] The goal is reached within this distance.
+    goal_radius: float = 0.3
+    # [-] Flights end after this multiple of the time that the straight way takes at that speed.
+    patience: float = 2.5
+    # [s] Lag of the acceleration of point masses.
+    lag: float = 0.12
+    # Whether the body-rate quadrotor flies, instead of a point mass.
+    body_rate: bool = False
+
+
+@torch.no_grad()
+def fly_courses(
+    pilot: Pilot,
+    fields: Fields,
+    conditions: FlightConditions,
+    noise: ObservationNoise | None = None,
+    seed: int = 0,
+) -> Outcomes:
+    """Flies every course once from its start, at rest, level and facing the goal."""
+    device = fields.p_WS.device
+    generator = torch.Generator(device).manual_seed(seed)
+    count = len(fields)
+    p_WG, to_goal = fields.p_WG, fields.p_WG - fields.p_WS
+    yaw = torch.atan2(to_goal[:, 1], to_goal[:, 0])
+    zero = torch.zeros_like(p_WG)
+    if conditions.body_rate:
+        vehicle: Vehicle = BodyRate.hovering(fields.p_WS, yaw)
+    else:
+        lag = torch.full((count, 1), conditions.lag, device=device)
+        vehicle = PointMass(fields.p_WS, zero, zero, yaw, lag)
+    memory, control = pilot.initial_memory(count), FlatnessControllerConfig()
+    speed = torch.full((count,), conditions.speed, device=device)
+
+    reached, collided, left = (torch.zeros(count, dtype=torch.bool, device=device) for _ in "rcl")
+    clearance = torch.full((count,), torch.inf, device=device)
+    path, time = torch.zeros(count, device=device), torch.zeros(count, device=device)
+    flying = torch.arange(count, device=device)
+    primitives = fields.primitives.of(flying)
+    limit = conditions.patience * to_goal.norm(dim=1) / conditions.speed
+    dt = 1.0 / pilot.rate
+    while len(flying):
+        distances, _ = primitives.near(vehicle.p)
+        here = distances.amin(1) - VEHICLE_RADIUS
+        clearance[flying] = torch.minimum(clearance[flying], here)
+        inside = (vehicle.p > fields.lower_W[flying]) & (vehicle.p < fields.upper_W[flying])
+        collided[flying] = here < 0.0
+        left[flying] = ~inside.all(1) & ~collided[flying]
+        done = (vehicle.p - p_WG[flying]).norm(dim=1) < conditions.goal_radius
+        reached[flying] = done & ~collided[flying] & ~left[flying]
+        ended = (reached | collided | left | (time > limit))[flying]
+        if ended.any():
+            keep = (~ended).nonzero()[:, 0]
+            flying, memory, distances = flying[keep], memory[keep], distances[keep]
+            vehicle = type(vehicle)(*(x[keep] for x in vehicle))
+            primitives = fields.primitives.of(flying)
+            continue
+        depth, R_WB = look(vehicle, primitives, pilot.grid, distances)
+        if noise is not None:
+            depth = noise.disturbed(depth, generator)
+        seen = Observation(depth, vehicle, R_WB, p_WG[flying], speed[flying])
+        a_cmd, heading, memory = pilot.decide(seen, memory)
+        before = vehicle.p
+        vehicle = vehicle.step(a_cmd, dt, control, heading)
+        path[flying] += (vehicle.p - before).norm(dim=1)
+        time[flying] += dt
+    return Outcomes(reached, collided, left, clearance, path / time.clamp(min=dt))

@@ -1,0 +1,104 @@
+"""Checkpoints of an optimisation: whole files that say what they belong to."""
+
+import hashlib
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatpilot.systems.files import written_atomically
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.views import ReconstructionViews
+
+VERSION = 1
+# What may differ when an interrupted run goes on, for it changes nothing that is computed.
+_INDIFFERENT = (
+    "threads",
+    "checkpoint_every",
+    "measure_every",
+    "tensorboard",
+    "voxel_size",
+    "max_range",
+    "distance_field",
+)
+
+
+class Checkpoint:
+    """The one file in which an optimisation is kept while it runs, in a work folder beside `out`.
+
+    Args:
+        out: the scene folder that is to be made.
+        config: the run's.
+        views: what it is fitted to.
+    """
+
+    def __init__(self, out: Path, config: ReconstructConfig, views: ReconstructionViews):
+        out = out.absolute()
+        self.folder = out.with_name(f".{out.name}.partial")
+        self.file = self.folder / "checkpoint.pt"
+        fields = asdict(config)
+        self._config = {name: fields[name] for name in fields if name not in _INDIFFERENT}
+        digest = hashlib.sha256()
+        for tensor in (views.images, views.depths, views.viewmats, views.K, views.gains):
+            digest.update(tensor.numpy().tobytes())
+        self._capture = digest.hexdigest()
+
+    def save(self, content: dict[str, Any]) -> None:
+        """Replaces what was kept.
+
+        Raises:
+            OSError: if it cannot be written, for example because the disk is full; what was kept
+                before is kept.
+        """
+        own = {"version": VERSION, "config": self._config, "capture": self._capture}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with written_atomically(self.file) as partial:
+                torch.save({**own, **content}, partial)
+        except (OSError, RuntimeError) as error:
+            # torch's own writer raises RuntimeError when the disk is full.
+            reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+            raise OSError(
+                f"{self.file}: the checkpoint cannot be written ({reason}); make room, or choose "
+                "another folder with --out"
+            ) from error
+
+    def load(self) -> dict[str, Any] | None:
+        """Returns what was kept last, or None if nothing was.
+
+        Raises:
+            ValueError: if the file is damaged, or belongs to another configuration or capture.
+        """
+        if not self.file.exists():
+            return None
+        try:
+            content = torch.load(self.file, weights_only=True)
+        except Exception as error:  # of a damaged file, the unpickler may raise anything
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            raise ValueError(
+                f"{self.file}: not a readable checkpoint ({reason}); {_REMEDY}"
+            ) from None
+        if content.get("version") != VERSION:
+            raise ValueError(f"{self.file}: written by another version of the program; {_REMEDY}")
+        for name, value in self._config.items():
+            kept = content["config"].get(name)
+            if kept != value:
+                raise ValueError(
+                    f"{self.file}: an interrupted run with {name} {kept}, not {value}; "
+                    f"set it so to go on; or {_REMEDY}"
+                )
+        if content["capture"] != self._capture:
+            raise ValueError(
+                f"{self.file}: an interrupted run on another capture, or its files have changed; "
+                f"{_REMEDY}"
+            )
+        return content
+
+    def remove(self) -> None:
+        """Removes the work folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+_REMEDY = "start anew with --restart, which discards it"

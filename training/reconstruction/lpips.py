@@ -1,0 +1,145 @@
+"""LPIPS, the learned perceptual distance between images, on the SqueezeNet backbone."""
+
+import importlib.util
+import os
+from functools import cache
+from pathlib import Path
+from pickle import UnpicklingError
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d
+from torchvision.models import squeezenet1_1
+
+# ImageNet's, which LPIPS applies as a shift and a scale of images in [-1, 1].
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+# Layers of SqueezeNet 1.1 after which features are compared.
+_TAPS = (1, 4, 7, 9, 10, 11, 12)
+_CHANNELS = (64, 128, 256, 384, 384, 512, 512)
+_SMALLEST = 17  # [px], below which the last pooling has nothing left
+
+_FILE = Path("weights") / "lpips_squeeze.pt"
+_BACKBONE = "squeezenet1_1-b8a52dc0.pth"
+
+
+class Lpips:
+    """LPIPS v0.1 with the SqueezeNet 1.1 backbone (Zhang et al., "The Unreasonable Effectiveness of
+    Deep Features as a Perceptual Metric", CVPR 2018).
+
+    With f_l the features of layer l, each pixel's scaled to unit length over channels, the distance
+    is the sum over seven layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. Its figures
+    ("LPIPS-squeeze") are not to be compared with those of the AlexNet or VGG backbones.
+
+    The network is loaded once a process.
+
+    Args:
+        weights: a file `{"squeezenet1_1": state dict, "lin": state dict}` as torch saves it. When
+            None, `$SPLATPILOT_DATA/weights/lpips_squeeze.pt`; without that, torchvision's
+            downloaded SqueezeNet with the linear layers of the installed package `lpips`.
+
+    Raises:
+        FileNotFoundError: no weights are there; the message says how to get them.
+        ValueError: the file holds something else.
+    """
+
+    def __init__(self, weights: Path | None = None):
+        self._source = _find(weights)
+        _load(self._source, torch.device("cpu"))
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """
+        Returns the distance of two images, a scalar at least 0, differentiable in `a`.
+
+        Args:
+            a, b: (..., H, W, 3) float32, red, green, blue in [0, 1]; of several the mean is taken.
+
+        Raises:
+            ValueError: the shapes differ, are none of images, or smaller than 17 pixels.
+        """
+        if a.shape != b.shape or a.ndim < 3 or a.shape[-1] != 3 or min(a.shape[-3:-1]) < _SMALLEST:
+            raise ValueError(
+                f"images have shapes {tuple(a.shape)} and {tuple(b.shape)}; both must be "
+                f"(..., H, W, 3) of one size, at least {_SMALLEST} pixels high and wide"
+            )
+        layers, linear = _load(self._source, a.device)
+        features = _features(layers, a)
+        with torch.no_grad():
+            other_features = _features(layers, b)
+        distances = [
+            conv2d((x - y).square(), w).mean()
+            for x, y, w in zip(features, other_features, linear, strict=True)
+        ]
+        return torch.stack(distances).sum()
+
+
+def _features(layers: nn.Sequential, images: Tensor) -> list[Tensor]:
+    """Returns the features of images (..., H, W, 3), of unit length over channels."""
+    x = images.reshape(-1, *images.shape[-3:])
+    x = ((x - x.new_tensor(_MEAN)) / x.new_tensor(_STD)).movedim(-1, 1)
+    features = []
+    for i, layer in enumerate(layers):
+        x = layer(x)
+        if i in _TAPS:
+            features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+    return features
+
+
+def _find(weights: Path | None) -> tuple[Path, ...]:
+    """Returns one file with all weights, or torchvision's backbone and the package's layers."""
+    if weights is not None:
+        if not weights.is_file():
+            raise FileNotFoundError(f"{weights}: no such file, LPIPS weights are expected there")
+        return (weights,)
+    in_data = Path(os.environ.get("SPLATPILOT_DATA", "")) / _FILE
+    if "SPLATPILOT_DATA" in os.environ and in_data.is_file():
+        return (in_data,)
+    backbone = Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONE
+    package = importlib.util.find_spec("lpips")
+    if backbone.is_file() and package is not None and package.origin is not None:
+        return (backbone, Path(package.origin).parent / "weights" / "v0.1" / "squeeze.pth")
+    raise FileNotFoundError(
+        "LPIPS has no weights: neither $SPLATPILOT_DATA/weights/lpips_squeeze.pt nor torchvision's "
+        f"{backbone} with the package `lpips` is there; run `pip install lpips` and `python -c "
+        "\"import torchvision; torchvision.models.squeezenet1_1(weights='DEFAULT')\"` once"
+    )
+
+
+@cache
+def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential, list[Tensor]]:
+    """Returns the layers of the backbone and the weights of the linear layers, (1, C, 1, 1)."""
+    try:
+        files = [torch.load(file, map_location="cpu", weights_only=True) for file in source]
+        backbone, linear = (
+            (files[0]["squeezenet1_1"], files[0]["lin"]) if len(files) == 1 else files
+        )
+        # The classifier is not needed.
+        layers = squeezenet1_1().features
+        layers.load_state_dict(
+            {
+                name.removeprefix("features."): tensor.float()
+                for name, tensor in backbone.items()
+                if name.startswith("features.")
+            }
+        )
+        weights = [linear[f"lin{i}.model.1.weight"].float() for i in range(len(_TAPS))]
+        if [w.shape for w in weights] != [(1, channels, 1, 1) for channels in _CHANNELS]:
+            raise ValueError("linear layers of other sizes")
+    except (
+        UnpicklingError,
+        OSError,
+        RuntimeError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        EOFError,
+    ) as error:
+        raise ValueError(
+            f"{' and '.join(map(str, source))}: no LPIPS-squeeze weights ({str(error)[:200]}); "
+            "get them again"
+        ) from error
+    for module in layers.modules():
+        if isinstance(module, nn.ReLU):
+            module.inplace = False
+    layers.requires_grad_(False).eval().to(device)
+    return layers, [w.to(device) for w in weights]

@@ -1,0 +1,249 @@
+"""Fitting Gaussians to images and depth: the paper's equations 1 and 2, step by step."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.event_log import event_log
+from splatpilot.training.reconstruction import mcmc
+from splatpilot.training.reconstruction.checkpoint import Checkpoint
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.densification import DefaultStrategy
+from splatpilot.training.reconstruction.held_out import HeldOutFigures, measure_held_out
+from splatpilot.training.reconstruction.losses import log_depth_loss, photometric_loss
+from splatpilot.training.reconstruction.mcmc import McmcStrategy
+from splatpilot.training.reconstruction.splat_parameters import SplatParameters
+from splatpilot.training.reconstruction.splat_rendering import Rendering, render
+from splatpilot.training.reconstruction.views import ReconstructionViews
+
+# The learning rate of the means falls to this fraction.
+_LAST_RATE = 0.01
+# Unknown gains are fitted after these parts of all steps.
+_GAIN_FITS = (0.1, 0.2, 0.4)
+# Terms of 2D Gaussian splatting begin after these parts of all steps, as in its publication.
+_DISTORTION_START, _NORMAL_START = 0.1, 7 / 30
+
+
+class Optimization:
+    """One run, from its first step or from a checkpoint.
+
+    Args:
+        config: how.
+        views: what to fit.
+        held_out: withheld frames to measure with; may be empty.
+        background: (3,) colour behind everything.
+        initial: makes the Gaussians to start from; not called if there is a checkpoint.
+        checkpoint: where to keep what was done.
+        perceptual: LPIPS of two images (H, W, 3), or None.
+        fit_gains: whether the gains of `views` are unknown, and to be found on the way.
+    """
+
+    def __init__(
+        self,
+        config: ReconstructConfig,
+        views: ReconstructionViews,
+        held_out: ReconstructionViews | None,
+        background: tuple[float, float, float],
+        initial: Callable[[], GaussianScene],
+        checkpoint: Checkpoint,
+        perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
+        fit_gains: bool = False,
+    ):
+        self._config, self._views, self._held_out = config, views, held_out
+        self._checkpoint, self._perceptual = checkpoint, perceptual
+        self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
+        self._background = torch.tensor([background], device=config.device)  # (1, 3)
+        self._viewmats = views.viewmats.to(config.device)
+        self._K = views.K.to(config.device)
+        self.center, self.extent = extent_of_cameras(views)
+        rates = {
+            "means": config.means_rate * self.extent,
+            "quats": config.quats_rate,
+            "log_scales": config.scales_rate,
+            "logit_opacities": config.opacities_rate,
+            "sh_0": config.colors_rate,
+            "sh_rest": config.colors_rate / 20,
+        }
+        kept = checkpoint.load()
+        if kept is None:
+            self.step = 0
+            self.splats = SplatParameters.of_scene(
+                initial(), config.sh_degree, rates, config.device
+            )
+        else:
+            self.step = kept["step"]
+            self.splats = SplatParameters(**kept["splats"], rates=rates)
+            views.gains = kept["gains"]
+        self._strategy = self._make_strategy()
+        if kept is not None and self._strategy is not None:
+            self._strategy.restore(kept["strategy"])
+
+    def run(self) -> None:
+        """Takes all steps that remain, and shows how far it has come.
+
+        Raises:
+            OSError: if a checkpoint cannot be written.
+        """
+        config = self._config
+        progress = tqdm(
+            total=config.iterations,
+            initial=self.step,
+            desc="optimising",
+            unit="step",
+            mininterval=1,
+        )
+        with one_torch_thread(), progress, event_log(config.tensorboard) as log:
+            while self.step < config.iterations:
+                self.take_step()
+                progress.update()
+                if self.step % config.measure_every == 0:
+                    figures = self.measure()
+                    log(
+                        self.step,
+                        {"gaussians": len(self.splats), **(figures.scalars() if figures else {})},
+                    )
+                    progress.set_postfix_str(
+                        f"{len(self.splats)} Gaussians" + (f", {figures}" if figures else "")
+                    )
+                if self.step % config.checkpoint_every == 0 or self.step == config.iterations:
+                    self._save()
+
+    def take_step(self) -> None:
+        """Fits one image a little better."""
+        config, splats = self._config, self.splats
+        decay = _LAST_RATE ** (self.step / config.iterations)
+        splats.set_rate("means", config.means_rate * self.extent * decay)
+        k = self._image_of_step(self.step)
+        viewmat = self._viewmats[k : k + 1]
+        part = self.step / config.iterations
+        flat = config.representation == "2dgs"
+        rendering = render(
+            config.representation,
+            self._gaussians(),
+            viewmat,
+            self._K,
+            self._views.width,
+            self._views.height,
+            background=self._background,
+            depth_mode=config.depth_mode,
+            absgrad=config.absgrad and config.strategy == "default",
+            distortion=flat and config.distortion_weight > 0 and part >= _DISTORTION_START,
+            threads=config.renderer_threads,
+        )
+        loss = self._loss(rendering, k, part)
+        if self._strategy is not None:
+            self._strategy.watch(rendering)
+        loss.backward()
+        if self._strategy is not None:
+            self._strategy.observe(rendering, splats, viewmat, self._K)
+        splats.step()
+        self.step += 1
+        if self.step in self._gain_steps:
+            self._fit_gains()
+        if self._strategy is not None:
+            self._strategy.refine(self.step, splats)
+
+    @torch.no_grad()
+    def measure(self) -> HeldOutFigures | None:
+        """Measures the Gaussians as they are on the withheld frames, if there are any."""
+        if self._held_out is None:
+            return None
+        return measure_held_out(
+            self._config.representation,
+            self._gaussians(),
+            self._held_out,
+            self._background,
+            self._config.renderer_threads,
+        )
+
+    def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        splats = self.splats
+        return splats["means"], splats["quats"], splats.scales, splats.opacities, splats.sh
+
+    @torch.no_grad()
+    def _fit_gains(self) -> None:
+        """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
+        gains = measure_held_out(
+            self._config.representation,
+            self._gaussians(),
+            self._views,
+            self._background,
+            self._config.renderer_threads,
+        ).gains
+        log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
+        self._views.gains = torch.exp(log_gains - log_gains.mean())
+
+    def _loss(self, rendering: Rendering, k: int, part: float) -> Tensor:
+        config, device = self._config, self._config.device
+        target = self._views.target(k).to(device)
+        loss = photometric_loss(rendering.color, target, config.ssim_weight)
+        if config.depth_weight > 0:
+            loss = loss + config.depth_weight * log_depth_loss(
+                rendering.depth,
+                self._views.depths[k].to(device),
+                self._views.edges[k].to(device).float(),
+            )
+        late = part >= 1 - config.lpips_fraction and self.step % config.lpips_every == 0
+        if self._perceptual is not None and late:
+            weight = config.lpips_weight * config.lpips_every
+            loss = loss + weight * self._perceptual(rendering.color.clamp(0, 1), target.clamp(0, 1))
+        if rendering.normals is not None and rendering.surface_normals is not None:
+            assert rendering.distortion is not None
+            if config.distortion_weight > 0 and part >= _DISTORTION_START:
+                loss = loss + config.distortion_weight * rendering.distortion.mean()
+            if config.normal_weight > 0 and part >= _NORMAL_START:
+                surface = rendering.surface_normals * rendering.alpha.detach()[..., None]
+                cosine = (rendering.normals * surface).sum(dim=-1)
+                loss = loss + config.normal_weight * (1 - cosine).mean()
+        if config.strategy == "mcmc":
+            loss = loss + mcmc.penalty(self.splats)
+        return loss
+
+    def _image_of_step(self, step: int) -> int:
+        """All images in random order, then all again in another; it depends on the step alone."""
+        n = len(self._views)
+        return int(np.random.default_rng([self._config.seed, step // n]).permutation(n)[step % n])
+
+    def _make_strategy(self) -> DefaultStrategy | McmcStrategy | None:
+        if self._config.strategy == "default":
+            center = torch.tensor(self.center, dtype=torch.float32, device=self._config.device)
+            return DefaultStrategy(self._config, center, self.extent, len(self.splats))
+        return McmcStrategy(self._config) if self._config.strategy == "mcmc" else None
+
+    def _save(self) -> None:
+        strategy = {} if self._strategy is None else self._strategy.state()
+        state = self.splats.state()
+        self._checkpoint.save(
+            {
+                "step": self.step,
+                "splats": state,
+                "strategy": strategy,
+                "gains": self._views.gains,
+            }
+        )
+
+
+def extent_of_cameras(views: ReconstructionViews) -> tuple[np.ndarray, float]:
+    """Returns the mean position (3,) [m] of the cameras and 1.1 times the largest distance from it
+    [m], by which learning rates and sizes are scaled; 1 m if they all stand in one place."""
+    positions = views.positions
+    center = positions.mean(axis=0)
+    extent = 1.1 * float(np.linalg.norm(positions - center, axis=1).max())
+    return center, extent if extent > 1e-6 else 1.0
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """torch's own sums depend on its number of threads, and what little it does here gains nothing
+    by more; the renderer has its own."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

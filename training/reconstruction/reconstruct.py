@@ -1,0 +1,268 @@
+"""From a capture to a scene folder that can be flown in."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.reconstruction.checkpoint import Checkpoint
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.held_out import HeldOutFigures
+from splatpilot.training.reconstruction.initial_gaussians import gaussians_from_depth
+from splatpilot.training.reconstruction.initialization import detail_of, first_gaussians, resolved
+from splatpilot.training.reconstruction.lpips import Lpips
+from splatpilot.training.reconstruction.optimize import Optimization, one_torch_thread
+from splatpilot.training.reconstruction.overlap import View
+from splatpilot.training.reconstruction.photometry import Photometry, estimate_photometry
+from splatpilot.training.reconstruction.scene_distance_field import (
+    DepthSource,
+    FieldDifference,
+    compare_fields,
+    fuse,
+    rendered_depth,
+    unit_of,
+    with_sky,
+)
+from splatpilot.training.reconstruction.views import (
+    ReconstructionViews,
+    ShrunkFrames,
+    shrink_factor,
+)
+
+
+@dataclass(frozen=True)
+class ReconstructSummary:
+    """What was made."""
+
+    scene: Path
+    frames: int
+    gaussians: int
+    vignetting: float
+    gain_range: tuple[float, float]
+    lower_W: NDArray[np.float64]  # (3,) [m]
+    upper_W: NDArray[np.float64]  # (3,) [m]
+    observed_free_volume: float  # [m^3]
+    p_WS: NDArray[np.float64]  # (3,) [m]
+    p_WG: NDArray[np.float64]  # (3,) [m]
+    geodesic: float  # [m], length of the shortest path from start to goal
+    held_out: HeldOutFigures | None = None
+    field_difference: FieldDifference | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        def vector(p: NDArray) -> str:
+            return "(" + ", ".join(f"{x:.2f}" for x in p) + ")"
+
+        rows = {
+            "scene": self.scene,
+            "frames": self.frames,
+            "Gaussians": self.gaussians,
+            "bounds [m]": f"{vector(self.lower_W)} to {vector(self.upper_W)}",
+            "seen free [m^3]": f"{self.observed_free_volume:.1f}",
+            "image gains": f"{self.gain_range[0]:.3f} to {self.gain_range[1]:.3f}",
+            "corner brightness": f"{np.exp(self.vignetting):.3f}",
+            "default start [m]": vector(self.p_WS),
+            "default goal [m]": vector(self.p_WG),
+            "shortest path [m]": f"{self.geodesic:.1f}",
+        }
+        if self.held_out is not None:
+            rows["held-out frames"] = self.held_out
+        if self.field_difference is not None:
+            rows["rendered field"] = f"{self.field_difference} (against captured depth)"
+        lines = [f"{name:<18} {value}" for name, value in rows.items()]
+        return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
+
+
+def run(
+    *, capture: str | Path, out: str | Path, config: ReconstructConfig, restart: bool = False
+) -> ReconstructSummary:
+    """Turns the capture in a folder into the scene folder `out`, and prints a summary.
+
+    While it runs, checkpoints are kept in the folder `.NAME.partial` beside `out`; run again after
+    an interruption, it goes on from there and ends in the same scene, bit for bit. With `restart`
+    it begins anew.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: for a damaged capture, a config that makes no sense,
+            a checkpoint of another run, or a folder `out` that cannot be written or holds something
+            else. No scene is written then.
+    """
+    config.validate()
+    check_scene_target(out)
+    summary = reconstruct(
+        read_capture(capture, config.capture), Path(out), config, path=str(capture), restart=restart
+    )
+    print(summary)
+    return summary
+
+
+def reconstruct(
+    capture: Capture,
+    out: Path,
+    config: ReconstructConfig,
+    *,
+    path: str = "",
+    restart: bool = False,
+) -> ReconstructSummary:
+    """Writes the scene folder `out`; see `run`. `path` says where the capture lies."""
+    config.validate()
+    config = resolved(config, capture)
+    every = config.hold_out if config.iterations else 0
+    held_out = list(range(0, len(capture), every)) if every else []
+    fitted = [i for i in range(len(capture)) if i not in held_out]
+    factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
+    frames = ShrunkFrames(capture, fitted, factor)
+    photometry = estimate_photometry(
+        [View.of(frame) for frame in tqdm(frames, "comparing brightness", unit="frame")],
+        config.seed,
+    )
+    gains = np.ones(len(capture))
+    checkpoint = None
+    figures = None
+    if config.iterations == 0:
+        gains[fitted] = photometry.gains
+        gaussians, background = gaussians_from_depth(frames, photometry, detail_of(config))
+        how = "depth back-projected"
+    else:
+        views = ReconstructionViews(frames, photometry)
+        withheld = None
+        if held_out:
+            unknown = Photometry(np.ones(len(held_out)), photometry.vignetting)
+            withheld = ReconstructionViews(ShrunkFrames(capture, held_out, factor), unknown)
+        checkpoint = Checkpoint(out, config, views)
+        if restart:
+            checkpoint.remove()
+        background = mean_color(views)
+        optimization = Optimization(
+            config,
+            views,
+            withheld,
+            background,
+            lambda: first_gaussians(capture, frames, photometry, views, config),
+            checkpoint,
+            _perceptual(config),
+            fit_gains=not capture.has_depth,
+        )
+        optimization.run()
+        gains[fitted] = views.gains
+        gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
+        with one_torch_thread():
+            figures = optimization.measure()
+        if figures is not None:
+            gains[held_out] = figures.gains
+        how = f"{config.representation}, {config.iterations} steps"
+
+    field, difference = _distance_field(capture, frames, gaussians, factor, config)
+    p_WS, p_WG, geodesic, warnings = _start_and_goal(capture, field)
+    write_scene_folder(
+        out,
+        World(capture.name, gaussians, field, field, background, p_WS, p_WG),
+        provenance=f"{capture.source}, {len(capture)} frames, {how}",
+        gains=[float(gain) for gain in gains],
+        vignetting=photometry.vignetting,
+        metric=capture.metric,
+        representation=config.representation if config.iterations else "3dgs",
+        capture=path and str(Path(path).absolute()),
+        held_out=held_out,
+        image_width=capture.width // factor if factor > 1 else 0,
+    )
+    if checkpoint is not None:
+        checkpoint.remove()
+    return ReconstructSummary(
+        scene=out,
+        frames=len(capture),
+        gaussians=len(gaussians),
+        vignetting=photometry.vignetting,
+        gain_range=(float(gains[fitted].min()), float(gains[fitted].max())),
+        lower_W=field.lower_W,
+        upper_W=field.upper_W,
+        observed_free_volume=field.volume(FieldState.FREE),
+        p_WS=p_WS,
+        p_WG=p_WG,
+        geodesic=geodesic,
+        held_out=figures,
+        field_difference=difference,
+        warnings=(*capture.dropped, *warnings),
+    )
+
+
+def _start_and_goal(
+    capture: Capture, field: Esdf
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[str, ...]]:
+    """Returns p_WS, p_WG, the length of the shortest path [m] and warnings.
+
+    Where nothing can fly, the scene can still be looked at: the ends are those of the capture.
+    """
+    try:
+        if capture.metric:
+            return *choose_start_and_goal(field, VEHICLE_RADIUS), ()
+        reason = "its scale is unknown"
+    except ValueError as error:
+        reason = str(error)
+    p_WS, p_WG = (capture.X_WCs[i].translation() for i in (0, -1))
+    return p_WS, p_WG, float("nan"), (f"this scene cannot be flown in: {reason}",)
+
+
+def mean_color(views: ReconstructionViews) -> tuple[float, float, float]:
+    """Returns the mean colour of the images, freed of gains and vignetting, in 0 to 1."""
+    means = torch.stack([views.target(k).mean(dim=(0, 1)) for k in range(len(views))])
+    red, green, blue = means.mean(dim=0).clamp(0, 1).tolist()
+    return red, green, blue
+
+
+def _perceptual(config: ReconstructConfig) -> Callable[[Tensor, Tensor], Tensor] | None:
+    return Lpips() if config.lpips_weight > 0 else None
+
+
+def _distance_field(
+    capture: Capture,
+    frames: ShrunkFrames,
+    gaussians: GaussianScene,
+    factor: int,
+    config: ReconstructConfig,
+) -> tuple[Esdf, FieldDifference | None]:
+    """Fuses depth, rendered or captured; and, if the capture has depth and was optimised, compares
+    the former with that of all captured depth."""
+    every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
+    if config.iterations == 0:
+        return fuse(every, config.voxel_size, config.max_range), None
+    K = capture.K.copy()
+    K[:2] /= factor
+    rendered = rendered_depth(
+        gaussians,
+        config.representation,
+        K,
+        capture.width // factor,
+        capture.height // factor,
+        capture.X_WCs,
+        config.renderer_threads,
+    )
+    unit = unit_of(rendered, capture.metric)
+    voxel_size, max_range = config.voxel_size * unit, config.max_range * unit
+    if not capture.has_depth:
+        return fuse(rendered, voxel_size, max_range), None
+    truth = fuse(every, voxel_size, max_range)
+    field = fuse(with_sky(rendered, frames), voxel_size, max_range, (truth.lower_W, truth.upper_W))
+    difference = compare_fields(field, truth)
+    if config.distance_field == "rendered":
+        return field, difference
+    seen = DepthSource(
+        lambda k: capture.registered_depth(frames.numbers[k]),
+        capture.K,
+        [capture.X_WCs[i] for i in frames.numbers],
+    )
+    return fuse(seen, voxel_size, max_range), difference

@@ -1,0 +1,144 @@
+"""The distance field of a reconstruction: from depth rendered at the poses of the capture."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.reconstruction.splat_rendering import render
+from splatpilot.training.reconstruction.views import ShrunkFrames
+
+# Rendered depth counts where at least this much of the light is stopped.
+_SOLID = 0.5
+# Fields are compared where the true one is at most this far from a surface [m].
+_NEAR = 0.5
+# The median depth of a scene of unknown scale is taken to be this [m].
+_MEDIAN_DEPTH = 2.0
+
+
+@dataclass(frozen=True)
+class DepthSource:
+    """Depth images (H, W) [m] with their poses, loaded one by one and as often as wanted."""
+
+    load: Callable[[int], NDArray[np.float32]]
+    K: NDArray[np.float64]  # (3, 3) [px]
+    X_WCs: Sequence[RigidTransform]
+
+    def images(self) -> Iterator[NDArray[np.float32]]:
+        return (self.load(i) for i in range(len(self.X_WCs)))
+
+    def median(self) -> float:
+        """[m], over all images; 0 where there is none."""
+        depths = [image[::4, ::4] for image in self.images()]
+        depth = np.concatenate([d[(d > 0) & np.isfinite(d)] for d in depths])
+        return float(np.median(depth)) if len(depth) else 0.0
+
+
+def rendered_depth(
+    gaussians: GaussianScene,
+    representation: str,
+    K: NDArray[np.float64],
+    width: int,
+    height: int,
+    X_WCs: Sequence[RigidTransform],
+    threads: int,
+) -> DepthSource:
+    """Returns what cameras would measure in the scene: expected depth, 0 where less than half of
+    the light is stopped."""
+    tensors = tuple(
+        torch.from_numpy(getattr(gaussians, name))
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    )
+
+    def load(i: int) -> NDArray[np.float32]:
+        viewmat = torch.from_numpy(X_WCs[i].inverse().GetAsMatrix4()).float()[None]
+        with torch.no_grad():
+            rendering = render(
+                representation,
+                tensors,  # pyright: ignore[reportArgumentType]
+                viewmat,
+                torch.from_numpy(K).float()[None],
+                width,
+                height,
+                depth_mode="ED",
+                threads=threads,
+            )
+        return torch.where(rendering.alpha > _SOLID, rendering.depth, 0).numpy()
+
+    return DepthSource(load, K, X_WCs)
+
+
+def with_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
+    """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
+    number measured nothing within range: there the space before the sky was seen to be free."""
+    places = {number: k for k, number in enumerate(frames.numbers)}
+
+    def load(i: int) -> NDArray[np.float32]:
+        depth = rendered.load(i)
+        if i not in places:
+            return depth
+        return np.where((depth == 0) & np.isinf(frames[places[i]].depth), np.float32(np.inf), depth)
+
+    return DepthSource(load, rendered.K, rendered.X_WCs)
+
+
+def fuse(
+    source: DepthSource,
+    voxel_size: float,
+    max_range: float,
+    bounds: tuple[NDArray, NDArray] | None = None,
+) -> Esdf:
+    """Fuses depth images into a distance field; space that no image saw is marked unknown."""
+    lower_W, upper_W = bounds or bounds_of_depth_images(
+        source.images(), source.K, source.X_WCs, max_range
+    )
+    return esdf_from_depth_images(
+        source.images(), source.K, source.X_WCs, lower_W, upper_W, voxel_size, max_range
+    )
+
+
+def unit_of(source: DepthSource, metric: bool) -> float:
+    """Returns the length that counts as a metre: 1, unless the scale is unknown."""
+    return 1.0 if metric else max(source.median(), 1e-6) / _MEDIAN_DEPTH
+
+
+@dataclass(frozen=True)
+class FieldDifference:
+    """How a distance field differs from the true one, near surfaces and where both are known."""
+
+    mean: float  # [m], positive: surfaces seem farther than they are
+    median_absolute: float  # [m]
+    p95_absolute: float  # [m]
+    blocked: float  # fraction of space that is free by a voxel or more, but counts as occupied
+    opened: float  # fraction of space that is occupied, but counts as free by a voxel or more
+
+    def __str__(self) -> str:
+        return (
+            f"{self.mean:+.3f} m mean, {self.median_absolute:.3f} m median, "
+            f"{self.p95_absolute:.3f} m 95th percentile; free taken as occupied "
+            f"{100 * self.blocked:.2f} %, occupied as free {100 * self.opened:.2f} %"
+        )
+
+
+def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
+    """Compares two fields on the same grid."""
+    d, d_true = field.distances, truth.distances
+    known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
+    free = known & (d_true > truth.voxel_size)
+    occupied = known & (truth.states == FieldState.OCCUPIED)
+    near = known & (np.abs(d_true) < _NEAR)
+    error = (d - d_true)[near]
+    return FieldDifference(
+        mean=float(error.mean()),
+        median_absolute=float(np.median(np.abs(error))),
+        p95_absolute=float(np.percentile(np.abs(error), 95)),
+        blocked=float((field.states == FieldState.OCCUPIED)[free].mean()),
+        opened=float((d[occupied] > field.voxel_size).mean()),
+    )

@@ -1,0 +1,143 @@
+"""What is optimised: the parameters of Gaussians, and Adam's memory of each."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+
+# Opacities at the ends of [0, 1] have infinite logits, which no gradient moves.
+_OPACITIES = (1e-4, 1 - 1e-4)
+# Gaussians fainter than this add to no pixel.
+_INVISIBLE = 1 / 255
+# Standard deviation of a surfel across itself [m].
+_FLAT = 1e-6
+
+
+class SplatParameters:
+    """N Gaussians as unconstrained tensors, with an Adam of a learning rate for each kind.
+
+    `means` (N, 3) [m]; `quats` (N, 4) wxyz of any length; `log_scales` (N, 3); `logit_opacities`
+    (N,); `sh_0` (N, 1, 3) and, if the degree is not 0, `sh_rest` (N, K - 1, 3).
+    """
+
+    def __init__(
+        self,
+        tensors: Mapping[str, Tensor],
+        rates: Mapping[str, float],
+        state: Mapping[str, Mapping[str, Tensor]] | None = None,
+    ):
+        groups = [
+            {"params": [tensor.clone().requires_grad_()], "lr": rates[name], "name": name}
+            for name, tensor in tensors.items()
+        ]
+        # The epsilon of 3D Gaussian splatting: gradients of single Gaussians are tiny.
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self._groups = {group["name"]: group for group in self.optimizer.param_groups}
+        for name, parameter_state in (state or {}).items():
+            self.optimizer.state[self[name]] = {k: v.clone() for k, v in parameter_state.items()}
+
+    @classmethod
+    def of_scene(
+        cls, scene: GaussianScene, sh_degree: int, rates: Mapping[str, float], device: str
+    ) -> "SplatParameters":
+        """Starts from `scene`, its spherical harmonics cut or filled up to the degree."""
+        coefficients = (sh_degree + 1) ** 2
+        sh = np.zeros((len(scene), coefficients, 3), dtype=np.float32)
+        K = min(coefficients, scene.sh.shape[1])
+        sh[:, :K] = scene.sh[:, :K]
+        tensors = {
+            "means": torch.from_numpy(scene.means.copy()),
+            "quats": torch.from_numpy(scene.quats.copy()),
+            "log_scales": torch.from_numpy(np.log(scene.scales)),
+            "logit_opacities": torch.logit(torch.from_numpy(scene.opacities.clip(*_OPACITIES))),
+            "sh_0": torch.from_numpy(sh[:, :1].copy()),
+        }
+        if sh_degree:
+            tensors["sh_rest"] = torch.from_numpy(sh[:, 1:].copy())
+        return cls({name: tensor.to(device) for name, tensor in tensors.items()}, rates)
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._groups[name]["params"][0]
+
+    def __len__(self) -> int:
+        return len(self["means"])
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._groups)
+
+    @property
+    def sh(self) -> Tensor:
+        """(N, K, 3)."""
+        if "sh_rest" not in self._groups:
+            return self["sh_0"]
+        return torch.cat([self["sh_0"], self["sh_rest"]], dim=1)
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 3) [m]."""
+        return torch.exp(self["log_scales"])
+
+    @property
+    def opacities(self) -> Tensor:
+        """(N,) in (0, 1)."""
+        return torch.sigmoid(self["logit_opacities"])
+
+    def set_rate(self, name: str, rate: float) -> None:
+        self._groups[name]["lr"] = rate
+
+    def rate(self, name: str) -> float:
+        return self._groups[name]["lr"]
+
+    def step(self) -> None:
+        """Moves all parameters along their gradients, and forgets these."""
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    @torch.no_grad()
+    def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
+        """Keeps the Gaussians `rows` (indices), in that order, and appends those `added`, of which
+        Adam remembers nothing."""
+        for name in self.names:
+            old = self[name]
+            extra = old[:0] if added is None else added[name]
+            new = torch.cat([old[rows], extra]).requires_grad_()
+            memory = self.optimizer.state.pop(old, {})
+            for key, value in memory.items():
+                if value.shape == old.shape:
+                    memory[key] = torch.cat([value[rows], torch.zeros_like(extra)])
+            self._groups[name]["params"][0] = new
+            self.optimizer.state[new] = memory
+
+    @torch.no_grad()
+    def overwrite(self, name: str, values: Tensor, rows: Tensor | slice = slice(None)) -> None:
+        """Sets a parameter of the Gaussians `rows`, of which Adam then remembers nothing."""
+        self[name][rows] = values
+        for key, value in self.optimizer.state[self[name]].items():
+            if key != "step":
+                value[rows] = 0
+
+    def state(self) -> dict[str, dict]:
+        """Returns all that makes these parameters and their Adam again, see `__init__`."""
+        return {
+            "tensors": {name: self[name].detach().clone() for name in self.names},
+            "state": {
+                name: {k: v.clone() for k, v in self.optimizer.state[self[name]].items()}
+                for name in self.names
+            },
+        }
+
+    @torch.no_grad()
+    def scene(self, flat: bool) -> GaussianScene:
+        """Returns those Gaussians that can be seen, `flat` ones with a third scale of next to
+        nothing."""
+        opacities = self.opacities
+        visible = opacities >= _INVISIBLE
+        scales = self.scales.clone()
+        if flat:
+            scales[:, 2] = _FLAT
+        arrays = (self["means"], self["quats"], scales, opacities, self.sh)
+        return GaussianScene(*(a[visible].cpu().numpy() for a in arrays))

@@ -1,0 +1,74 @@
+"""Rendering of Gaussians or surfels for reconstruction: the two rasterisers behind one call."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from splatpilot.systems.splats.rasterization import rasterize
+from splatpilot.systems.splats.surfels import rasterize_surfels
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One camera's images."""
+
+    color: Tensor  # (H, W, 3)
+    depth: Tensor  # (H, W) [m], accumulated or expected
+    alpha: Tensor  # (H, W)
+    meta: dict[str, Any]  # of the rasteriser
+    normals: Tensor | None = None  # (H, W, 3) sum of weight and normal; surfels only
+    surface_normals: Tensor | None = None  # (H, W, 3) from depth; surfels only
+    distortion: Tensor | None = None  # (H, W) [m]; surfels only, if asked for
+
+
+def render(
+    representation: str,
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,
+    depth_mode: str = "D",
+    absgrad: bool = False,
+    distortion: bool = False,
+    threads: int = 1,
+) -> Rendering:
+    """Renders colour and depth.
+
+    Args:
+        representation: "3dgs" or "2dgs".
+        gaussians: means, quats, scales, opacities and spherical harmonics, as for `rasterize`.
+        viewmat: (1, 4, 4) world to camera.
+        K: (1, 3, 3) [px].
+        width, height: [px].
+        background: (1, 3), black if None.
+        depth_mode: "D", accumulated, or "ED", expected.
+        absgrad: see `rasterize`.
+        distortion: whether surfels render it.
+        threads: of the CPU.
+    """
+    scene = *gaussians, viewmat, K, width, height
+    options: dict[str, Any] = {
+        "sh_degree": {1: 0, 4: 1, 9: 2, 16: 3}[gaussians[4].shape[1]],
+        "backgrounds": background,
+        "render_mode": f"RGB+{depth_mode}",
+        "threads": threads,
+    }
+    if representation == "3dgs":
+        image, alpha, meta = rasterize(*scene, **options, absgrad=absgrad)
+        return Rendering(image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0], meta)
+    image, alpha, normals, surface_normals, distort, _, meta = rasterize_surfels(
+        *scene, **options, distloss=distortion
+    )
+    return Rendering(
+        image[0, ..., :3],
+        image[0, ..., 3],
+        alpha[0, ..., 0],
+        meta,
+        normals[0],
+        None if surface_normals is None else surface_normals[0],
+        distort[0, ..., 0],
+    )

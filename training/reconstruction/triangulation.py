@@ -1,0 +1,98 @@
+"""Points of a place from posed images alone: features matched and triangulated, no depth needed."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from tqdm import tqdm
+
+from splatpilot.training.captures.capture import Capture, SfmPoints
+
+_OVERLAP = 10  # images after each one that it is matched with
+_FEATURES = 2048  # at most, of an image
+
+
+def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
+    """Returns the points that pycolmap triangulates between some frames of a capture, whose poses
+    and intrinsics are taken as they are.
+
+    SIFT features of each frame are matched with those of the next ten in order.
+
+    Raises:
+        ValueError: if fewer than 100 points are found.
+        OSError: if the images cannot be read, or copied into the system's temporary folder.
+    """
+    # COLMAP logs every image on standard error.
+    pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)
+    pycolmap.set_random_seed(0)
+    with tempfile.TemporaryDirectory(prefix="splatpilot-") as folder:
+        database, images = Path(folder) / "database.db", Path(folder) / "images"
+        images.mkdir()
+        names = [f"{k:06d}.png" for k in range(len(numbers))]
+        for name, i in zip(tqdm(names, "copying", unit="frame"), numbers, strict=True):
+            image = capture.load_image(i)
+            if not cv2.imwrite(str(images / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
+                raise OSError(f"{images / name}: cannot be written; is the disk full?")
+        model = _posed(capture, numbers, database, images, names)
+        pairing = pycolmap.SequentialPairingOptions(overlap=_OVERLAP, quadratic_overlap=False)
+        # One thread each: others would make the order of images and matches, and with it the last
+        # digits of the points, a matter of chance.
+        matching = pycolmap.FeatureMatchingOptions(num_threads=1)
+        pycolmap.match_sequential(database, matching, pairing)
+        (Path(folder) / "model").mkdir()
+        options = pycolmap.IncrementalPipelineOptions(
+            extract_colors=True, num_threads=1, random_seed=0
+        )
+        model = pycolmap.triangulate_points(
+            model, database, images, Path(folder) / "model", options=options
+        )
+        points = list(model.points3D.values())
+    if len(points) < 100:
+        raise ValueError(
+            f"{capture.source}: only {len(points)} points can be triangulated between its images, "
+            "100 are needed; it has too little texture or its frames see too different things"
+        )
+    p_WQ = np.array([point.xyz for point in points])
+    colors = np.array([point.color for point in points]) / 255
+    # Threads hand images and matches over in any order, and points are numbered by it.
+    order = np.lexsort(p_WQ.T)
+    return SfmPoints(p_WQ[order], colors[order])
+
+
+def _posed(
+    capture: Capture, numbers: Sequence[int], database: Path, images: Path, names: Sequence[str]
+) -> pycolmap.Reconstruction:
+    """Extracts features into the database and returns a model of the cameras, without points."""
+    K = capture.K
+    parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = _FEATURES
+    extraction.num_threads = 1
+    pycolmap.extract_features(
+        database,
+        images,
+        names,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=pycolmap.ImageReaderOptions(
+            camera_model="PINHOLE", camera_params=",".join(f"{x:.17g}" for x in parameters)
+        ),
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as content:
+        (camera,) = content.read_all_cameras()
+        model.add_camera_with_trivial_rig(camera)
+        frames = dict(zip(names, numbers, strict=True))
+        for image in content.read_all_images():
+            X_CW = capture.X_WCs[frames[image.name]].inverse()
+            model.add_image_with_trivial_frame(
+                pycolmap.Image(
+                    name=image.name, camera_id=camera.camera_id, image_id=image.image_id
+                ),
+                pycolmap.Rigid3d(X_CW.GetAsMatrix34()),
+            )
+    return model

@@ -1,0 +1,126 @@
+"""The images that a reconstruction is compared with, shrunk and ready."""
+
+from collections.abc import Sequence
+from typing import overload
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.reconstruction.losses import depth_edge_weights
+from splatpilot.training.reconstruction.photometry import Photometry
+
+# Depths within a pixel that differ by more than this fraction belong to different surfaces.
+_ONE_SURFACE = 0.1
+
+
+def shrink_factor(width: int, wanted: int) -> int:
+    """Returns by which whole factor to shrink images of `width` [px] to about `wanted`, 0: 1."""
+    return max(1, round(width / wanted)) if wanted else 1
+
+
+def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
+    """Returns the frame with each factor x factor pixels made one; what remains at the right and at
+    the bottom is cut off.
+
+    Colours are averaged. Depth is averaged as its inverse, which is exact on planes, where it is of
+    one surface; at the edges of things it is the (lower) median, a depth that was seen. It is
+    unknown (0) where most of it is, and infinite where it is beyond range.
+    """
+    if factor == 1:
+        return frame
+    height, width = (n // factor for n in frame.depth.shape)
+    image = frame.image[: height * factor, : width * factor]
+    image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    blocks = frame.depth[: height * factor, : width * factor]
+    blocks = blocks.reshape(height, factor, width, factor).swapaxes(1, 2)
+    blocks = blocks.reshape(height, width, factor**2)
+    known = blocks > 0
+    count = known.sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(known, 1 / blocks, 0)
+        most = inverse.max(axis=-1)
+        spread = most - np.where(known, inverse, np.inf).min(axis=-1)
+        mean = count / inverse.sum(axis=-1)
+        # Sorted, the unknown ones come last.
+        ordered = np.sort(np.where(known, blocks, np.nan), axis=-1)
+        middle = np.maximum(count - 1, 0)[..., None] // 2
+        median = np.take_along_axis(ordered, middle, axis=-1)[..., 0]
+        depth = np.where(spread <= _ONE_SURFACE * most, mean, median)
+    depth = np.where(2 * count > factor**2, depth, 0).astype(np.float32)
+    K = frame.K.copy()
+    K[:2] /= factor
+    return CaptureFrame(np.asarray(image, dtype=np.uint8), depth, frame.X_WC, K)
+
+
+class ShrunkFrames(Sequence[CaptureFrame]):
+    """Some frames of a capture, shrunk by a whole factor, each loaded when asked for.
+
+    Args:
+        capture: what was seen.
+        numbers: the frames to take.
+        factor: see `shrink`.
+    """
+
+    def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
+        self._capture, self.numbers, self._factor = capture, list(numbers), factor
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @overload
+    def __getitem__(self, k: int) -> CaptureFrame: ...
+    @overload
+    def __getitem__(self, k: slice) -> "ShrunkFrames": ...
+    def __getitem__(self, k):
+        if isinstance(k, slice):
+            return ShrunkFrames(self._capture, self.numbers[k], self._factor)
+        return shrink(self._capture.frame(self.numbers[k]), self._factor)
+
+
+class ReconstructionViews:
+    """Frames as tensors on the CPU.
+
+    Args:
+        frames: all of one size and with one K.
+        photometry: their gains, in their order, and their vignetting.
+    """
+
+    def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
+        images, depths, edges, viewmats = [], [], [], []
+        for frame in tqdm(frames, "loading", len(frames), unit="frame"):
+            images.append(torch.from_numpy(frame.image))
+            depths.append(torch.from_numpy(frame.depth))
+            edges.append(depth_edge_weights(depths[-1]).half())
+            viewmats.append(torch.from_numpy(frame.X_WC.inverse().GetAsMatrix4()).float())
+        self.images = torch.stack(images)  # (n, H, W, 3) uint8
+        self.depths = torch.stack(depths)  # (n, H, W) [m]
+        self.edges = torch.stack(edges)  # (n, H, W) weights of the depth term
+        self.viewmats = torch.stack(viewmats)  # (n, 4, 4) X_CW
+        self.K = torch.from_numpy(frames[0].K).float()[None]  # (1, 3, 3) [px]
+        self.height, self.width = self.depths.shape[1:]
+        self.gains = torch.from_numpy(photometry.gains).float()  # (n,)
+        vignette = photometry.factor(0, self.height, self.width) / photometry.gains[0]
+        self.vignette = torch.from_numpy(vignette).float()  # (H, W)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(n, 3) [m], p_WC."""
+        X_CWs = self.viewmats.double().numpy()
+        return -np.einsum("nji,nj->ni", X_CWs[:, :3, :3], X_CWs[:, :3, 3])
+
+    def image(self, k: int) -> Tensor:
+        """(H, W, 3) in 0 to 1, as it was taken."""
+        return self.images[k] / 255
+
+    def target(self, k: int) -> Tensor:
+        """(H, W, 3), the image freed of its gain and vignetting: what the scene should look like,
+        about 0 to 1."""
+        return self.images[k] * (1 / (255 * self.gains[k] * self.vignette))[..., None]

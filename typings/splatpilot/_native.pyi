@@ -1,0 +1,1 @@
+../../splatpilot/_native.pyi
