@@ -14,9 +14,9 @@ import time
 
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.workers import fly_all
-from splatpilot.diagrams.add_policy import policy_named
 from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.configuration import dump_config

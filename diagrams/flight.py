@@ -158,7 +158,10 @@ def decision_times(
         for name in images:
             policy.GetInputPort(name).Eval(context)
         rendered = time.perf_counter()
-        policy.EvalUniquePeriodicDiscreteUpdate(context)
+        if policy.GetUniquePeriodicDiscreteUpdateAttribute() is not None:
+            policy.EvalUniquePeriodicDiscreteUpdate(context)
+        for index in range(policy.num_output_ports()):
+            policy.get_output_port(index).Eval(context)
         spent[k] = rendered - started, time.perf_counter() - rendered
     render, decide = spent[1:].mean(axis=0)
     return float(render), float(decide)

@@ -1,66 +1,102 @@
-"""What a policy sees: its camera, and what is between the camera and the policy."""
+"""What a policy observes: its camera, what is between the camera and the policy, and sensors."""
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.sensors import SENSORS, SensorConfig, make_camera
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.sensing.color_noise import ColorNoise
 from splatpilot.systems.sensing.delayed_pose import DelayedPose
 from splatpilot.systems.sensing.depth_noise import DepthNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.splat_camera import SplatCamera
+
+_TAKEN = {
+    *("plant", "pose", "collision", "goal", "policy", "controller", "selector", "camera", "video"),
+    *("policy_camera", "delayed_pose", "depth_noise", "color_noise"),
+    *("flight_visualizer", "camera_visualizer", "state_log", "command_log", "hypotheses_log"),
+}
+"""Names of the other systems of a flight."""
 
 
-def camera_of(scenario: Scenario) -> OnboardCamera | None:
-    """The camera of the scenario's policy; None of a policy that does not see."""
-    return getattr(scenario.policy, "camera", None)
+def decision_period(scenario: Scenario, policy: System) -> float:
+    """[s] between decisions of a policy: that of its periodic update, or of the scenario's policy
+    where it has none."""
+    update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
+    return update.period_sec() if update is not None else 1 / scenario.policy.rate
+
+
+def sensors_of(scenario: Scenario, policy: System | None = None) -> dict[str, SensorConfig]:
+    """What is on board by name: what the policy (the scenario's if None) brings in its `sensors`,
+    and the scenario's."""
+    return getattr(policy or scenario.policy, "sensors", {}) | scenario.sensors
 
 
 def AddObservation(
     builder: DiagramBuilder,
     scenario: Scenario,
     world: World,
-    gaussians: BakedScene,
     state: OutputPort,
     pose: OutputPort,
     policy: System,
-) -> None:
+) -> dict[str, OutputPort]:
     """
-    Adds the camera of a policy that sees, as `policy_camera`, and connects the policy to it.
+    Adds the camera of a policy that sees, as `policy_camera`.
 
     It renders when the policy looks. Where the scenario asks for them, `delayed_pose` makes its
     images late, and `depth_noise` or `color_noise` noisy.
+
+    Returns:
+        The images that the policy has inputs for, by their names.
     """
-    config, noise = camera_of(scenario), scenario.observation
-    if config is None:
-        return
-    camera = builder.AddNamedSystem(
-        "policy_camera",
-        SplatCamera(
-            gaussians,
-            config.camera_info(),
-            config.X_BC(),
-            min_depth=config.min_depth,
-            max_depth=config.max_depth,
-            background=world.background,
-        ),
-    )
+    names = [n for n in ("depth_image_32f", "color_image") if policy.HasInputPort(n)]
+    if not names:
+        return {}
+    config = getattr(policy, "camera", None) or getattr(scenario.policy, "camera", None)
+    config, noise = config or OnboardCamera(), scenario.observation
+    camera = builder.AddNamedSystem("policy_camera", make_camera(config, world))
     if noise.latency > 0.0:
         delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(noise.latency))
         builder.Connect(state, delayed.GetInputPort("state"))
         pose = delayed.GetOutputPort("pose")
     builder.Connect(pose, camera.GetInputPort("body_pose"))
+    images = {name: camera.GetOutputPort(name) for name in names}
     for port, name, kind, active in (
         ("depth_image_32f", "depth_noise", DepthNoise, noise.changes_depth),
         ("color_image", "color_noise", ColorNoise, noise.changes_color),
     ):
-        if not policy.HasInputPort(port):
-            continue
-        image = camera.GetOutputPort(port)
-        if active:
-            system = kind(noise, config, scenario.policy.rate, scenario.seed)
+        if port in images and active:
+            system = kind(noise, config, 1 / decision_period(scenario, policy), scenario.seed)
             builder.AddNamedSystem(name, system)
-            builder.Connect(image, system.get_input_port())
-            image = system.get_output_port()
-        builder.Connect(image, policy.GetInputPort(port))
+            builder.Connect(images[port], system.get_input_port())
+            images[port] = system.get_output_port()
+    return images
+
+
+def AddSensors(
+    builder: DiagramBuilder,
+    sensors: dict[str, SensorConfig],
+    world: World,
+    state: OutputPort,
+    pose: OutputPort,
+) -> dict[str, OutputPort]:
+    """
+    Adds sensors under their names.
+
+    Returns:
+        Their outputs: `p` of the sensor `s` as `s_p`.
+
+    Raises:
+        ValueError: for a configuration that no sensor has, and a name that is taken.
+    """
+    measured = {}
+    for name, config in sensors.items():
+        if name in _TAKEN:
+            raise ValueError(f"a sensor is named {name!r}, as a part of the flight; rename it")
+        sensor = builder.AddNamedSystem(name, SENSORS.kind_of(config).build(config, world))
+        for port, source in (("state", state), ("body_pose", pose)):
+            if sensor.HasInputPort(port):
+                builder.Connect(source, sensor.GetInputPort(port))
+        for index in range(sensor.num_output_ports()):
+            port = sensor.get_output_port(index)
+            measured[f"{name}_{port.get_name()}"] = port
+    return measured

@@ -8,9 +8,11 @@ from pydrake.common.schema import Rotation, Transform
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.diagrams.add_policy import PolicyConfig
+from splatpilot.diagrams.policies import POLICIES, PolicyConfig
+from splatpilot.diagrams.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import WorldConfig
+from splatpilot.diagrams.worlds.make_world import WORLDS, WorldConfig
+from splatpilot.systems.configuration import open_field
 from splatpilot.systems.policies.privileged_planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
@@ -58,8 +60,9 @@ class Scenario:
 
     # Seed of everything random: the world where it is generated, and the start's offset.
     seed: int = 0
-    # What is flown in: a generated world, or (!SceneConfig) a reconstructed scene.
-    world: WorldConfig = field(default_factory=ForestConfig)
+    # What is flown in: a generated world, or (!SceneConfig) a reconstructed scene, or another of
+    # `make_world.py` and of other packages.
+    world: WorldConfig = open_field(WORLDS, ForestConfig)
     # [m] Start p_WS and goal p_WG in the world frame; the world's own where left out.
     start: list[float] | None = None
     goal: list[float] | None = None
@@ -72,8 +75,11 @@ class Scenario:
     vehicle: QuadrotorParams = field(default_factory=QuadrotorParams)
     # What onlookers see from the vehicle; a policy that sees has a camera of its own.
     camera: CameraConfig = field(default_factory=_default_camera)
-    # Who flies: the privileged planner, or (!ReactiveConfig, ...) another of `add_policy.py`.
-    policy: PolicyConfig = field(default_factory=PrivilegedPlannerConfig)
+    # Who flies: the privileged planner, or (!ReactiveConfig, ...) another of `policies.py` and of
+    # other packages.
+    policy: PolicyConfig = open_field(POLICIES, PrivilegedPlannerConfig)
+    # What is on board beside the cameras of onlookers and policy, by name; see `sensors.py`.
+    sensors: dict[str, SensorConfig] = open_field(SENSORS, dict)
     # What lies between the policy's camera and the policy; nothing by default.
     observation: ObservationNoise = field(default_factory=ObservationNoise)
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
@@ -96,6 +102,8 @@ class Scenario:
             _check(name, point, valid, "three finite numbers x, y, z in metres")
         self.world.validate()
         self.policy.validate()
+        for sensor in self.sensors.values():
+            sensor.validate()
         self.observation.validate()
         _check_camera(self.camera)
         _check_simulator(self.simulator)

@@ -1,1 +1,25 @@
-"""Learned drone flight inside Gaussian-splat reconstructions of real places, as Drake systems."""
+"""Learned drone flight inside Gaussian-splat reconstructions of real places, as Drake systems.
+
+    import splatpilot as sp
+
+    scenario = sp.Scenario(seed=5)
+    world = sp.make_world(scenario.world, scenario.seed)
+    flight = sp.fly(sp.BuildFlightDiagram(scenario, world), scenario, world)
+
+The public names are those of `__init__.pyi`, each loaded when it is first used: flying imports
+neither torch nor what reads captures.
+"""
+
+from typing import Any
+
+import lazy_loader
+
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("splatpilot")
+    return _load(name)

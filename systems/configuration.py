@@ -2,13 +2,31 @@
 
 import dataclasses
 import difflib
+import functools
+import operator
+import re
+from collections.abc import Callable
 from pathlib import Path
 from textwrap import indent
 from types import UnionType
-from typing import Any, cast, get_type_hints
+from typing import Any, cast
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+
+from splatpilot.systems.registry import Registry
+
+_REGISTRY = "registry"
+"""Key of an open field's registry in its metadata."""
+
+
+def open_field(registry: Registry, default: Callable[[], Any]) -> Any:
+    """
+    A field of a dataclass that holds a configuration of any kind that the registry has or will
+    have, or a dictionary of such. In YAML its tag names the type; one without a tag is of the type
+    that `default` makes.
+    """
+    return dataclasses.field(default_factory=default, metadata={_REGISTRY: registry})
 
 
 def load_config[Config](
@@ -61,20 +79,52 @@ def parse_config[Config](defaults: Config, text: str, source: str) -> Config:
 
 def dump_config(config: Any) -> str:
     """The configuration as YAML, every field written out."""
+    _resolve_open_fields(config, set())
     return cast(str, yaml_dump_typed(config))
+
+
+def _resolve_open_fields(config: Any, tags: set[str]) -> None:
+    """
+    Gives Drake's reader and writer, which go by the types of fields, the types that the open fields
+    of a configuration and of those in it may have now; `tags` are those that a text names.
+
+    They read what has no tag as the first type, and write a value as the first type that it is an
+    instance of, without a tag where that is the very first.
+    """
+    if not dataclasses.is_dataclass(config):
+        return
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        registry: Registry | None = field.metadata.get(_REGISTRY)
+        if registry is None:
+            _resolve_open_fields(value, tags)
+            continue
+        held = list(value.values()) if isinstance(value, dict) else [value]
+        for one in held:
+            _resolve_open_fields(one, tags)
+        known = registry.configs(tags | {type(one).__name__ for one in held})
+        first = known[0] if isinstance(value, dict) else type(field.default_factory())  # type: ignore
+        # Of types that derive from each other the derived ones come first. A value that derives
+        # from the untagged type must not pass for it: then a type that fits none goes before all.
+        derived = sorted({*known, *map(type, held)} - {first}, key=lambda t: -len(t.__mro__))
+        passes = any(isinstance(one, first) and type(one) is not first for one in held)
+        types = [str, *derived, first] if passes else [first, *derived]
+        union = functools.reduce(operator.or_, types)
+        field.type = dict[str, union] if isinstance(value, dict) else union
 
 
 def _tag_of(config: Any, path: list[str]) -> str:
     """The YAML tag that keeps the type which a field has now, where it may have several."""
     owner = config
     for name in path[:-1]:
-        owner = getattr(owner, name, None)
-    if not dataclasses.is_dataclass(owner):
-        return ""
-    schema = get_type_hints(type(owner)).get(path[-1])
-    value = getattr(owner, path[-1], None)
-    several = isinstance(schema, UnionType) and dataclasses.is_dataclass(value)
-    return f"!{type(value).__name__}" if several else ""
+        owner = owner.get(name) if isinstance(owner, dict) else getattr(owner, name, None)
+    if isinstance(owner, dict):
+        value, several = owner.get(path[-1]), True
+    else:
+        fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
+        schema = next((field.type for field in fields if field.name == path[-1]), None)
+        value, several = getattr(owner, path[-1], None), isinstance(schema, UnionType)
+    return f"!{type(value).__name__}" if several and dataclasses.is_dataclass(value) else ""
 
 
 def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -> Config:
@@ -83,6 +133,8 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
     `tagged` is the same text with the types of fields that may have several.
     """
     try:
+        tokens = [token for token in yaml.scan(text) if isinstance(token, yaml.TagToken)]
+        _resolve_open_fields(config, {token.value[1] for token in tokens})
         _check_names(config, yaml.load(text, _NamesLoader), "")
         return yaml_load_typed(schema=type(config), data=tagged or text, defaults=config)
     except yaml.YAMLError as error:
@@ -91,7 +143,20 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
         raise ValueError(f"{source}: null stands where fields belong") from None
     except (RuntimeError, ValueError, TypeError, AttributeError) as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"{source}: {reason}") from None
+        raise ValueError(f"{source}: {_UNKNOWN_TAG.sub(_known_tags, reason)}") from None
+
+
+_UNKNOWN_TAG = re.compile(r"The yaml type tag value '(.*)' did not match .* for '(.*)' \((.*)\)$")
+
+
+def _known_tags(refusal: re.Match[str]) -> str:
+    """What Drake's reader says of an unknown tag, with the tags that there are and the remedy."""
+    tag, field, types = refusal.groups()
+    known = ", ".join(f"!{name}" for name in re.findall(r"(\w+)'>", types))
+    return (
+        f"{field} is !{tag}, which nobody knows; known are {known}, and those of other packages "
+        "once they are installed or their modules imported (--import)"
+    )
 
 
 class _NamesLoader(yaml.SafeLoader):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from splatpilot.diagrams.add_policy import POLICIES, policy_named
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES, policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
@@ -35,7 +35,7 @@ class StudyConfig:
     # Names of the benchmark's scenarios, or YAML files of others.
     scenarios: list[str] = field(default_factory=lambda: list(benchmark_scenarios()))
     # Names of policies, or files of weights (.npz), whose policies are named after the file.
-    policies: list[str] = field(default_factory=lambda: list(POLICIES))
+    policies: list[str] = field(default_factory=lambda: list(BENCHMARK_POLICIES))
     # [m/s] Nominal speeds.
     speeds: list[float] = field(default_factory=lambda: [2.0])
     # Flights of each, with the seeds from 0 on.

@@ -37,7 +37,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _fly(options: argparse.Namespace) -> None:
     from splatpilot.diagrams import fly
-    from splatpilot.diagrams.add_policy import policy_named
+    from splatpilot.diagrams.policies import policy_named
     from splatpilot.diagrams.scenario import Scenario
     from splatpilot.diagrams.scenario_files import scenario_file
     from splatpilot.diagrams.worlds.make_world import SceneConfig

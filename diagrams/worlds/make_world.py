@@ -1,4 +1,8 @@
-"""From a scenario's `world` field to the world."""
+"""All worlds: their configurations, and how each becomes a world."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 from splatpilot.diagrams.worlds.branches import Branches, BranchesConfig
 from splatpilot.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
@@ -14,21 +18,55 @@ from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.walls import WallsConfig, walls_blueprint
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.registry import Registry
 
-ProceduralConfig = (
-    ForestConfig | BranchesConfig | ClutterConfig | WallsConfig | RoomConfig | OverUnderConfig
-)
-WorldConfig = (
-    ForestConfig
-    | BranchesConfig
-    | ClutterConfig
-    | WallsConfig
-    | RoomConfig
-    | OverUnderConfig
-    | SceneConfig
-    | InsertedConfig
-    | OctomapConfig
-)
+
+class WorldConfig(Protocol):
+    """The configuration of a world: a dataclass."""
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        ...
+
+
+@dataclass(frozen=True)
+class WorldKind:
+    """How a world is configured and made."""
+
+    config: type
+    """The type of its configurations."""
+    make: Callable[[Any, int], World]
+    """From a configuration and a seed to a world: the same arguments, the same bits."""
+    make_blueprint: Callable[[Any, int], Blueprint] | None = None
+    """The same place as solids, start and goal, of worlds that are generated: cheap."""
+
+
+WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
+"""All worlds, by the names of their configurations' types."""
+
+
+def register_world(
+    config: type,
+    make: Callable[[Any, int], World] | None = None,
+    make_blueprint: Callable[[Any, int], Blueprint] | None = None,
+) -> None:
+    """
+    Makes a kind of world known, so that scenarios can name it by its configuration's type.
+
+    Args:
+        config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
+        make: see `WorldKind.make`; draws and samples the blueprint if None.
+        make_blueprint: see `WorldKind.make_blueprint`; needed to train and render captures in it.
+
+    Raises:
+        ValueError: if another world has the name, or neither function is given.
+    """
+    if make is None:
+        if make_blueprint is None:
+            raise ValueError(f"{config.__name__}: give make or make_blueprint")
+        plan = make_blueprint
+        make = lambda config, seed: build(plan(config, seed))  # noqa: E731
+    WORLDS.add(config.__name__, WorldKind(config, make, make_blueprint))
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
@@ -41,45 +79,30 @@ def make_world(config: WorldConfig, seed: int) -> World:
             they are drawn.
 
     Raises:
-        ValueError: for parameters no world can be made of, and for damaged scenes.
+        ValueError: for a configuration that no kind of world has, parameters no world can be made
+            of, and damaged scenes.
         FileNotFoundError: for a scene that is not there.
     """
-    match config:
-        case InsertedConfig():
-            return inserted_world(config, seed)
-        case OctomapConfig():
-            return octomap_world(config, seed)
-        case SceneConfig():
-            return read_scene_world(config, seed)
-        case BranchesConfig():
-            return Branches(config, seed).world()
-        case ForestConfig():
-            return Forest(config, seed).world()
-        case _:
-            return build(make_blueprint(config, seed))
+    return WORLDS.kind_of(config).make(config, seed)
 
 
-def make_blueprint(config: ProceduralConfig, seed: int) -> Blueprint:
+def is_procedural(config: WorldConfig) -> bool:
+    """Whether the world is generated, so that `make_blueprint` makes it too."""
+    return WORLDS.kind_of(config).make_blueprint is not None
+
+
+def make_blueprint(config: WorldConfig, seed: int) -> Blueprint:
     """
     Generates a procedural world as solids, start and goal, without Gaussians and grids: cheap.
     `write_gltf` exports it as a mesh, `make_world` of the same arguments gives the same place.
 
     Raises:
-        ValueError: for parameters no world can be made of.
+        ValueError: for a world that is not generated, and parameters no world can be made of.
     """
-    match config:
-        case BranchesConfig():
-            return Branches(config, seed).blueprint()
-        case ForestConfig():
-            return Forest(config, seed).blueprint()
-        case ClutterConfig():
-            return clutter_blueprint(config, seed)
-        case WallsConfig():
-            return walls_blueprint(config, seed)
-        case RoomConfig():
-            return room_blueprint(config, seed)
-        case OverUnderConfig():
-            return over_under_blueprint(config, seed)
+    plan = WORLDS.kind_of(config).make_blueprint
+    if plan is None:
+        raise ValueError(f"{type(config).__name__} is no generated world: it has no blueprint")
+    return plan(config, seed)
 
 
 def build(blueprint: Blueprint) -> World:
@@ -97,3 +120,22 @@ def build(blueprint: Blueprint) -> World:
         p_WS=blueprint.p_WS,
         p_WG=blueprint.p_WG,
     )
+
+
+register_world(
+    ForestConfig,
+    lambda config, seed: Forest(config, seed).world(),
+    lambda config, seed: Forest(config, seed).blueprint(),
+)
+register_world(
+    BranchesConfig,
+    lambda config, seed: Branches(config, seed).world(),
+    lambda config, seed: Branches(config, seed).blueprint(),
+)
+register_world(ClutterConfig, make_blueprint=clutter_blueprint)
+register_world(WallsConfig, make_blueprint=walls_blueprint)
+register_world(RoomConfig, make_blueprint=room_blueprint)
+register_world(OverUnderConfig, make_blueprint=over_under_blueprint)
+register_world(SceneConfig, read_scene_world)
+register_world(InsertedConfig, inserted_world)
+register_world(OctomapConfig, octomap_world)

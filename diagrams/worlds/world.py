@@ -1,12 +1,14 @@
 """What is flown in: a place to look at, the truth about its surfaces, and where to fly."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
@@ -27,3 +29,8 @@ class World:
     """(3,) [m] default start."""
     p_WG: NDArray[np.float64]
     """(3,) [m] default goal."""
+
+    @cached_property
+    def baked(self) -> BakedScene:
+        """The Gaussians as cameras render them; made when first asked for, and shared by all."""
+        return BakedScene(self.gaussians)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from splatpilot.diagrams.add_policy import policy_named
 from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 

@@ -1,14 +1,9 @@
 """Finding scenarios by name or path, and writing them."""
 
-from itertools import permutations
-from typing import get_args
-
 import pytest
 
-from splatpilot.diagrams.add_policy import PolicyConfig
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from splatpilot.diagrams.worlds.make_world import WorldConfig
 from splatpilot.systems.configuration import dump_config, load_config, parse_config
 
 
@@ -35,11 +30,3 @@ def test_scenario_that_was_written_is_the_same(name):
     again = parse_config(Scenario(), dump_config(scenario), name)
     assert type(again.world) is type(scenario.world)
     assert again.world == scenario.world
-
-
-@pytest.mark.parametrize("union", [WorldConfig, PolicyConfig])
-def test_no_configuration_is_another_ones_base(union):
-    """Drake writes a value as the first type of a union that it is an instance of: types in one
-    union may not be derived from each other."""
-    for first, second in permutations(get_args(union), 2):
-        assert not issubclass(first, second), f"{first.__name__} would be a {second.__name__}"

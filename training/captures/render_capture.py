@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.gltf import write_gltf
-from splatpilot.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
+from splatpilot.diagrams.worlds.make_world import is_procedural, make_blueprint
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.configuration import dump_config, load_config
@@ -108,7 +108,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     blueprint = None
     if world.suffix in (".yaml", ".yml"):
         scenario = load_config(Scenario(), world)
-        if not isinstance(scenario.world, ProceduralConfig):
+        if not is_procedural(scenario.world):
             raise ValueError(
                 f"{world}: its world is a {type(scenario.world).__name__}; a generated one is "
                 "needed"

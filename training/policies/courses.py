@@ -1,14 +1,13 @@
 """The courses that policies train in: of the benchmark's kinds, of seeds that it never uses."""
 
 from dataclasses import dataclass, field
-from typing import cast
 
 import torch
 
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
-from splatpilot.diagrams.worlds.make_world import ProceduralConfig, make_blueprint
+from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.systems.configuration import load_config
 from splatpilot.training.policies.fields import Course, Fields
 
@@ -53,7 +52,7 @@ class CourseSelection:
 def make_course(kind: str, seed: int) -> Course:
     """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
     world = load_config(Scenario(), scenario_file(kind)).world
-    plan = make_blueprint(cast(ProceduralConfig, world), seed)
+    plan = make_blueprint(world, seed)
     shapes = [solid.shape for solid in plan.solids]
     return Course(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
 

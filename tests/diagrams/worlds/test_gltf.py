@@ -27,7 +27,6 @@ from splatpilot.diagrams.worlds.solids.illumination import Sunlight
 from splatpilot.diagrams.worlds.solids.light import Daylight
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
-from splatpilot.systems.splats.baked_scene import BakedScene
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 80.0
 
@@ -95,7 +94,7 @@ def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, blueprin
 
     world = build(blueprint)
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    view = BakedScene(world.gaussians).render(K, WIDTH, HEIGHT, X_WC, background=world.background)
+    view = world.baked.render(K, WIDTH, HEIGHT, X_WC, background=world.background)
     solid = seen & (view.alpha > 0.99)
     assert solid.sum() > 0.4 * depth.size
     assert np.abs(view.color - color)[solid].mean() < 0.06

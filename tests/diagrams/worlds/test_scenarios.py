@@ -25,7 +25,6 @@ from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanc
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import Box, Capsule, HalfSpace
 from splatpilot.systems.configuration import load_config
-from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -127,7 +126,7 @@ def test_what_is_drawn_is_where_it_is_hit():
     axes = np.column_stack([right, np.cross(forward, right), forward])
     X_WC = RigidTransform(RotationMatrix(axes), world.p_WS)
     K = np.array([[60.0, 0, 60], [0, 60, 45], [0, 0, 1]])
-    view = BakedScene(world.gaussians).render(K, 120, 90, X_WC, near=0.05)
+    view = world.baked.render(K, 120, 90, X_WC, near=0.05)
     v, u = np.mgrid[:90, :120] + 0.5
     rays = np.stack([(u - 60) / 60, (v - 45) / 60, np.ones_like(u)], axis=-1)
     q = X_WC.multiply((rays * view.depth[..., None]).reshape(-1, 3).T).T

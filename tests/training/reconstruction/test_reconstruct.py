@@ -7,7 +7,6 @@ import pytest
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -47,7 +46,7 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W, capsys):
 
     # It looks like the room.
     capture = read_tartanair_v1(room)
-    baked = BakedScene(world.gaussians)
+    baked = world.baked
     photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
     for i in range(len(capture)):
         frame = capture.frame(i)
@@ -144,7 +143,7 @@ def test_hospital(tmp_path):
     assert summary.geodesic > 6
     assert -0.4 < summary.vignetting < -0.2
     world, sequence = read_scene(tmp_path / "scene"), read_tartanair_v1(part)
-    baked = BakedScene(world.gaussians)
+    baked = world.baked
     photometry = Photometry(
         np.array(read_scene_metadata(tmp_path / "scene").gains), summary.vignetting
     )

@@ -195,7 +195,7 @@ VIEWS = [  # p_WC [m], yaw and pitch [rad]
 
 @pytest.fixture(scope="module")
 def baked(world) -> BakedScene:
-    return BakedScene(world.gaussians)
+    return world.baked
 
 
 @pytest.mark.parametrize("p_WC, yaw, pitch", VIEWS)

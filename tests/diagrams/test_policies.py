@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
-from splatpilot.diagrams.add_policy import POLICIES, policy_named
 from splatpilot.diagrams.flight import Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES, policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.policies.depthnav import DepthNavConfig
 from splatpilot.systems.policies.depthnav_inference import DEPTHNAV_NETWORK
@@ -37,7 +37,7 @@ def test_onlooking_camera_changes_no_flight(post_world):
     np.testing.assert_array_equal(bare.states, watched.states)
 
 
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("name", BENCHMARK_POLICIES)
 def test_name_gives_a_policy_of_that_speed(name):
     """Each name gives a valid configuration, which the speed changes."""
     assert policy_named(name, 1.5) != policy_named(name, 2.5)

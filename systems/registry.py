@@ -1,0 +1,165 @@
+"""Kinds of one thing, ours and those of other packages, by name."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+_OURS = "splatpilot."
+
+
+class Registry[Kind]:
+    """
+    What there is of one thing: policies, worlds, sensors and so on.
+
+    A kind is there under a name that our own code or a caller has given it, under the name of an
+    entry point of `group`, which an installed package announces in its pyproject.toml,
+
+        [project.entry-points."splatpilot.policies"]
+        hover = "my_package.hover:HoverConfig"
+
+    and, where nothing is installed, as `my_package.hover:HoverConfig`. What is behind the colon is
+    the kind, or the type of its configuration, for which the module registers a kind when imported.
+
+    Kinds with an attribute `config`, the type of their configurations, are found by these too.
+    """
+
+    def __init__(self, what: str, group: str, kind: type[Kind]):
+        """
+        Args:
+            what: the thing, for messages.
+            group: of the entry points.
+            kind: the type of the kinds.
+        """
+        self.what, self.group = what, group
+        self._kind = kind
+        self._kinds: dict[str, Kind] = {}
+
+    def add(self, name: str, kind: Kind) -> None:
+        """
+        Registers a kind; the same one again changes nothing.
+
+        Raises:
+            ValueError: if the name, or that of the type of its configurations, is another kind's.
+        """
+        if name in self._kinds and self._kinds[name] != kind:
+            raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
+        config = getattr(kind, "config", None)
+        for other in self._configs():
+            if config is not None and config.__name__ == other.__name__ and config is not other:
+                raise ValueError(
+                    f"{config.__module__}.{config.__name__} has the name of {other.__module__}."
+                    f"{other.__name__}, and files could not tell them apart; rename it"
+                )
+        self._kinds[name] = kind
+
+    def registered(self) -> list[str]:
+        """The names of the kinds that are registered by now."""
+        return list(self._kinds)
+
+    def names(self) -> list[str]:
+        """The names of all kinds: those registered, then those that installed packages announce."""
+        return list(dict.fromkeys([*self._kinds, *(point.name for point in self._announced())]))
+
+    def find(self, name: str) -> Kind:
+        """
+        The kind of a name, or of `module:attribute`, whose module is imported.
+
+        Raises:
+            ValueError: if there is none; the message lists what there is.
+        """
+        if name in self._kinds:
+            return self._kinds[name]
+        for point in self._announced():
+            if point.name == name:
+                return self._load(point)
+        if ":" in name:
+            return self._load(EntryPoint(name=name, value=name, group=self.group))
+        raise ValueError(
+            f"there is no {self.what} {name!r}; there are {', '.join(self.names())}, and "
+            "module:attribute of your own"
+        )
+
+    def kind_of(self, config: Any) -> Kind:
+        """
+        The kind whose configuration this is, or the nearest of its base classes.
+
+        Raises:
+            ValueError: if there is none; the message lists what there is.
+        """
+        for type_ in type(config).__mro__:
+            for kind in self._kinds.values():
+                if getattr(kind, "config", None) is type_:
+                    return kind
+        known = ", ".join(config.__name__ for config in self._configs())
+        raise ValueError(
+            f"no {self.what} has the configuration {type(config).__name__}; known are {known}, and "
+            f"what register_{self.what} is told"
+        )
+
+    def configs(self, tags: set[str]) -> list[type]:
+        """
+        The types of configurations, in the order of their registration.
+
+        Args:
+            tags: names of types that are looked for: if one is unknown, the packages that announce
+                kinds are imported.
+        """
+        if tags - {config.__name__ for config in self._configs()}:
+            for point in self._announced():
+                self._load(point)
+        return list(self._configs())
+
+    def modules(self) -> set[str]:
+        """The modules of others that must be imported for all kinds to be found again."""
+        announced = {point.module for point in self._announced()}
+        modules = {config.__module__ for config in self._configs()}
+        return {m for m in modules - announced if not m.startswith(_OURS) and m != "__main__"}
+
+    def _configs(self) -> Iterator[type]:
+        for kind in self._kinds.values():
+            config = getattr(kind, "config", None)
+            if config is not None:
+                yield config
+
+    def _announced(self) -> Iterator[EntryPoint]:
+        yield from entry_points(group=self.group)
+
+    def _load(self, point: EntryPoint) -> Kind:
+        try:
+            value = point.load()
+        except (ImportError, AttributeError) as error:
+            raise ValueError(
+                f"the {self.what} {point.name!r} is not at {point.value}: {error}"
+            ) from error
+        if isinstance(value, self._kind):
+            self.add(point.name, value)
+            return value
+        for kind in self._kinds.values():
+            if getattr(kind, "config", None) is value:
+                self.add(point.name, kind)
+                return kind
+        raise ValueError(
+            f"{point.value} is no {self.what}; it must be a {self._kind.__name__}, or the type of "
+            f"the configurations of one that its module registers"
+        )
+
+
+def import_modules(names: list[str]) -> None:
+    """
+    Imports modules that register kinds.
+
+    Raises:
+        ValueError: if one cannot be imported.
+    """
+    for name in names:
+        if name in sys.modules:
+            continue
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise ValueError(
+                f"the module {name} cannot be imported: {error}; install it, or put its folder "
+                "into PYTHONPATH"
+            ) from error

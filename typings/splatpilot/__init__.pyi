@@ -1,0 +1,1 @@
+../../splatpilot/__init__.pyi
