@@ -19,11 +19,23 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="splatpilot", description="Fly drones by camera inside Gaussian-splat worlds."
     )
+    parser.add_argument(
+        "--import",
+        action="append",
+        default=[],
+        dest="modules",
+        metavar="MODULE",
+        help="import a module that registers policies, worlds, sensors, ... (repeatable)",
+    )
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     for command in COMMANDS:
         command.add_to(verbs)
     options = parser.parse_args(arguments)
     try:
+        if options.modules:
+            from splatpilot.systems.registry import import_modules
+
+            import_modules(options.modules)
         options.verb(options)
     except (ValueError, OSError) as error:
         print(f"splatpilot: {error}", file=sys.stderr)

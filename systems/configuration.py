@@ -105,12 +105,16 @@ def _resolve_open_fields(config: Any, tags: set[str]) -> None:
         known = registry.configs(tags | {type(one).__name__ for one in held})
         first = known[0] if isinstance(value, dict) else type(field.default_factory())  # type: ignore
         # Of types that derive from each other the derived ones come first. A value that derives
-        # from the untagged type must not pass for it: then a type that fits none goes before all.
+        # from the untagged type must not pass for it: then what fits none goes before all.
         derived = sorted({*known, *map(type, held)} - {first}, key=lambda t: -len(t.__mro__))
         passes = any(isinstance(one, first) and type(one) is not first for one in held)
-        types = [str, *derived, first] if passes else [first, *derived]
+        types = [_Nothing, *derived, first] if passes else [first, *derived, _Nothing]
         union = functools.reduce(operator.or_, types)
         field.type = dict[str, union] if isinstance(value, dict) else union
+
+
+class _Nothing:
+    """A type that no value is of: it keeps unions of one type unions."""
 
 
 def _tag_of(config: Any, path: list[str]) -> str:
@@ -152,7 +156,7 @@ _UNKNOWN_TAG = re.compile(r"The yaml type tag value '(.*)' did not match .* for 
 def _known_tags(refusal: re.Match[str]) -> str:
     """What Drake's reader says of an unknown tag, with the tags that there are and the remedy."""
     tag, field, types = refusal.groups()
-    known = ", ".join(f"!{name}" for name in re.findall(r"(\w+)'>", types))
+    known = ", ".join(f"!{name}" for name in re.findall(r"\.([A-Za-z]\w*)'>", types))
     return (
         f"{field} is !{tag}, which nobody knows; known are {known}, and those of other packages "
         "once they are installed or their modules imported (--import)"

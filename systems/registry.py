@@ -1,6 +1,7 @@
 """Kinds of one thing, ours and those of other packages, by name."""
 
 import importlib
+import os
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
@@ -75,6 +76,7 @@ class Registry[Kind]:
             if point.name == name:
                 return self._load(point)
         if ":" in name:
+            _look_here_too()
             return self._load(EntryPoint(name=name, value=name, group=self.group))
         raise ValueError(
             f"there is no {self.what} {name!r}; there are {', '.join(self.names())}, and "
@@ -148,14 +150,13 @@ class Registry[Kind]:
 
 def import_modules(names: list[str]) -> None:
     """
-    Imports modules that register kinds.
+    Imports modules that register kinds; those in the working directory are found too.
 
     Raises:
         ValueError: if one cannot be imported.
     """
+    _look_here_too()
     for name in names:
-        if name in sys.modules:
-            continue
         try:
             importlib.import_module(name)
         except ImportError as error:
@@ -163,3 +164,9 @@ def import_modules(names: list[str]) -> None:
                 f"the module {name} cannot be imported: {error}; install it, or put its folder "
                 "into PYTHONPATH"
             ) from error
+
+
+def _look_here_too() -> None:
+    """Lets modules that were named be found in the working directory, after all other places."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())

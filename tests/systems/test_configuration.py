@@ -1,10 +1,13 @@
 """Configurations from YAML and from the command line."""
 
+from dataclasses import dataclass
+
 import pytest
 
 from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.make_world import SceneConfig
-from splatpilot.systems.configuration import dump_config, load_config
+from splatpilot.diagrams.worlds.forest.config import ForestConfig
+from splatpilot.diagrams.worlds.make_world import SceneConfig, make_world, register_world
+from splatpilot.systems.configuration import dump_config, load_config, parse_config
 
 
 def test_file_and_overrides_set_only_what_they_name(tmp_path):
@@ -112,3 +115,28 @@ def test_override_keeps_the_type_that_a_file_chose(tmp_path):
     scenario = load_config(Scenario(), path, overrides)
     assert scenario.world == SceneConfig(path="b")
     assert (scenario.policy.speed, scenario.policy.camera.width) == (1.5, 32)
+
+
+def test_unknown_type_is_refused_with_those_there_are():
+    """A tag that nobody knows is an error that lists the tags that are known."""
+    with pytest.raises(ValueError, match=r"policy is !NobodyConfig, which .*!StraightConfig, !Rea"):
+        load_config(Scenario(), overrides=["policy=!NobodyConfig {}"])
+
+
+def test_type_of_another_package_is_read_and_written():
+    """A configuration that is registered later is read by its tag and written with it, also where
+    its type derives from one that is written without."""
+
+    @dataclass
+    class DerivedForestConfig(ForestConfig):
+        gap: float = 1.0
+
+    register_world(DerivedForestConfig, make=make_world)
+    scenario = parse_config(
+        Scenario(), "world: !DerivedForestConfig {gap: 2, spacing: 2.5}", "text"
+    )
+    assert scenario.world == DerivedForestConfig(gap=2.0, spacing=2.5)
+    text = dump_config(scenario)
+    assert "world: !DerivedForestConfig" in text
+    assert parse_config(Scenario(), text, "dump").world == scenario.world
+    assert "!ForestConfig" not in dump_config(Scenario())

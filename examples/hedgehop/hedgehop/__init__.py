@@ -1,0 +1,1 @@
+"""Hedges to hop over, a rangefinder, and a policy that hops."""

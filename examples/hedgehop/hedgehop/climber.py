@@ -1,0 +1,99 @@
+"""A policy: ahead while the way is clear, up where it is not."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from hedgehop.rangefinder import RangefinderConfig
+from splatpilot import register_policy
+
+
+def _rangefinders() -> dict[str, RangefinderConfig]:
+    return {
+        # Tilted, so that it still sees the edge that the vehicle itself would not clear.
+        "ahead": RangefinderConfig(direction=[1.0, 0.0, -0.3]),
+        "below": RangefinderConfig(direction=[0.0, 0.0, -1.0]),
+    }
+
+
+@dataclass
+class ClimberConfig:
+    """How the climber flies."""
+
+    # [m/s]
+    speed: float = 2.0
+    # [Hz] Decisions per second.
+    rate: float = 15.0
+    # [m] What is nearer ahead is climbed over.
+    margin: float = 3.0
+    # [m] Least height above what is below.
+    height: float = 1.0
+    sensors: dict[str, RangefinderConfig] = field(default_factory=_rangefinders)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range."""
+        for name in ("speed", "rate", "margin", "height"):
+            if not 0 < getattr(self, name) <= 100:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be 0 to 100")
+
+
+def decide(
+    p_WB: np.ndarray, p_WG: np.ndarray, ahead: float, below: float, config: ClimberConfig
+) -> np.ndarray:
+    """The velocity v_WB (3,) [m/s]: to the goal, the slower ahead and the faster up the nearer what
+    is in the way."""
+    offset = p_WG - p_WB
+    plan = np.hypot(offset[0], offset[1])
+    clear = np.clip((ahead - 1.0) / config.margin, 0.0, 1.0) if ahead < plan else 1.0
+    level = config.speed * clear * min(1.0, plan) * offset[:2] / max(plan, 1e-6)
+    climb = np.clip(offset[2], -0.5, 0.5)
+    if clear < 1.0:
+        climb = config.speed * (1.0 - clear)
+    elif below < config.height:
+        climb = max(climb, 2.0 * (config.height - below))
+    return np.append(level, climb)
+
+
+class Climber(LeafSystem):
+    """
+    Flies by two rangefinders.
+
+    .. pydrake_system::
+
+        name: Climber
+        input_ports:
+        - state
+        - goal
+        - ahead_distance
+        - below_distance
+        output_ports:
+        - acceleration
+
+    Updates at `rate` from time 0 with the acceleration that leads to the velocity of `decide`.
+    """
+
+    def __init__(self, config: ClimberConfig | None = None):
+        super().__init__()
+        self._config = config or ClimberConfig()
+        self._config.validate()
+        self.sensors = self._config.sensors
+        for name, size in (
+            ("state", 13),
+            ("goal", 3),
+            ("ahead_distance", 1),
+            ("below_distance", 1),
+        ):
+            self.DeclareVectorInputPort(name, size)
+        self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
+        self.DeclarePeriodicDiscreteUpdateEvent(1 / self._config.rate, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state, p_WG, ahead, below = (
+            self.get_input_port(index).Eval(context) for index in range(self.num_input_ports())
+        )
+        v_wanted = decide(state[:3], p_WG, float(ahead[0]), float(below[0]), self._config)
+        discrete_state.set_value(2.0 * (v_wanted - state[3:6]))
+
+
+register_policy(ClimberConfig, lambda config, world, vehicle: Climber(config))

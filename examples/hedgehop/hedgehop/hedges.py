@@ -1,0 +1,51 @@
+"""A world: a field with hedges across the way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatpilot import register_world
+from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.fittings import box, daylight, ground, start_and_goal
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+
+
+@dataclass
+class HedgesConfig:
+    """Hedges from side to side, one behind the other."""
+
+    length: float = 24.0  # [m] flyable volume along x: from 0 to length
+    width: float = 10.0  # [m] along y, centred on 0
+    height: float = 5.0  # [m] along z, from the ground
+    hedges: int = 3  # [-]
+    tallest: float = 2.5  # [m] height of the tallest hedge; others reach at least half of it
+
+    def validate(self) -> None:
+        """Raises ValueError for the first value with which no field can be laid out."""
+        if not 1 <= self.hedges <= self.length / 5:
+            raise ValueError(f"hedges = {self.hedges} must be 1 to {self.length / 5:.0f}, 5 m each")
+        if not 0.5 <= self.tallest <= self.height - 1.5:
+            raise ValueError(f"tallest = {self.tallest} m must be 0.5 to {self.height - 1.5} m")
+
+
+def hedges_blueprint(config: HedgesConfig, seed: int) -> Blueprint:
+    """The field that `config` and `seed` determine, as solids, start and goal."""
+    config.validate()
+    half = config.width / 2
+    lower, upper = np.array([0, -half, 0.0]), np.array([config.length, half, config.height])
+
+    def draw(rng: np.random.Generator) -> Blueprint:
+        p_WS, p_WG = start_and_goal(lower, upper, rng)
+        hedges = []
+        for x in np.linspace(0, config.length, config.hedges + 2)[1:-1]:
+            top = config.tallest * rng.uniform(0.5, 1.0)
+            hedges.append(box([x, -half, 0], [x + 0.5, half, top], "foliage", int(x)))
+        _, light = daylight(rng)
+        return Blueprint(
+            "hedges", lower, upper, [ground("tiles"), *hedges], p_WS, p_WG, light, seed
+        )
+
+    return drawn(draw, seed)
+
+
+register_world(HedgesConfig, make_blueprint=hedges_blueprint)

@@ -1,0 +1,113 @@
+"""Diagrams of finished systems, and of sensors."""
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+
+from splatpilot.diagrams.flight import Outcome, fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.configuration import dump_config, load_config, parse_config
+from splatpilot.systems.policies.reactive import Reactive
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.flatness_controller import FlatnessController
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+
+
+def flown(scenario: Scenario, world, **systems):
+    return fly(BuildFlightDiagram(scenario, world, camera=False, **systems), scenario, world)
+
+
+def test_finished_systems_fly_as_configured_ones(post_world):
+    """The same policy, plant and controller, given as systems, fly the same flight bit for bit."""
+    scenario = Scenario(timeout=1.5, policy=policy_named("reactive"))
+    configured = flown(scenario, post_world)
+    given = flown(
+        scenario,
+        post_world,
+        policy=Reactive(scenario.policy),
+        plant=QuadrotorPlant(scenario.vehicle),
+        controller=FlatnessController(scenario.controller, scenario.vehicle),
+    )
+    np.testing.assert_array_equal(given.states, configured.states)
+    # Without a configuration that says how, the policy looks through the default camera.
+    scenario.policy = policy_named("planner")
+    np.testing.assert_array_equal(
+        flown(scenario, post_world, policy=Reactive()).states[-1], configured.states[-1]
+    )
+
+
+def test_a_policy_needs_only_its_outputs(post_world):
+    """A system without any input flies to the waypoint that it gives."""
+    scenario = Scenario(timeout=8.0, start_radius=0.0, start=[1, 0, 2], goal=[3.0, 0, 2])
+
+    class Waypoint(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorOutputPort("waypoint", 3, lambda _, y: y.SetFromVector([3.0, 0, 2]))
+
+    flight = flown(scenario, post_world, policy=Waypoint())
+    assert flight.outcome in (Outcome.GOAL, Outcome.TIMEOUT)
+    assert np.linalg.norm(flight.states[-1, :3] - [3.0, 0, 2]) < 0.3
+
+
+def test_systems_without_the_ports_they_need_are_named(post_world):
+    """A policy without outputs or with an input that nothing gives, and a plant that is none, are
+    errors that name the port."""
+    scenario = Scenario(timeout=1.0)
+    with pytest.raises(ValueError, match=r"policy ConstantVectorSource.* has none of the outputs"):
+        flown(scenario, post_world, policy=ConstantVectorSource(np.zeros(3)))
+    with pytest.raises(ValueError, match=r"the plant ConstantVector.* has no port 'command'"):
+        flown(scenario, post_world, plant=ConstantVectorSource(np.zeros(13)))
+
+    class Listener(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("wind", 3)
+            self.DeclareVectorOutputPort("waypoint", 3, lambda _, y: None)
+
+    with pytest.raises(ValueError, match=r"nothing gives the input 'wind' of the policy Listener"):
+        flown(scenario, post_world, policy=Listener())
+
+
+def test_configuration_that_nobody_knows_is_refused(post_world):
+    """A policy's or a world's configuration of an unknown type lists the known ones."""
+
+    class MineConfig:
+        rate = 10.0
+
+    with pytest.raises(ValueError, match=r"no policy has the configuration MineConfig; .*Straight"):
+        flown(Scenario(policy=MineConfig()), post_world)
+
+
+@pytest.mark.parametrize("shown", [{"video": True}, {"meshcat": object()}])
+def test_what_shows_the_camera_needs_it(post_world, shown):
+    """Video or Meshcat without the camera is an error that says so."""
+    with pytest.raises(ValueError, match=r"camera is False, but (video|meshcat) shows its images"):
+        BuildFlightDiagram(Scenario(), post_world, camera=False, **shown)
+
+
+def test_sensors_of_a_scenario_are_on_board(post_world):
+    """A scenario's sensors are systems whose outputs the diagram has; they survive YAML and
+    overrides, and change no flight."""
+    text = "sensors: {down: !OnboardCamera {width: 8, height: 6, pitch: -90}}\ntimeout: 1.0\n"
+    scenario = load_config(
+        parse_config(Scenario(), text, "text"), overrides=["sensors.down.width=10"]
+    )
+    assert scenario.sensors == {"down": OnboardCamera(width=10, height=6, pitch=-90)}
+    assert parse_config(Scenario(), dump_config(scenario), "dump").sensors == scenario.sensors
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    image = diagram.GetOutputPort("down_depth_image_32f").Eval(diagram.CreateDefaultContext())
+    assert image.data.shape == (6, 10, 1)
+    with_sensor = fly(diagram, scenario, post_world)
+    np.testing.assert_array_equal(
+        with_sensor.states, flown(Scenario(timeout=1.0), post_world).states
+    )
+
+
+def test_sensor_named_as_a_part_of_the_flight_is_refused(post_world):
+    """A name that the diagram uses is an error that says so."""
+    with pytest.raises(ValueError, match=r"a sensor is named 'plant'"):
+        flown(Scenario(sensors={"plant": OnboardCamera()}), post_world)
