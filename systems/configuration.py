@@ -106,7 +106,8 @@ def _resolve_open_fields(config: Any, tags: set[str]) -> None:
         first = known[0] if isinstance(value, dict) else type(field.default_factory())  # type: ignore
         # Of types that derive from each other the derived ones come first. A value that derives
         # from the untagged type must not pass for it: then what fits none goes before all.
-        derived = sorted({*known, *map(type, held)} - {first}, key=lambda t: -len(t.__mro__))
+        others = [t for t in dict.fromkeys([*known, *map(type, held)]) if t is not first]
+        derived = sorted(others, key=lambda t: -len(t.__mro__))
         passes = any(isinstance(one, first) and type(one) is not first for one in held)
         types = [_Nothing, *derived, first] if passes else [first, *derived, _Nothing]
         union = functools.reduce(operator.or_, types)
