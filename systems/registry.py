@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
@@ -75,7 +76,7 @@ class Registry[Kind]:
         for point in self._announced():
             if point.name == name:
                 return self._load(point)
-        if ":" in name:
+        if re.fullmatch(r"[\w.]+:[\w.]+", name):
             _look_here_too()
             return self._load(EntryPoint(name=name, value=name, group=self.group))
         raise ValueError(
