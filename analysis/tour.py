@@ -3,15 +3,14 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatpilot.analysis.reconstruction import measure_scene
+from splatpilot.analysis.reconstruction import run as reconstruction
 from splatpilot.diagrams import fly
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import SceneConfig
-from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.render_capture import RenderConfig
-from splatpilot.training.reconstruction import reconstruct
-from splatpilot.training.reconstruction.reconstruct import ReconstructConfig
+from splatpilot.training.reconstruction.config import ReconstructConfig
 
 
 @dataclass
@@ -28,7 +27,7 @@ class TourConfig:
 
 
 def run(
-    *, world: Path, out: Path, scene: Path | None, config: TourConfig, seed: int = 0
+    *, world: str | Path, out: Path, scene: Path | None, config: TourConfig, seed: int = 0
 ) -> dict[str, float | str]:
     """Renders `world` to `out/capture`, reconstructs that as `scene` (`out/scene` if None), flies
     in it, leaving `out/flight`, and returns the summary of the flight.
@@ -36,7 +35,7 @@ def run(
     What is there from a run before is used again: an interrupted tour goes on.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: see `render_capture.run`, `reconstruct.run` and
+        FileNotFoundError, ValueError, OSError: see `render_capture.run`, `reconstruction.run` and
             `fly.run`; or if `scene` was made of another capture.
     """
     capture = out / "capture"
@@ -51,7 +50,6 @@ def run(
             )
         print(f"{scene}: is reconstructed already")
     else:
-        reconstruct.run(capture=capture, out=scene, config=config.reconstruct)
-        measure_scene.run(scene)
+        reconstruction.run(capture=capture, out=scene, config=config.reconstruct)
     config.flight.world = SceneConfig(path=str(scene.absolute()))
     return fly.run(scenario=config.flight, out=out / "flight")

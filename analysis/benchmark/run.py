@@ -12,10 +12,11 @@ from splatpilot.analysis.benchmark.rollout import Rollout
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import format_table, policy_table
-from splatpilot.analysis.benchmark.workers import default_jobs, fly_all
+from splatpilot.analysis.benchmark.workers import fly_all
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
 from splatpilot.systems.configuration import dump_config
+from splatpilot.systems.cores import available_cores
 
 
 def run(
@@ -62,7 +63,7 @@ def run(
         print(f"{len(specs) - len(missing)} of {len(specs)} flights are there already.")
     kept = {name: dump_config(folder.scenario(name)) for name in flyable}
     done = [folder.read(spec)[0] for spec in specs if spec not in set(missing)]
-    flights = fly_all(missing, kept, jobs or default_jobs(), cluster, folder.weights())
+    flights = fly_all(missing, kept, jobs or available_cores(), cluster, folder.weights())
     _keep(folder, flights, done, len(specs))
 
     rows = [folder.read(spec)[0] for spec in specs]

@@ -1,6 +1,5 @@
 """Where the flights of a study are flown: worker processes here, or on a cluster."""
 
-import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -92,8 +91,3 @@ def _on_cluster(work: list[_Work], address: str) -> Iterator[Rollout]:
                 f"the cluster's workers die of one and the same work ({error}); what was flown is "
                 "kept: give them more memory and run the same command again"
             ) from None
-
-
-def default_jobs() -> int:
-    """One worker process for each core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -41,7 +41,9 @@ def _add_render(actions: argparse._SubParsersAction) -> None:
         "free space between the heights.",
     )
     render.set_defaults(verb=_render)
-    render.add_argument("world", type=Path, help=".gltf, .obj, or a scenario of a generated world")
+    render.add_argument(
+        "world", type=Path, help=".gltf or .obj, or a scenario of a generated world: P01 or a file"
+    )
     render.add_argument("--out", type=Path, required=True, help="capture folder to write")
     render.add_argument(
         "--path", metavar='"X,Y,Z X,Y,Z ..."', help="points the camera goes through [m]"

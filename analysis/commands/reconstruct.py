@@ -19,16 +19,16 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
-    from splatpilot.analysis.reconstruction import measure_scene
+    from splatpilot.analysis.reconstruction import run as reconstruction
     from splatpilot.systems.configuration import load_config
-    from splatpilot.training.captures.read_capture import read_capture
-    from splatpilot.training.reconstruction import reconstruct
     from splatpilot.training.reconstruction.config import ReconstructConfig
 
-    config = load_config(ReconstructConfig(), overrides=options.overrides)
+    overrides = list(options.overrides)
     if options.iterations is not None:
-        config.iterations = options.iterations
-    reconstruct.run(
+        if any(override.startswith("iterations=") for override in overrides):
+            raise ValueError("iterations are given by --iterations and by --set; keep one of them")
+        overrides.append(f"iterations={options.iterations}")
+    config = load_config(ReconstructConfig(), overrides=overrides)
+    reconstruction.run(
         capture=options.capture, out=options.out, config=config, restart=options.restart
     )
-    measure_scene.run(options.out, read_capture(options.capture, config.capture))

@@ -24,7 +24,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _tour(options: argparse.Namespace) -> None:
     from splatpilot.analysis import tour
-    from splatpilot.diagrams.scenario_files import benchmark_scenarios
     from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
@@ -33,7 +32,7 @@ def _tour(options: argparse.Namespace) -> None:
         config.render.up = options.up
     config = load_config(config, overrides=options.overrides)
     tour.run(
-        world=benchmark_scenarios().get(str(options.world)) or options.world,
+        world=options.world,
         out=options.out,
         scene=options.scene,
         config=config,

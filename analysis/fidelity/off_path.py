@@ -32,21 +32,21 @@ def choose_withheld(frames: int, stretches: Sequence[int], kept: int) -> list[in
     return withheld
 
 
-def without(capture: Capture, withheld: Sequence[int]) -> Capture:
+def drop_frames(capture: Capture, withheld: Sequence[int]) -> Capture:
     """Returns the capture less some of its frames."""
     gone = set(withheld)
     kept = [i for i in range(len(capture)) if i not in gone]
-    has_depth = capture.load_depth is not no_depth
     return replace(
         capture,
         X_WCs=[capture.X_WCs[i] for i in kept],
         load_image=lambda k: capture.load_image(kept[k]),
-        load_depth=(lambda k: capture.load_depth(kept[k])) if has_depth else no_depth,
+        load_depth=(lambda k: capture.load_depth(kept[k])) if capture.has_depth else no_depth,
         frame_names=[capture.frame_names[i] for i in kept] if capture.frame_names else (),
+        folder="",
     )
 
 
-def displaced_poses(
+def displace_pose(
     X_WCs: Sequence[RigidTransform], i: int, offset: float
 ) -> tuple[RigidTransform, RigidTransform, RigidTransform, RigidTransform]:
     """Returns pose i of a path moved by `offset` [m] to its left, to its right, up and down.

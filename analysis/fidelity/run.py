@@ -17,7 +17,7 @@ from pydrake.math import RigidTransform
 from tqdm import tqdm
 
 from splatpilot.analysis.fidelity.figures import write_curves, write_views
-from splatpilot.analysis.fidelity.off_path import choose_withheld, displaced_poses, without
+from splatpilot.analysis.fidelity.off_path import choose_withheld, displace_pose, drop_frames
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
 from splatpilot.analysis.fidelity.trust import first_crossing
 from splatpilot.analysis.fidelity.view_support import ViewSupport
@@ -26,7 +26,7 @@ from splatpilot.analysis.reconstruction.measure_scene import (
     measure_scene,
     read_measures,
 )
-from splatpilot.diagrams.worlds.scene_folder import (
+from splatpilot.diagrams.worlds.scene_metadata import (
     SceneMetadata,
     read_scene_metadata,
     write_scene_metadata,
@@ -142,7 +142,7 @@ def study_scene(
     support = _support(views)
     samples, shown = [], []
     for i, offset, frame in frames:
-        frame = views.shrunk(frame)
+        frame = views.shrink(frame)
         found = views.measure(frame)
         if found.depth_mae_m is None:
             continue
@@ -171,7 +171,7 @@ def study_scene(
 def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
     """Returns how far each pose of the capture may be displaced [m].
 
-    A pose may go left, right, up and down (`displaced_poses`) as long as no more of its view is
+    A pose may go left, right, up and down (`displace_pose`) as long as no more of its view is
     unseen than the study found to be within the limits, and at most as far as was measured.
     """
     support = _support(views)
@@ -180,7 +180,7 @@ def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
     bounds = []
     X_WCs = views.capture.X_WCs
     for i in tqdm(range(len(X_WCs)), "bounds", unit="pose"):
-        sides = zip(*(displaced_poses(X_WCs, i, offset) for offset in grid), strict=True)
+        sides = zip(*(displace_pose(X_WCs, i, offset) for offset in grid), strict=True)
         bounds.append(
             min(
                 first_crossing(grid, (1 - support.of(X_WC) for X_WC in side), study.unseen_limit)
@@ -232,7 +232,7 @@ def _rendered_frames(
     numbers = views.metadata.held_out or range(len(X_WCs))
     for i in tqdm(numbers, "rendering", unit="pose"):
         for offset in config.offsets:
-            for X_WC in displaced_poses(X_WCs, i, offset)[: 2 if offset else 1]:
+            for X_WC in displace_pose(X_WCs, i, offset)[: 2 if offset else 1]:
                 way = np.linspace(X_WCs[i].translation(), X_WC.translation(), 11)
                 if offset and esdf.distance(way[1:]).min() < config.clearance:
                     continue
@@ -249,7 +249,7 @@ def _withheld_frames(
     settings = replace(config.reconstruct, representation=representation, hold_out=0)
     recipe = f"{yaml_dump_typed(settings)}withheld: {withheld}\n"
     file = out / RECIPE
-    part = without(whole, withheld)
+    part = drop_frames(whole, withheld)
     if not file.is_file() or file.read_text() != recipe:
         reconstruct(part, out, settings)
         with written_atomically(file) as partial:

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.training.reconstruction.measures import ViewRenderer
+from splatpilot.training.captures.lens import back_project
+from splatpilot.training.reconstruction.measures import SceneRenderer
 
 _WIDTH = 48  # [px] of the views that are compared
 _NEAREST = 16  # cameras that are asked
@@ -31,7 +32,7 @@ class ViewSupport:
 
     def __init__(
         self,
-        renderer: ViewRenderer,
+        renderer: SceneRenderer,
         K: NDArray,
         width: int,
         height: int,
@@ -51,9 +52,7 @@ class ViewSupport:
         depth = self._render(X_WC)
         rows, columns = np.nonzero(depth > 0)
         z = depth[rows, columns].astype(np.float64)
-        x = (columns + 0.5 - self._K[0, 2]) / self._K[0, 0] * z
-        y = (rows + 0.5 - self._K[1, 2]) / self._K[1, 1] * z
-        p_WQ = X_WC.multiply(np.stack([x, y, z]))  # (3, m)
+        p_WQ = X_WC.multiply(back_project(self._K, columns + 0.5, rows + 0.5, z).T)  # (3, m)
         ray = p_WQ - X_WC.translation()[:, None]
         distance = np.linalg.norm(ray, axis=0)
         unseen = np.arange(len(z))

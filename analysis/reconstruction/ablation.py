@@ -14,22 +14,25 @@ from pydrake.common.yaml import yaml_dump_typed
 
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
+    colorize,
     depth_scale,
     error_scale,
-    in_color,
-    with_floaters,
+    mark_floaters,
     write_sheet,
 )
 from splatpilot.analysis.reconstruction.measure_scene import (
     NAMES,
     SceneMeasures,
     SceneViews,
+    format_measure,
     measure_scene,
+    read_capture_of,
     read_measures,
-    written,
 )
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth
@@ -106,7 +109,9 @@ class AblationResult:
         rows = [["capture", "arm", *(NAMES[name][0] for name in COLUMNS)]]
         for capture, arms in self.captures.items():
             for arm in ARMS:
-                cells = [written(arms[arm.key].mean(name), NAMES[name][1]) for name in COLUMNS]
+                cells = [
+                    format_measure(arms[arm.key].mean(name), NAMES[name][1]) for name in COLUMNS
+                ]
                 rows.append([capture, arm.title, *cells])
         if len(self.captures) > 1:
             for arm in ARMS:
@@ -142,7 +147,7 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
             f"hold_out is {config.hold_out} and iterations {config.iterations}: an ablation "
             "optimises, and measures on held-out frames; neither may be 0"
         )
-    opened = [(path, read_capture(path, config.capture)) for path in captures]
+    opened = [(path, _open(path, config.capture)) for path in captures]
     names = [capture.name for _, capture in opened]
     for path, capture in opened:
         if not capture.has_depth:
@@ -151,10 +156,7 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
             raise ValueError(f"{path}: two captures are called {capture.name}; rename one folder")
     require_writable_folder(out)
     result = AblationResult(
-        {
-            capture.name: _ablate(path, capture, out / capture.name, config)
-            for path, capture in opened
-        }
+        {capture.name: _ablate(capture, out / capture.name, config) for _, capture in opened}
     )
     for _, capture in opened:
         _write_sheet(out / f"{capture.name}.png", capture, out / capture.name, result)
@@ -163,9 +165,14 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
     return result
 
 
-def _ablate(
-    path: Path, capture: Capture, out: Path, config: ReconstructConfig
-) -> dict[str, SceneMeasures]:
+def _open(path: Path, config: CaptureConfig) -> Capture:
+    """Opens a capture, or the one that a scene folder was made from."""
+    if (path / "scene.yaml").is_file():
+        return read_capture_of(path, read_scene_metadata(path))
+    return read_capture(path, config)
+
+
+def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMeasures]:
     """Makes and measures the arms of one capture that are not there yet."""
     found = {}
     points = capture.points
@@ -186,7 +193,7 @@ def _ablate(
                     fitted = [i for i in range(len(capture)) if i % config.hold_out]
                     points = triangulate(capture, fitted)
                 seen = replace(capture, points=points)
-            reconstruct(seen, scene, arm_config(arm, config), path=str(path))
+            reconstruct(seen, scene, arm_config(arm, config))
             with written_atomically(file) as partial:
                 partial.write_text(recipe)
         found[arm.key] = read_measures(scene) or measure_scene(scene, capture)
@@ -237,7 +244,7 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
     frame = scenes[0][1].frame(i)
     truth, known = frame.image / 255, has_true_depth(frame.depth)
     depths, errors = depth_scale([frame.depth]), error_scale(_ERROR_LIMIT)
-    true_depth = Panel(in_color(frame.depth, depths, known))
+    true_depth = Panel(colorize(frame.depth, depths, known))
     rows: list[list[Panel | None]] = [[Panel(truth)], [None], [true_depth], [None]]
     for arm, views in scenes:
         view, found = views.render(frame), arms[arm.key].frames[i]
@@ -246,9 +253,9 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
         mask = floaters(view.depth, view.alpha, frame.depth)
         fraction, mae = found.floater_fraction or 0.0, found.depth_mae_m or 0.0
         rows[0].append(Panel(image, f"{found.psnr_db:.1f} dB"))
-        rows[1].append(Panel(with_floaters(image, mask), f"{fraction:.1%}"))
-        rows[2].append(Panel(in_color(view.depth, depths, view.alpha > 0)))
-        rows[3].append(Panel(in_color(error, errors, known), f"{mae:.2f} m"))
+        rows[1].append(Panel(mark_floaters(image, mask), f"{fraction:.1%}"))
+        rows[2].append(Panel(colorize(view.depth, depths, view.alpha > 0)))
+        rows[3].append(Panel(colorize(error, errors, known), f"{mae:.2f} m"))
     columns = ["captured", "2DGS", "3DGS", "2DGS + depth", "3DGS + depth (ours)"]
     titles = [f"frame {i}", "floaters", "depth", "depth error"]
     write_sheet(path, rows, columns, titles, [None, None, depths, errors])

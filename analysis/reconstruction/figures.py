@@ -54,13 +54,13 @@ def error_scale(limit: float) -> Scale:
     return Scale(ERROR_COLORS, Normalize(0, limit, clip=True), "depth error [m]")
 
 
-def in_color(values: NDArray, scale: Scale, known: NDArray[np.bool_]) -> NDArray[np.float64]:
+def colorize(values: NDArray, scale: Scale, known: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Returns values (H, W) as colours (H, W, 3), grey where they are not known."""
     colors = colormaps[scale.colors](scale.norm(np.where(known, values, 1.0)))[..., :3]
     return np.where(known[..., None], colors, 0.35)
 
 
-def with_floaters(image: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def mark_floaters(image: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Returns the image (H, W, 3), paled, with the pixels of `mask` in red."""
     gray = np.repeat(0.35 + 0.6 * np.mean(image, axis=-1, keepdims=True), 3, axis=-1)
     return np.where(mask[..., None], 0.25 * gray + 0.75 * _RED, gray)

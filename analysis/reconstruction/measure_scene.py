@@ -12,23 +12,26 @@ from tqdm import tqdm
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     Scale,
+    colorize,
     depth_scale,
     error_scale,
-    in_color,
     write_sheet,
 )
-from splatpilot.diagrams.worlds.scene_folder import SceneMetadata, read_scene_metadata
+from splatpilot.diagrams.worlds.scene_metadata import SceneMetadata, read_scene_metadata
+from splatpilot.systems.configuration import load_config
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.measures import (
+    SceneRenderer,
     ViewMeasures,
-    ViewRenderer,
     fit_exposure,
     has_true_depth,
+    mean_measure,
     measure_view,
 )
 from splatpilot.training.reconstruction.views import shrink, shrink_factor
@@ -64,7 +67,7 @@ class SceneMeasures:
 
     def mean(self, name: str) -> float | None:
         """Returns the mean of a measure over the frames that have it; None if none has."""
-        return mean(getattr(frame, name) for frame in self.frames.values())
+        return mean_measure(self.frames.values(), name)
 
     def as_json(self) -> dict:
         """Returns the content of `metrics.json`: means, and the measures of each frame."""
@@ -81,19 +84,13 @@ class SceneMeasures:
         kind = "held-out frames" if self.held_out else "frames the scene was made from"
         lines = [f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}"]
         for name, (title, form) in NAMES.items():
-            lines.append(f"{title:<22} {written(self.mean(name), form)}")
+            lines.append(f"{title:<22} {format_measure(self.mean(name), form)}")
         if self.lpips_missing:
             lines.append(f"no LPIPS: {self.lpips_missing}")
         return "\n".join(lines)
 
 
-def mean(values) -> float | None:
-    """Returns the mean of what is not None; None if nothing is left."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
-
-
-def written(value: float | None, form: str) -> str:
+def format_measure(value: float | None, form: str) -> str:
     """Returns a figure as text, a dash for None."""
     return "-" if value is None else form.format(value)
 
@@ -124,6 +121,24 @@ def load_lpips() -> tuple[Lpips | None, str]:
         return None, str(error)
 
 
+def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
+    """Opens the capture that a scene folder was made from, with the settings it was made with.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: if `metadata` names none, or it cannot be opened.
+    """
+    file = scene / "scene.yaml"
+    if not metadata.capture:
+        raise ValueError(
+            f"{file}: names no capture to compare the scene with; reconstruct it again"
+        )
+    try:
+        config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
+    except ValueError as error:
+        raise ValueError(f"{file}: capture_settings: {error}") from None
+    return read_capture(metadata.capture, config)
+
+
 class SceneViews:
     """A scene folder beside its capture: frames as they were, and as the scene shows them.
 
@@ -138,12 +153,7 @@ class SceneViews:
     def __init__(self, scene: Path, capture: Capture | None = None):
         self.metadata: SceneMetadata = read_scene_metadata(scene)
         if capture is None:
-            if not self.metadata.capture:
-                raise ValueError(
-                    f"{scene / 'scene.yaml'}: names no capture to compare the scene with; "
-                    "reconstruct it again"
-                )
-            capture = read_capture(self.metadata.capture)
+            capture = read_capture_of(scene, self.metadata)
         self.capture = capture
         lost = [i for i in self.metadata.held_out if i >= len(capture)]
         if lost:
@@ -152,15 +162,15 @@ class SceneViews:
                 f"only {len(capture)} frames; the capture has changed, reconstruct the scene again"
             )
         self.factor = shrink_factor(capture.width, self.metadata.image_width)
-        self.renderer = ViewRenderer(
+        self.renderer = SceneRenderer(
             read_ply(scene / "gaussians.ply"), self.metadata.representation
         )
 
     def frame(self, i: int) -> CaptureFrame:
         """Returns frame i of the capture in the size at which the scene was made."""
-        return self.shrunk(self.capture.frame(i))
+        return self.shrink(self.capture.frame(i))
 
-    def shrunk(self, frame: CaptureFrame) -> CaptureFrame:
+    def shrink(self, frame: CaptureFrame) -> CaptureFrame:
         """Returns a frame of the capture's camera in the size at which the scene was made."""
         return shrink(frame, self.factor)
 
@@ -178,7 +188,9 @@ class SceneViews:
 
     def measure(self, frame: CaptureFrame, lpips: Lpips | None = None) -> ViewMeasures:
         """Compares both."""
-        return measure_view(self.render(frame), frame, self.metadata.vignetting, lpips)
+        return measure_view(
+            self.render(frame), frame.image, frame.depth, self.metadata.vignetting, lpips
+        )
 
 
 def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
@@ -207,9 +219,18 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
     return measures
 
 
-def run(scene: Path, capture: Capture | None = None) -> None:
-    """Measures a scene folder, see `measure_scene`, and prints the table."""
-    print(measure_scene(scene, capture))
+def run(scene: Path) -> SceneMeasures:
+    """Measures a scene folder, see `measure_scene`, and prints what it is and the table."""
+    metadata = read_scene_metadata(scene)
+    measures = measure_scene(scene)
+    if metadata.provenance:
+        print(f"{'made from':<22} {metadata.provenance}")
+    print(f"{'seen free [m^3]':<22} {metadata.observed_free_volume:.1f}")
+    if metadata.gains:
+        low, high = min(metadata.gains), max(metadata.gains)
+        print(f"{'image gains':<22} {low:.3f} to {high:.3f}")
+    print(measures)
+    return measures
 
 
 def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None:
@@ -242,10 +263,10 @@ def depth_panels(
     known = has_true_depth(frame.depth)
     error: NDArray = np.abs(view.depth - np.where(known, frame.depth, 0))
     return [
-        Panel(in_color(frame.depth, depths, known)),
-        Panel(in_color(view.depth, depths, view.alpha > 0)),
+        Panel(colorize(frame.depth, depths, known)),
+        Panel(colorize(view.depth, depths, view.alpha > 0)),
         Panel(
-            in_color(error, errors, known),
+            colorize(error, errors, known),
             "" if depth_mae_m is None else f"{100 * depth_mae_m:.1f} cm",
         ),
     ]

@@ -92,26 +92,26 @@ def poses_along(
     path = np.asarray(path, dtype=np.float64)
     if path.ndim != 2 or path.shape[1] != 3 or not len(path) or not np.isfinite(path).all():
         raise ValueError(f"the path has shape {path.shape}; finite points x, y, z are needed")
-    p_WP = resampled(path, _STEP)
+    p_WP = resample(path, _STEP)
     if len(p_WP) > 1:
         # Continued beyond its ends point-symmetrically, so that they stay where they are.
         more = min(len(p_WP) - 1, int(4 * _ROUNDING / _STEP))
         p_WP = np.pad(p_WP, ((more, more), (0, 0)), mode="reflect", reflect_type="odd")
         p_WP = gaussian_filter1d(p_WP, _ROUNDING / _STEP, axis=0)[more : len(p_WP) - more]
-    p_WP = resampled(p_WP, spacing)
+    p_WP = resample(p_WP, spacing)
     way = np.gradient(p_WP, axis=0) if len(p_WP) > 1 else np.array([[1.0, 0, 0]])
     # Where the way is up or down, the heading stays what it was.
     level = np.linalg.norm(way[:, :2], axis=1) > 0.1 * np.linalg.norm(way, axis=1)
     last = np.maximum.accumulate(np.where(level, np.arange(len(way)), 0))
     headings = np.arctan2(way[last, 1], way[last, 0])
     return [
-        looking(p, heading + np.deg2rad(yaw), np.deg2rad(pitch))
+        look_along(p, heading + np.deg2rad(yaw), np.deg2rad(pitch))
         for p, heading in zip(p_WP, headings, strict=True)
         for yaw in yaws
     ]
 
 
-def looking(p_WC: NDArray[np.float64], yaw: float, pitch: float) -> RigidTransform:
+def look_along(p_WC: NDArray[np.float64], yaw: float, pitch: float) -> RigidTransform:
     """Returns the pose X_WC of an upright camera that looks along yaw and up by pitch [rad]."""
     ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
@@ -120,14 +120,14 @@ def looking(p_WC: NDArray[np.float64], yaw: float, pitch: float) -> RigidTransfo
     )
 
 
-def beside(X_WC: RigidTransform, offset: float) -> RigidTransform:
+def move_left(X_WC: RigidTransform, offset: float) -> RigidTransform:
     """Returns the pose moved by `offset` [m] to the camera's left, looking where it looked."""
     return RigidTransform(
         X_WC.rotation(), X_WC.translation() - offset * X_WC.rotation().matrix()[:, 0]
     )
 
 
-def resampled(path: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+def resample(path: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
     """Returns points of a polyline, evenly spaced by about `spacing` [m], ends included."""
     lengths = np.append(0.0, np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum())
     wanted = np.linspace(0, lengths[-1], max(round(lengths[-1] / spacing), 1) + 1)

@@ -1,13 +1,15 @@
 """A capture: what a camera saw of a place, from known poses."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures.registered_depth import registered_depth
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.lens import back_project
+from splatpilot.training.captures.register_depth import register_depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +26,7 @@ class CaptureFrame:
 
     def back_project(self, columns: NDArray, rows: NDArray, depth: NDArray) -> NDArray[np.floating]:
         """Returns the points p_CQ, (..., 3) [m], at image coordinates [px] and depths [m]."""
-        x = (columns - self.K[0, 2]) / self.K[0, 0] * depth
-        y = (rows - self.K[1, 2]) / self.K[1, 1] * depth
-        return np.stack([x, y, depth], axis=-1)
+        return back_project(self.K, columns, rows, depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +96,11 @@ class Capture:
     """Why frames were left out, one message each that names the file."""
     axes: FileAxes | None = None
     """The axes of the files, for those who doubt that they were read rightly."""
+    folder: str = ""
+    """The absolute path from which `read_capture` opens it again, with `config`; empty if it does
+    not come from there as it is."""
+    config: CaptureConfig = field(default_factory=CaptureConfig)
+    """What was said when it was read of what its files leave open."""
 
     def __len__(self) -> int:
         return len(self.X_WCs)
@@ -119,7 +124,7 @@ class Capture:
         if self.depth_camera is None:
             return depth
         camera = self.depth_camera
-        return registered_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
+        return register_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
 
     def frame(self, i: int) -> CaptureFrame:
         """Loads frame i, 0 <= i < len(self), with its registered depth.

@@ -1,6 +1,7 @@
 """What a capture's files leave open."""
 
 import dataclasses
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -97,8 +98,21 @@ class CaptureConfig:
             )
         self.scale.validate()
 
+    def settings(self) -> list[str]:
+        """Returns the fields that are not as they are by default, as `--set` takes them:
+        "depth_unit=5000.0", "scale.camera_height=1.6"."""
+        return [
+            f"{prefix}{name}={json.dumps(getattr(own, name))}"
+            for prefix, own, default in (
+                ("", self, CaptureConfig()),
+                ("scale.", self.scale, ScaleConfig()),
+            )
+            for name in (each.name for each in dataclasses.fields(default))
+            if name != "scale" and getattr(own, name) != getattr(default, name)
+        ]
 
-def completed_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
+
+def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
     """Returns `config` with what it leaves open taken from the capture's own `capture.yaml`.
 
     Raises:

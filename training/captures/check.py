@@ -10,12 +10,12 @@ from pathlib import Path
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_agreement import (
-    Agreement,
-    agreement_of,
+    ReadingFit,
     choose_pairs,
+    measure_reading,
     reading_of,
 )
-from splatpilot.training.captures.known_mistakes import fitted_readings, other_readings
+from splatpilot.training.captures.known_mistakes import fit_readings, undo_mistakes
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.captures.registration import ColorFit, fit_color_camera
 
@@ -37,8 +37,8 @@ class CheckReport:
     frames: int
     dropped: tuple[str, ...]
     pairs: int
-    agreement: Agreement
-    others: tuple[Agreement, ...]
+    agreement: ReadingFit
+    others: tuple[ReadingFit, ...]
     """Other readings, the best first."""
     color: ColorFit | None
     mistake: str
@@ -115,9 +115,9 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     if sum(len(pair.depth) for pair in found) < _FEWEST:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")
     as_read = reading_of(capture)
-    agreement = agreement_of(as_read, found)
-    others = [agreement_of(other, found) for other in other_readings(as_read, capture)]
-    others += [agreement_of(other, found) for other in fitted_readings(as_read, found)]
+    agreement = measure_reading(as_read, found)
+    others = [measure_reading(other, found) for other in undo_mistakes(as_read, capture)]
+    others += [measure_reading(other, found) for other in fit_readings(as_read, found)]
     others.sort(key=lambda each: each.error)
     best = others[0]
     color = None

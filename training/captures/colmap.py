@@ -18,9 +18,9 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import read_depth
 from splatpilot.training.captures.lens import Lens, pinhole
-from splatpilot.training.captures.metric_scale import made_metric
+from splatpilot.training.captures.metric_scale import make_metric
 from splatpilot.training.captures.poses import pose_from_matrix
-from splatpilot.training.captures.upright import raised
+from splatpilot.training.captures.upright import turn_upright
 
 _MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "../images", "../../images", "")
@@ -121,7 +121,7 @@ def capture_of_model(
                 np.array([point.color for point in points]) / 255,
             ),
         )
-    return raised(made_metric(capture, config.scale, locate), config.up or "cameras")
+    return turn_upright(make_metric(capture, config.scale, locate), config.up or "cameras")
 
 
 def _lens(camera: pycolmap.Camera, config: CaptureConfig) -> Lens:

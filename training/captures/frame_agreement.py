@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.lens import back_project
 from splatpilot.training.captures.registration import grid_step
 
 _POINTS = 5000
@@ -50,7 +51,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ReadingFit:
     """How well a reading fits."""
 
     name: str
@@ -114,7 +115,7 @@ def _partner(capture: Capture, i: int, depth: float) -> int | None:
     return j
 
 
-def agreement_of(reading: Reading, pairs: Sequence[FramePair]) -> Agreement:
+def measure_reading(reading: Reading, pairs: Sequence[FramePair]) -> ReadingFit:
     """Measures a reading on pairs of frames."""
     errors, total = [], 0
     for pair in pairs:
@@ -124,13 +125,13 @@ def agreement_of(reading: Reading, pairs: Sequence[FramePair]) -> Agreement:
     error = np.concatenate(errors)
     inside = len(error) / total
     if inside < _LEAST_INSIDE:
-        return Agreement(reading.name, np.inf, inside)
-    return Agreement(reading.name, float(np.median(error)), inside)
+        return ReadingFit(reading.name, np.inf, inside)
+    return ReadingFit(reading.name, float(np.median(error)), inside)
 
 
 def _relative_errors(reading: Reading, pair: FramePair) -> NDArray[np.float64]:
-    f, c = np.diag(reading.K)[:2, None], reading.K[:2, 2, None]
-    rays = np.concatenate([(pair.pixels - c) / f, np.ones((1, pair.pixels.shape[1]))])
+    f, c = np.diag(reading.K)[:2], reading.K[:2, 2]
+    rays = back_project(reading.K, *pair.pixels, np.ones(len(pair.depth))).T
     z = reading.factor * pair.depth
     if reading.is_range:
         z = z / np.linalg.norm(rays, axis=0)

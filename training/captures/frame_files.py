@@ -79,10 +79,10 @@ def open_frames(
     sound: list[_Frame] = []
     for frame in frames:
         try:
-            sound.append(_looked_at(frame))
+            sound.append(_inspect(frame))
         except (ValueError, OSError) as error:
             messages.append(str(error))
-    sound = _of_usual_size(sound, messages, registered=depth_camera is None)
+    sound = _keep_usual_size(sound, messages, registered=depth_camera is None)
     if sound:
         stray = set(stray_frames(np.array([frame.X_FB.translation() for frame in sound])).tolist())
         for i in sorted(stray):
@@ -105,17 +105,17 @@ def open_frames(
 
     def load_image(i: int) -> NDArray[np.uint8]:
         image = read_image(sound[i].image)
-        return _resampled(_sized(image, sound[i].image, sound[i].size), i, cv2.INTER_LINEAR)
+        return _resample(_require_size(image, sound[i].image, sound[i].size), i, cv2.INTER_LINEAR)
 
     def load_depth(i: int) -> NDArray[np.float32] | None:
         file, size = sound[i].depth, sound[i].depth_size
         if file is None or size is None or read_depth is None:
             return None
-        depth = _sized(read_depth(file), file, size)
+        depth = _require_size(read_depth(file), file, size)
         # Between surfaces an average would be a place where nothing is.
-        return depth if depth_camera else _resampled(depth, i, cv2.INTER_NEAREST)
+        return depth if depth_camera else _resample(depth, i, cv2.INTER_NEAREST)
 
-    def _resampled(image: NDArray, i: int, interpolation: int) -> NDArray:
+    def _resample(image: NDArray, i: int, interpolation: int) -> NDArray:
         lens = lenses[i]
         if lens is None or (found := maps[lens]) is None:
             return image
@@ -143,7 +143,7 @@ def _no_lens() -> Lens:
     raise ValueError("the intrinsics are unknown; set capture.intrinsics to [fx, fy, cx, cy]")
 
 
-def _looked_at(frame: FrameFiles) -> _Frame:
+def _inspect(frame: FrameFiles) -> _Frame:
     size = image_size(frame.image)
     if frame.lens is not None and size != (frame.lens.width, frame.lens.height):
         raise ValueError(_size_message(frame.image, size, (frame.lens.width, frame.lens.height)))
@@ -151,7 +151,9 @@ def _looked_at(frame: FrameFiles) -> _Frame:
     return _Frame(frame.image, size, frame.depth, found, frame.lens, frame.X_FB())
 
 
-def _of_usual_size(frames: Sequence[_Frame], messages: list[str], registered: bool) -> list[_Frame]:
+def _keep_usual_size(
+    frames: Sequence[_Frame], messages: list[str], registered: bool
+) -> list[_Frame]:
     """Leaves out frames of another size than most, or whose depth is."""
     sizes = [frame.size for frame in frames if frame.lens is None]
     usual = max(sizes, key=sizes.count, default=None)
@@ -176,7 +178,7 @@ def _size_message(file: Path, size: tuple[int, int], wanted: tuple[int, int]) ->
     )
 
 
-def _sized(array: NDArray, file: Path, size: tuple[int, int]) -> NDArray:
+def _require_size(array: NDArray, file: Path, size: tuple[int, int]) -> NDArray:
     if array.shape[1::-1] != size:
         raise ValueError(_size_message(file, array.shape[1::-1], size))
     return array

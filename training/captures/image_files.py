@@ -66,7 +66,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     """Returns an image as (H, W, 3) red, green, blue; raises ValueError if it is unreadable."""
     # The pixels as they are stored: poses and intrinsics belong to them, not to the turned picture.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    return cv2.cvtColor(_decoded(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
+    return cv2.cvtColor(_decode(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
 
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
@@ -85,7 +85,7 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
             reason = _reason(error)
             raise ValueError(f"{file}: not a readable array ({reason}); copy it again") from None
     else:
-        raw = _decoded(file, cv2.IMREAD_UNCHANGED)
+        raw = _decode(file, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype == np.uint8:
         raise ValueError(
             f"{file}: a {raw.dtype} array of shape {raw.shape} is no depth; rows and columns of "
@@ -94,18 +94,18 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     depth = raw.astype(np.float32) / np.float32(unit)
     if raw.dtype == np.uint16:
         depth[raw == 65535] = 0
-    return _cleaned(depth)
+    return _clean(depth)
 
 
 def read_packed_depth(file: Path) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from a PNG whose four channels hold the bytes of a float32."""
-    raw = _decoded(file, cv2.IMREAD_UNCHANGED)
+    raw = _decode(file, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 3 or raw.shape[2] != 4 or raw.dtype != np.uint8:
         raise ValueError(
             f"{file}: a {raw.dtype} array of shape {raw.shape}; four channels of 8 bits, the bytes "
             "of 32-bit depth, are needed"
         )
-    return _cleaned(np.ascontiguousarray(raw).view("<f4")[..., 0].copy())
+    return _clean(np.ascontiguousarray(raw).view("<f4")[..., 0].copy())
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
@@ -126,12 +126,12 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return dict(sorted(files.items()))
 
 
-def _cleaned(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+def _clean(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     depth[np.isnan(depth) | (depth < 0)] = 0
     return depth
 
 
-def _decoded(file: Path, flags: int) -> NDArray:
+def _decode(file: Path, flags: int) -> NDArray:
     raw = np.fromfile(file, dtype=np.uint8)
     image = cv2.imdecode(raw, flags) if len(raw) else None
     if image is None:

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import minimize
 
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.frame_agreement import FramePair, Reading, agreement_of
+from splatpilot.training.captures.frame_agreement import FramePair, Reading, measure_reading
 
 _BODIES = {
     "optical axes (x right, y down, z forward)": np.eye(3),
@@ -20,7 +20,7 @@ _BODIES = {
 }
 
 
-def other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
+def undo_mistakes(as_read: Reading, capture: Capture) -> list[Reading]:
     """Returns the readings with one known mistake each undone; their names say the mistake."""
     present = next(
         (name for name, R in _BODIES.items() if np.allclose(R, as_read.R_BC.matrix())), "its axes"
@@ -50,9 +50,7 @@ def other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
         )
     for axis, S in zip("xyz", 1 - 2 * np.eye(3), strict=True):
         readings.append(
-            replace(
-                as_read, name=f"the world is left-handed: {axis} is mirrored", pose=_mirrored(S)
-            )
+            replace(as_read, name=f"the world is left-handed: {axis} is mirrored", pose=_mirror(S))
         )
     for name, M in (
         ("east and north", [[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
@@ -63,7 +61,7 @@ def other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
             replace(
                 as_read,
                 name=f"positions and rotations are in different worlds: {name} differ",
-                pose=_moved(np.array(M, dtype=float)),
+                pose=_move(np.array(M, dtype=float)),
             )
         )
     for factor in (0.001, 0.01, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 100.0, 1000.0):
@@ -89,7 +87,7 @@ def other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
     return readings
 
 
-def fitted_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
+def fit_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
     """Returns readings whose focal length, or principal point, fits best."""
 
     def focal(x: NDArray) -> Reading:
@@ -107,7 +105,7 @@ def fitted_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Readin
     for make, size, step in ((focal, 1, 0.1), (principal, 2, 0.05)):
         simplex = np.concatenate([np.zeros((1, size)), step * np.eye(size)])
         result = minimize(
-            lambda x, make=make: min(agreement_of(make(x), pairs).error, 1.0),
+            lambda x, make=make: min(measure_reading(make(x), pairs).error, 1.0),
             np.zeros(size),
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-6, "maxfev": 80},
@@ -122,12 +120,12 @@ def _from_wxyz(X_FB: RigidTransform) -> RigidTransform:
     return RigidTransform(Quaternion(np.array([x, y, z, w])), X_FB.translation())
 
 
-def _mirrored(S: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
+def _mirror(S: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
     M = np.diag(S)
     return lambda X_FB: RigidTransform(
         RotationMatrix(M @ X_FB.rotation().matrix() @ M), M @ X_FB.translation()
     )
 
 
-def _moved(M: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
+def _move(M: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
     return lambda X_FB: RigidTransform(X_FB.rotation(), M @ X_FB.translation())

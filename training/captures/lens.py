@@ -44,6 +44,21 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
+def back_project(
+    K: NDArray[np.float64], u: NDArray, v: NDArray, depth: NDArray
+) -> NDArray[np.floating]:
+    """Returns the points p_CQ (..., 3) that a pinhole camera sees.
+
+    Args:
+        K: (3, 3) [px].
+        u, v: (...) [px], image coordinates.
+        depth: (...) [m], along the optical axis.
+    """
+    x = (u - K[0, 2]) / K[0, 0] * depth
+    y = (v - K[1, 2]) / K[1, 1] * depth
+    return np.stack([x, y, depth], axis=-1)
+
+
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float]
 ) -> Lens:

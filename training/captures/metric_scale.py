@@ -9,13 +9,18 @@ from pydrake.math import RotationMatrix
 
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import ScaleConfig
-from splatpilot.training.captures.upright import fit_ground, known_points, turned, up_of_cameras
+from splatpilot.training.captures.upright import (
+    fit_ground,
+    known_points,
+    turn_and_scale,
+    up_of_cameras,
+)
 
 _FEWEST = 20
 """Points whose depth must be known for a scale."""
 
 
-def made_metric(
+def make_metric(
     capture: Capture,
     scale: ScaleConfig,
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
@@ -37,7 +42,7 @@ def made_metric(
     if scale.factor:
         factor = scale.factor
     elif scale.distance:
-        a, b = (_located(capture, each, locate) for each in scale.between)
+        a, b = (_locate(capture, each, locate) for each in scale.between)
         if (length := float(np.linalg.norm(a - b))) < 1e-9:
             raise ValueError(f"scale.between: {' and '.join(scale.between)} are the same place")
         factor = scale.distance / length
@@ -46,10 +51,10 @@ def made_metric(
     else:
         factor = _factor_from_depth(capture)
     source = f"{capture.source}, scale {factor:.6g} from {given[0]}"
-    return dataclasses.replace(turned(capture, RotationMatrix(), factor), source=source)
+    return dataclasses.replace(turn_and_scale(capture, RotationMatrix(), factor), source=source)
 
 
-def _located(
+def _locate(
     capture: Capture,
     what: str,
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None,

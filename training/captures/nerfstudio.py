@@ -21,9 +21,9 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import depth_size, image_size, read_depth
 from splatpilot.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
-from splatpilot.training.captures.metric_scale import made_metric
+from splatpilot.training.captures.metric_scale import make_metric
 from splatpilot.training.captures.poses import pose_from_matrix
-from splatpilot.training.captures.upright import raised
+from splatpilot.training.captures.upright import turn_upright
 
 TRANSFORMS = "transforms.json"
 
@@ -86,8 +86,8 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
     if points := content.get("ply_file_path"):
         capture = dataclasses.replace(capture, points=_read_points(path / points))
     if config.scale.given() or not capture.has_depth:
-        capture = made_metric(capture, config.scale)
-    return raised(capture, config.up or "z")
+        capture = make_metric(capture, config.scale)
+    return turn_upright(capture, config.up or "z")
 
 
 def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:

@@ -1,10 +1,11 @@
 """Opens a capture of any known kind."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.capture_config import CaptureConfig, completed_config
+from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.colmap import model_folder, read_colmap
 from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstudio
 from splatpilot.training.captures.photographs import photographs_in, read_photographs
@@ -70,11 +71,12 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     path = Path(path)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder; a capture is a folder")
-    config = completed_config(path, config)
+    said = config or CaptureConfig()
+    config = complete_config(path, said)
     if config.kind and config.kind not in _KINDS:
         raise ValueError(f"capture.kind is {config.kind!r}; known are {', '.join(KINDS)}")
     for kind, (fits, read, _) in _KINDS.items():
         if config.kind == kind or (not config.kind and fits(path)):
-            return read(path, config)
+            return replace(read(path, config), folder=str(path.absolute()), config=said)
     known = ", ".join(description for _, _, description in _KINDS.values())
     raise ValueError(f"{path}: no capture of a known kind; known are {known}")

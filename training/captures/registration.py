@@ -16,6 +16,7 @@ from pydrake.math import RigidTransform
 from scipy.optimize import minimize
 
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.lens import back_project
 
 _POINTS = 3000
 """About how many pixels of an image are compared."""
@@ -70,7 +71,7 @@ def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Colo
     depth_camera = capture.depth_camera
     K_D = capture.K if depth_camera is None else depth_camera.K
     X_DC = RigidTransform() if depth_camera is None else depth_camera.X_CD.inverse()
-    colored = [pair for i, j in pairs if (pair := _colored_pair(capture, K_D, X_DC, i, j))]
+    colored = [pair for i, j in pairs if (pair := _color_pair(capture, K_D, X_DC, i, j))]
     if not colored:
         return None
 
@@ -107,7 +108,7 @@ def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Colo
     return ColorFit(as_read, float(fit.fun), focal_length, (x, y), mistake)
 
 
-def _colored_pair(
+def _color_pair(
     capture: Capture, K_D: NDArray[np.float64], X_DC: RigidTransform, i: int, j: int
 ) -> _ColoredPair | None:
     """Returns the points of frame i that frame j sees too, in both depth cameras."""
@@ -119,13 +120,7 @@ def _colored_pair(
     z = a[rows, columns].astype(np.float64)
     known = (z > 0) & np.isfinite(z)
     z, rows, columns = z[known], rows[known], columns[known]
-    p_DQ = np.stack(
-        [
-            (columns + 0.5 - K_D[0, 2]) / K_D[0, 0] * z,
-            (rows + 0.5 - K_D[1, 2]) / K_D[1, 1] * z,
-            z,
-        ]
-    )
+    p_DQ = back_project(K_D, columns + 0.5, rows + 0.5, z).T
     X_WDs = [capture.X_WCs[k] @ X_DC.inverse() for k in (i, j)]
     q = (X_WDs[1].inverse() @ X_WDs[0]).multiply(p_DQ)
     with np.errstate(divide="ignore", invalid="ignore"):

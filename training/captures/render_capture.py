@@ -12,13 +12,14 @@ from pydrake.math import RigidTransform
 from tqdm import tqdm
 
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.gltf import write_gltf
 from splatpilot.diagrams.worlds.make_world import is_procedural, make_blueprint
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
-from splatpilot.training.captures.camera_path import beside, poses_along, resampled, visiting_path
+from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
 from splatpilot.training.captures.tartanair import AXES
@@ -95,15 +96,17 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     interruption, it goes on from there. A capture that is there already is left as it is.
 
     Args:
-        world: a mesh (.gltf or .obj), or a scenario (.yaml) whose world is procedural: that world
-            is exported, with what `seed` draws, as `world.gltf` into the capture.
+        world: a mesh (.gltf or .obj), or a scenario whose world is procedural, one of the
+            benchmark's ("P02") or a file (.yaml): that world is exported, with what `seed` draws,
+            as `world.gltf` into the capture.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a world or settings that cannot be rendered, a
             path through walls, something else in `out`, or a full disk.
     """
     config.validate()
-    out, world = Path(out).absolute(), Path(world).absolute()
+    out = Path(out).absolute()
+    world = benchmark_scenarios().get(str(world)) or Path(world).absolute()
     partial = out.with_name(f".{out.name}.partial")
     blueprint = None
     if world.suffix in (".yaml", ".yml"):
@@ -149,7 +152,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
 
     _write_frames(partial, "rendering", X_WCs, view)
     for offset in config.offsets:
-        moved = [beside(X_WC, offset) for X_WC in X_WCs]
+        moved = [move_left(X_WC, offset) for X_WC in X_WCs]
         room = [X_WC for X_WC in moved if _has_room(esdf, X_WC.translation(), config.clearance)]
         _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", room, view)
     if out.exists():
@@ -224,7 +227,7 @@ def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
     if config.path:
         X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
         stops = np.array([X_WC.translation() for X_WC in X_WCs])
-        for p_W in resampled(stops, esdf.voxel_size / 2):
+        for p_W in resample(stops, esdf.voxel_size / 2):
             if not _has_room(esdf, p_W, min(config.clearance, esdf.voxel_size)):
                 raise ValueError(
                     f"the path touches something at {np.round(p_W, 2).tolist()} m; lead it around"

@@ -18,7 +18,7 @@ from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import numbered_files, read_depth
 from splatpilot.training.captures.lens import Lens, pinhole
 from splatpilot.training.captures.poses import pose_from_matrix, read_rows
-from splatpilot.training.captures.upright import raised
+from splatpilot.training.captures.upright import turn_upright
 
 # fx, fy, cx, cy [px] at 640x480, and the colour camera's position in the depth camera [m].
 _COLOR = (523.0, 523.0, 320.0, 240.0)
@@ -80,4 +80,4 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         read_depth=lambda file: read_depth(file, unit),
         depth_camera=depth_camera,
     )
-    return raised(capture, config.up or "cameras")
+    return turn_upright(capture, config.up or "cameras")

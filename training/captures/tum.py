@@ -18,7 +18,7 @@ from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import read_depth
 from splatpilot.training.captures.lens import Lens, opencv_lens, pinhole
 from splatpilot.training.captures.poses import pose_from_quaternion, read_rows
-from splatpilot.training.captures.upright import raised
+from splatpilot.training.captures.upright import turn_upright
 
 _MAX_APART = 0.02
 """[s] between a colour image and its depth, as the data set's own tools have it."""
@@ -90,7 +90,7 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
         read_depth=lambda file: read_depth(file, unit),
         dropped=dropped if alone else (),
     )
-    return raised(capture, config.up or "z")
+    return turn_upright(capture, config.up or "z")
 
 
 def _frame(

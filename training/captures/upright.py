@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints
+from splatpilot.training.captures.lens import back_project
 
 # How much cameras that look level count against images that are level.
 _LEVEL_GAZE = 0.01
@@ -98,7 +99,7 @@ def fit_ground(
     return n, float(d)
 
 
-def raised(capture: Capture, up: str) -> Capture:
+def turn_upright(capture: Capture, up: str) -> Capture:
     """Turns the world of a capture so that z is up.
 
     Args:
@@ -117,10 +118,10 @@ def raised(capture: Capture, up: str) -> Capture:
             direction, _ = fit_ground(known_points(capture), cameras, direction)
     else:
         direction = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
-    return turned(capture, _turn_to_z(direction))
+    return turn_and_scale(capture, _turn_to_z(direction))
 
 
-def turned(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -> Capture:
+def turn_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -> Capture:
     """Returns the capture in a world N, turned and with lengths times `scale`; not its depth."""
     points, axes = capture.points, capture.axes
     return dataclasses.replace(
@@ -146,10 +147,8 @@ def known_points(capture: Capture) -> NDArray[np.float64]:
     for i in np.unique(np.linspace(0, len(capture) - 1, 20).astype(int)).tolist():
         depth = capture.registered_depth(i)[::16, ::16]
         rows, columns = np.nonzero((depth > 0) & np.isfinite(depth))
-        z = depth[rows, columns]
-        x = (16 * columns + 0.5 - capture.K[0, 2]) / capture.K[0, 0] * z
-        y = (16 * rows + 0.5 - capture.K[1, 2]) / capture.K[1, 1] * z
-        parts.append(capture.X_WCs[i].multiply(np.stack([x, y, z]).astype(float)).T)
+        p_CQ = back_project(capture.K, 16 * columns + 0.5, 16 * rows + 0.5, depth[rows, columns])
+        parts.append(capture.X_WCs[i].multiply(p_CQ.T).T)
     if not sum(len(part) for part in parts):
         raise ValueError(
             f"{capture.source}: neither points nor depth are known, so no ground can be found; set "

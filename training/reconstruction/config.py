@@ -1,13 +1,13 @@
 """How a capture becomes a scene."""
 
-import os
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from splatpilot.diagrams.worlds.scene_metadata import REPRESENTATIONS
+from splatpilot.systems.cores import available_cores
 from splatpilot.training.captures.capture_config import CaptureConfig
 
-REPRESENTATIONS = ("3dgs", "2dgs")
 INITIALIZATIONS = ("auto", "depth", "points", "random")
 STRATEGIES = ("auto", "none", "default", "mcmc")
 DISTANCE_FIELDS = ("rendered", "captured")
@@ -124,7 +124,7 @@ class ReconstructConfig:
 
     @property
     def renderer_threads(self) -> int:
-        return self.threads or len(os.sched_getaffinity(0))
+        return self.threads or available_cores()
 
     def validate(self) -> None:
         """Raises ValueError for values that make no sense."""

@@ -101,7 +101,7 @@ class DefaultStrategy:
         parts = slice(len(double), None)
         random = torch.randn((len(split), 3), generator=generator).to(splats["means"].device)
         offset = random * splats.scales[split]
-        added["means"][parts] += rotated(splats["quats"][split], offset)
+        added["means"][parts] += rotate(splats["quats"][split], offset)
         added["log_scales"][parts] -= torch.log(torch.tensor(_SPLIT_SHRINK))
         splats.rebuild(torch.nonzero(~(grow & large))[:, 0], added)
 
@@ -112,7 +112,7 @@ class DefaultStrategy:
         splats.rebuild(torch.nonzero(~bad)[:, 0])
 
 
-def rotated(quats: Tensor, vectors: Tensor) -> Tensor:
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     """Returns the vectors (N, 3) turned by the quaternions (N, 4) wxyz of any length but zero."""
     q = torch.nn.functional.normalize(quats, dim=1)
     w, axis = q[:, :1], q[:, 1:]

@@ -47,7 +47,7 @@ class Cells:
         """Returns some of the cells."""
         return Cells(**{field.name: getattr(self, field.name)[mask] for field in fields(self)})
 
-    def moved_back(self, factor: NDArray[np.float64]) -> "Cells":
+    def move_back(self, factor: NDArray[np.float64]) -> "Cells":
         """Returns the same cells on surfaces `factor` (n,) times as far away."""
         w, w_u, w_v = (slope / factor for slope in (self.w, self.w_u, self.w_v))
         return replace(self, w=w, w_u=w_u, w_v=w_v)
@@ -151,7 +151,7 @@ def frame_gaussians(
     # Gaussians are drawn in order of the depths of their centres, so an underlay must be farther
     # than the surface of the neighbouring cells.
     across = under.size * np.hypot(under.w_u, under.w_v) / under.w
-    under = under.moved_back(1 + _UNDERLAY_SETBACK + np.minimum(0.75 * across, _MAX_SETBACK))
+    under = under.move_back(1 + _UNDERLAY_SETBACK + np.minimum(0.75 * across, _MAX_SETBACK))
     p_WQ, covariances = cell_gaussians(frame, surface, _SPREAD)
     p_WU, under_covariances = cell_gaussians(frame, under, _UNDERLAY_SPREAD)
     return (

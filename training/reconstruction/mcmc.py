@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.densification import rotated
+from splatpilot.training.reconstruction.densification import rotate
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering
 
@@ -51,7 +51,7 @@ class McmcStrategy:
         # Covariance times noise, in the Gaussian's own axes.
         q = splats["quats"]
         inverse = q * q.new_tensor([1.0, -1.0, -1.0, -1.0])
-        splats["means"].add_(rotated(q, splats.scales**2 * rotated(inverse, noise)))
+        splats["means"].add_(rotate(q, splats.scales**2 * rotate(inverse, noise)))
 
     def state(self) -> dict[str, Tensor]:
         """Nothing: all random numbers follow from the step."""
@@ -82,7 +82,7 @@ def penalty(splats: SplatParameters) -> Tensor:
     return _OPACITY_PENALTY * splats.opacities.mean() + _SCALE_PENALTY * splats.scales.mean()
 
 
-def shared(opacities: Tensor, scales: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+def share_out(opacities: Tensor, scales: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     """Returns opacities (N,) and scales (N, 3) with which `counts` (N,) Gaussians in one place look
     as nearly as can be like the one with those given (equation 9 of the paper).
 
@@ -117,6 +117,6 @@ def _share(splats: SplatParameters, chosen: Tensor) -> None:
     """Gives each of the chosen Gaussians, which are to be copied as often as they occur, its part
     of what it was."""
     rows, copies = torch.unique(chosen, return_counts=True)
-    opacities, scales = shared(splats.opacities[rows], splats.scales[rows], copies + 1)
+    opacities, scales = share_out(splats.opacities[rows], splats.scales[rows], copies + 1)
     splats.overwrite("logit_opacities", torch.logit(opacities.clamp(1e-6, 1 - 1e-6)), rows)
     splats.overwrite("log_scales", torch.log(scales), rows)

@@ -1,5 +1,6 @@
 """How far rendered views are from what a camera saw: in colour, in depth and in floaters."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,10 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.losses import photometric_loss
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.splat_rendering import render
+from splatpilot.training.reconstruction.vignette import vignette
 
 NEAR, FAR = 1e-3, 150.0
 """[m], true depths that count: the range of `log_depth_loss`."""
@@ -33,6 +34,28 @@ class ViewMeasures:
     depth_relative: float | None  # mean of |error| / true depth
     floater_fraction: float | None  # of the pixels with true depth
     gain: float  # brightness of the true image relative to the scene
+
+
+@dataclass(frozen=True)
+class HeldOutMeasures:
+    """The frames that were withheld from a reconstruction, against what it shows."""
+
+    views: tuple[ViewMeasures, ...]
+
+    def means(self) -> dict[str, float]:
+        """Returns the mean PSNR and, where there is depth, the mean depth error, by name."""
+        found = {name: mean_measure(self.views, name) for name in ("psnr_db", "depth_mae_m")}
+        return {name: value for name, value in found.items() if value is not None}
+
+    def __str__(self) -> str:
+        units = {"psnr_db": "{:.2f} dB", "depth_mae_m": "{:.4f} m"}
+        return ", ".join(units[name].format(value) for name, value in self.means().items())
+
+
+def mean_measure(views: Iterable[ViewMeasures], name: str) -> float | None:
+    """Returns the mean of a measure over the views that have it; None if none has."""
+    known = [value for view in views if (value := getattr(view, name)) is not None]
+    return float(np.mean(known)) if known else None
 
 
 def psnr_db(image: NDArray, truth: NDArray) -> float:
@@ -99,13 +122,6 @@ def floater_fraction(depth: NDArray, alpha: NDArray, truth: NDArray) -> float | 
     return float(floaters(depth, alpha, truth).sum() / count) if count else None
 
 
-def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
-    """Returns the brightness (H, W) of an image relative to its centre, see `Photometry`."""
-    y = (np.arange(height) + 0.5 - height / 2)[:, None]
-    x = np.arange(width) + 0.5 - width / 2
-    return np.exp(vignetting * (x**2 + y**2) / ((height**2 + width**2) / 4))
-
-
 def fit_exposure(color: NDArray, truth: NDArray, vignetting: float) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) as the camera would have exposed it, and the gain.
 
@@ -121,31 +137,42 @@ def fit_exposure(color: NDArray, truth: NDArray, vignetting: float) -> tuple[NDA
 
 
 def measure_view(
-    view: RenderedView, frame: CaptureFrame, vignetting: float = 0.0, lpips: Lpips | None = None
+    view: RenderedView,
+    image: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    vignetting: float = 0.0,
+    lpips: Lpips | None = None,
 ) -> ViewMeasures:
-    """Compares a rendered view with the frame of its camera, of the same size.
+    """Compares a rendered view with what its camera saw.
 
     Colours are compared as `fit_exposure` exposes them.
+
+    Args:
+        view: what was rendered.
+        image: (H, W, 3), the true image, of the same size.
+        depth: (H, W) [m], the true depth.
+        vignetting: of the capture, see `vignette`.
+        lpips: the perceptual distance; None leaves it out.
     """
-    truth = frame.image / 255
-    image, gain = fit_exposure(view.color, truth, vignetting)
+    truth = image / 255
+    exposed, gain = fit_exposure(view.color, truth, vignetting)
     distance = None
     if lpips is not None:
         with torch.no_grad():
-            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (image, truth))
+            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth))
             distance = lpips(a, b).item()
     return ViewMeasures(
-        psnr_db=psnr_db(image, truth),
-        ssim=ssim(image, truth),
+        psnr_db=psnr_db(exposed, truth),
+        ssim=ssim(exposed, truth),
         lpips=distance,
-        depth_mae_m=depth_mae_m(view.depth, frame.depth),
-        depth_relative=depth_relative(view.depth, frame.depth),
-        floater_fraction=floater_fraction(view.depth, view.alpha, frame.depth),
+        depth_mae_m=depth_mae_m(view.depth, depth),
+        depth_relative=depth_relative(view.depth, depth),
+        floater_fraction=floater_fraction(view.depth, view.alpha, depth),
         gain=gain,
     )
 
 
-class ViewRenderer:
+class SceneRenderer:
     """Renders a scene as what it is: Gaussians ("3dgs") or surfels ("2dgs")."""
 
     def __init__(self, scene: GaussianScene, representation: str, threads: int = 1):

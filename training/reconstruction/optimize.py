@@ -1,25 +1,27 @@
 """Fitting Gaussians to images and depth: the paper's equations 1 and 2, step by step."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.event_log import event_log
 from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.densification import DefaultStrategy
-from splatpilot.training.reconstruction.held_out import HeldOutFigures, measure_held_out
 from splatpilot.training.reconstruction.losses import log_depth_loss, photometric_loss
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
+from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
+from splatpilot.training.reconstruction.photometry import fit_gain
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
+from splatpilot.training.torch_threads import one_torch_thread
 
 # The learning rate of the means falls to this fraction.
 _LAST_RATE = 0.01
@@ -60,7 +62,7 @@ class Optimization:
         self._background = torch.tensor([background], device=config.device)  # (1, 3)
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
-        self.center, self.extent = extent_of_cameras(views)
+        self.center, self.extent = views.extent()
         rates = {
             "means": config.means_rate * self.extent,
             "quats": config.quats_rate,
@@ -72,13 +74,14 @@ class Optimization:
         kept = checkpoint.load()
         if kept is None:
             self.step = 0
+            self.gains = views.gains
             self.splats = SplatParameters.of_scene(
                 initial(), config.sh_degree, rates, config.device
             )
         else:
             self.step = kept["step"]
             self.splats = SplatParameters(**kept["splats"], rates=rates)
-            views.gains = kept["gains"]
+            self.gains = kept["gains"]
         self._strategy = self._make_strategy()
         if kept is not None and self._strategy is not None:
             self._strategy.restore(kept["strategy"])
@@ -89,7 +92,7 @@ class Optimization:
         Raises:
             OSError: if a checkpoint cannot be written.
         """
-        config = self._config
+        config, splats = self._config, self.splats
         progress = tqdm(
             total=config.iterations,
             initial=self.step,
@@ -102,13 +105,10 @@ class Optimization:
                 self.take_step()
                 progress.update()
                 if self.step % config.measure_every == 0:
-                    figures = self.measure()
-                    log(
-                        self.step,
-                        {"gaussians": len(self.splats), **(figures.scalars() if figures else {})},
-                    )
+                    found = self.measure()
+                    log(self.step, {"gaussians": len(splats), **(found.means() if found else {})})
                     progress.set_postfix_str(
-                        f"{len(self.splats)} Gaussians" + (f", {figures}" if figures else "")
+                        f"{len(splats)} Gaussians" + (f", {found}" if found else "")
                     )
                 if self.step % config.checkpoint_every == 0 or self.step == config.iterations:
                     self._save()
@@ -149,17 +149,18 @@ class Optimization:
             self._strategy.refine(self.step, splats)
 
     @torch.no_grad()
-    def measure(self) -> HeldOutFigures | None:
+    def measure(self) -> HeldOutMeasures | None:
         """Measures the Gaussians as they are on the withheld frames, if there are any."""
-        if self._held_out is None:
+        views = self._held_out
+        if views is None:
             return None
-        return measure_held_out(
-            self._config.representation,
-            self._gaussians(),
-            self._held_out,
-            self._background,
-            self._config.renderer_threads,
-        )
+        found = []
+        for k in range(len(views)):
+            seen = self._render(views, k)
+            images = (image.cpu().numpy() for image in (seen.color, seen.depth, seen.alpha))
+            truth = views.images[k].numpy(), views.depths[k].numpy()
+            found.append(measure_view(RenderedView(*images), *truth, views.vignetting))
+        return HeldOutMeasures(tuple(found))
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         splats = self.splats
@@ -168,19 +169,31 @@ class Optimization:
     @torch.no_grad()
     def _fit_gains(self) -> None:
         """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
-        gains = measure_held_out(
+        views = self._views
+        gains = [
+            fit_gain(self._render(views, k).color.cpu() * views.vignette[..., None], image)
+            for k, image in ((k, views.images[k] / 255) for k in range(len(views)))
+        ]
+        log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
+        self.gains = torch.exp(log_gains - log_gains.mean())
+
+    def _render(self, views: ReconstructionViews, k: int) -> Rendering:
+        """Renders the Gaussians as view k sees them, with expected depth."""
+        return render(
             self._config.representation,
             self._gaussians(),
-            self._views,
-            self._background,
-            self._config.renderer_threads,
-        ).gains
-        log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
-        self._views.gains = torch.exp(log_gains - log_gains.mean())
+            views.viewmats[k : k + 1].to(self._background.device),
+            views.K.to(self._background.device),
+            views.width,
+            views.height,
+            background=self._background,
+            depth_mode="ED",
+            threads=self._config.renderer_threads,
+        )
 
     def _loss(self, rendering: Rendering, k: int, part: float) -> Tensor:
         config, device = self._config, self._config.device
-        target = self._views.target(k).to(device)
+        target = self._views.target(k, self.gains[k]).to(device)
         loss = photometric_loss(rendering.color, target, config.ssim_weight)
         if config.depth_weight > 0:
             loss = loss + config.depth_weight * log_depth_loss(
@@ -223,27 +236,6 @@ class Optimization:
                 "step": self.step,
                 "splats": state,
                 "strategy": strategy,
-                "gains": self._views.gains,
+                "gains": self.gains,
             }
         )
-
-
-def extent_of_cameras(views: ReconstructionViews) -> tuple[np.ndarray, float]:
-    """Returns the mean position (3,) [m] of the cameras and 1.1 times the largest distance from it
-    [m], by which learning rates and sizes are scaled; 1 m if they all stand in one place."""
-    positions = views.positions
-    center = positions.mean(axis=0)
-    extent = 1.1 * float(np.linalg.norm(positions - center, axis=1).max())
-    return center, extent if extent > 1e-6 else 1.0
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """torch's own sums depend on its number of threads, and what little it does here gains nothing
-    by more; the renderer has its own."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -1,6 +1,6 @@
 """Which pixels of different frames of a capture show the same point of the place."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
-from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.lens import back_project
+from splatpilot.training.reconstruction.vignette import radius_squared
 
 STRIDE = 2
 """Views keep every second pixel along each axis."""
@@ -21,7 +23,7 @@ _COARSER = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ThinnedFrame:
     """A frame thinned to what the comparison of frames needs; (h, w) = (H, W) / `STRIDE`."""
 
     X_WC: RigidTransform
@@ -33,7 +35,7 @@ class View:
     radius_squared: NDArray[np.floating]  # (h, w), squared distance from the image centre; corner 1
 
     @classmethod
-    def of(cls, frame: CaptureFrame) -> "View":
+    def of(cls, frame: CaptureFrame) -> "ThinnedFrame":
         """Thins `frame`."""
         thin = (slice(None, None, STRIDE), slice(None, None, STRIDE))
         height, width = frame.depth.shape
@@ -46,10 +48,6 @@ class View:
         # is turned away from the ray by about f z |dw|.
         slope = depth * np.hypot(w_u, w_v)  # relative change of depth a pixel
         f = frame.K[0, 0]
-        rows, columns = np.mgrid[0:height:STRIDE, 0:width:STRIDE]
-        rho = ((columns + 0.5 - width / 2) ** 2 + (rows + 0.5 - height / 2) ** 2) / (
-            (width**2 + height**2) / 4
-        )
         return cls(
             X_WC=frame.X_WC,
             K=frame.K,
@@ -57,7 +55,7 @@ class View:
             tolerance=depth * (_DEPTH_TOLERANCE + np.minimum(STRIDE * slope, 0.1)),
             pixel_size=depth / f * np.minimum(np.hypot(1, f * slope), 10),
             luminance=frame.image[thin].mean(-1) / 255,
-            radius_squared=rho.astype(np.float32),
+            radius_squared=radius_squared(width, height)[thin].astype(np.float32),
         )
 
     def points(self, step: int = 1) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
@@ -67,9 +65,8 @@ class View:
         index = (rows * w + columns).ravel()
         index = index[self.depth.flat[index] > 0]
         z = self.depth.flat[index].astype(np.float64)
-        x = (index % w * STRIDE + 0.5 - self.K[0, 2]) / self.K[0, 0] * z
-        y = (index // w * STRIDE + 0.5 - self.K[1, 2]) / self.K[1, 1] * z
-        return self.X_WC.multiply(np.stack([x, y, z])), index
+        p_CQ = back_project(self.K, index % w * STRIDE + 0.5, index // w * STRIDE + 0.5, z)
+        return self.X_WC.multiply(p_CQ.T), index
 
     def find(self, p_WQ: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Finds which of the points (3, n) this view sees.
@@ -87,12 +84,9 @@ class View:
         return number[same], index[same]
 
 
-def load_views(capture: Capture) -> Iterator[View]:
-    """Loads and thins one frame after the other."""
-    return (View.of(frame) for frame in capture.frames())
-
-
-def find_new_pixels(views: Sequence[View], last: Collection[int] = ()) -> list[NDArray[np.bool_]]:
+def find_new_pixels(
+    views: Sequence[ThinnedFrame], last: Collection[int] = ()
+) -> list[NDArray[np.bool_]]:
     """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once.
 
     Kept are pixels that are nearly the finest which any view has of their point (at most `_COARSER`
@@ -129,7 +123,7 @@ def find_new_pixels(views: Sequence[View], last: Collection[int] = ()) -> list[N
     return [new[i] for i in range(len(views))]
 
 
-def _overlapping(view: View, views: Sequence[View]) -> list[int]:
+def _overlapping(view: ThinnedFrame, views: Sequence[ThinnedFrame]) -> list[int]:
     """Returns the numbers of the views that see some of a few points of `view`."""
     p_WQ, _ = view.points(step=8)
     return [j for j, other in enumerate(views) if len(other.find(p_WQ)[0])]

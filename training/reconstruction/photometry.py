@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import lsqr
+from torch import Tensor
 
-from splatpilot.training.reconstruction.overlap import View
+from splatpilot.training.reconstruction.overlap import ThinnedFrame
+from splatpilot.training.reconstruction.vignette import vignette
 
 _SAMPLES_PER_PAIR = 100
 _BRIGHTNESS = (0.1, 0.98)  # outside, noise or saturation spoils the ratio
@@ -27,13 +29,10 @@ class Photometry:
 
     def factor(self, i: int, height: int, width: int) -> NDArray[np.float32]:
         """Returns I / S for the pixels of image i, (height, width)."""
-        y = (np.arange(height) + 0.5 - height / 2)[:, None]
-        x = np.arange(width) + 0.5 - width / 2
-        rho_squared = (x**2 + y**2) / ((height**2 + width**2) / 4)
-        return (self.gains[i] * np.exp(self.vignetting * rho_squared)).astype(np.float32)
+        return (self.gains[i] * vignette(self.vignetting, width, height)).astype(np.float32)
 
 
-def estimate_photometry(views: Sequence[View], seed: int) -> Photometry:
+def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
     """Estimates gains and vignetting from the points that two views or more show.
 
     Each such point gives one equation, log I_i - log I_j = g_i - g_j + a (rho_i^2 - rho_j^2); they
@@ -80,3 +79,11 @@ def estimate_photometry(views: Sequence[View], seed: int) -> Photometry:
         weights = 1 / np.sqrt(np.maximum(np.abs(b - A @ x), 0.01))
     log_gains = x[:n] - x[:n].mean()
     return Photometry(np.exp(log_gains), float(min(x[n], 0)))
+
+
+def fit_gain(color: Tensor, image: Tensor) -> float:
+    """Returns the factor by which `color` (H, W, 3) comes nearest to `image` in the least-squares
+    sense, over pixels that are not saturated."""
+    usable = image < _BRIGHTNESS[1]
+    x, y = color[usable].double(), image[usable].double()
+    return float((x * y).sum() / (x * x).sum().clamp(min=1e-9))

@@ -1,13 +1,11 @@
 """From a capture to a scene folder that can be flown in."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
@@ -15,33 +13,31 @@ from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.held_out import HeldOutFigures
-from splatpilot.training.reconstruction.initial_gaussians import gaussians_from_depth
-from splatpilot.training.reconstruction.initialization import detail_of, first_gaussians, resolved
+from splatpilot.training.reconstruction.initialization import (
+    detail_of,
+    gaussians_from_depth,
+    make_initial_gaussians,
+    resolve_config,
+)
 from splatpilot.training.reconstruction.lpips import Lpips
-from splatpilot.training.reconstruction.optimize import Optimization, one_torch_thread
-from splatpilot.training.reconstruction.overlap import View
+from splatpilot.training.reconstruction.measures import HeldOutMeasures
+from splatpilot.training.reconstruction.optimize import Optimization
+from splatpilot.training.reconstruction.overlap import ThinnedFrame
 from splatpilot.training.reconstruction.photometry import Photometry, estimate_photometry
 from splatpilot.training.reconstruction.scene_distance_field import (
-    DepthSource,
     FieldDifference,
-    compare_fields,
-    fuse,
-    rendered_depth,
-    unit_of,
-    with_sky,
+    make_distance_field,
 )
 from splatpilot.training.reconstruction.views import (
     ReconstructionViews,
     ShrunkFrames,
     shrink_factor,
 )
+from splatpilot.training.torch_threads import one_torch_thread
 
 
 @dataclass(frozen=True)
@@ -59,7 +55,7 @@ class ReconstructSummary:
     p_WS: NDArray[np.float64]  # (3,) [m]
     p_WG: NDArray[np.float64]  # (3,) [m]
     geodesic: float  # [m], length of the shortest path from start to goal
-    held_out: HeldOutFigures | None = None
+    held_out: HeldOutMeasures | None = None
     field_difference: FieldDifference | None = None
     warnings: tuple[str, ...] = ()
 
@@ -87,52 +83,36 @@ class ReconstructSummary:
         return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
 
 
-def run(
-    *, capture: str | Path, out: str | Path, config: ReconstructConfig, restart: bool = False
+def reconstruct(
+    capture: Capture, out: str | Path, config: ReconstructConfig, *, restart: bool = False
 ) -> ReconstructSummary:
-    """Turns the capture in a folder into the scene folder `out`, and prints a summary.
+    """Turns a capture into the scene folder `out`.
 
     While it runs, checkpoints are kept in the folder `.NAME.partial` beside `out`; run again after
     an interruption, it goes on from there and ends in the same scene, bit for bit. With `restart`
     it begins anew.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: for a damaged capture, a config that makes no sense,
-            a checkpoint of another run, or a folder `out` that cannot be written or holds something
-            else. No scene is written then.
+        ValueError, OSError: for a damaged capture, a config that makes no sense, a checkpoint of
+            another run, or a folder `out` that cannot be written or holds something else. No scene
+            is written then.
     """
+    out = Path(out)
     config.validate()
     check_scene_target(out)
-    summary = reconstruct(
-        read_capture(capture, config.capture), Path(out), config, path=str(capture), restart=restart
-    )
-    print(summary)
-    return summary
-
-
-def reconstruct(
-    capture: Capture,
-    out: Path,
-    config: ReconstructConfig,
-    *,
-    path: str = "",
-    restart: bool = False,
-) -> ReconstructSummary:
-    """Writes the scene folder `out`; see `run`. `path` says where the capture lies."""
-    config.validate()
-    config = resolved(config, capture)
+    config = resolve_config(config, capture)
     every = config.hold_out if config.iterations else 0
     held_out = list(range(0, len(capture), every)) if every else []
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
     frames = ShrunkFrames(capture, fitted, factor)
     photometry = estimate_photometry(
-        [View.of(frame) for frame in tqdm(frames, "comparing brightness", unit="frame")],
+        [ThinnedFrame.of(frame) for frame in tqdm(frames, "comparing brightness", unit="frame")],
         config.seed,
     )
     gains = np.ones(len(capture))
     checkpoint = None
-    figures = None
+    measured = None
     if config.iterations == 0:
         gains[fitted] = photometry.gains
         gaussians, background = gaussians_from_depth(frames, photometry, detail_of(config))
@@ -152,21 +132,21 @@ def reconstruct(
             views,
             withheld,
             background,
-            lambda: first_gaussians(capture, frames, photometry, views, config),
+            lambda: make_initial_gaussians(capture, frames, photometry, views, config),
             checkpoint,
-            _perceptual(config),
+            Lpips() if config.lpips_weight > 0 else None,
             fit_gains=not capture.has_depth,
         )
         optimization.run()
-        gains[fitted] = views.gains
+        gains[fitted] = optimization.gains
         gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
         with one_torch_thread():
-            figures = optimization.measure()
-        if figures is not None:
-            gains[held_out] = figures.gains
+            measured = optimization.measure()
+        if measured is not None:
+            gains[held_out] = [view.gain for view in measured.views]
         how = f"{config.representation}, {config.iterations} steps"
 
-    field, difference = _distance_field(capture, frames, gaussians, factor, config)
+    field, difference = make_distance_field(capture, frames, gaussians, config)
     p_WS, p_WG, geodesic, warnings = _start_and_goal(capture, field)
     write_scene_folder(
         out,
@@ -176,7 +156,8 @@ def reconstruct(
         vignetting=photometry.vignetting,
         metric=capture.metric,
         representation=config.representation if config.iterations else "3dgs",
-        capture=path and str(Path(path).absolute()),
+        capture=capture.folder,
+        capture_settings=capture.config.settings(),
         held_out=held_out,
         image_width=capture.width // factor if factor > 1 else 0,
     )
@@ -194,7 +175,7 @@ def reconstruct(
         p_WS=p_WS,
         p_WG=p_WG,
         geodesic=geodesic,
-        held_out=figures,
+        held_out=measured,
         field_difference=difference,
         warnings=(*capture.dropped, *warnings),
     )
@@ -219,50 +200,8 @@ def _start_and_goal(
 
 def mean_color(views: ReconstructionViews) -> tuple[float, float, float]:
     """Returns the mean colour of the images, freed of gains and vignetting, in 0 to 1."""
-    means = torch.stack([views.target(k).mean(dim=(0, 1)) for k in range(len(views))])
+    means = torch.stack(
+        [views.target(k, views.gains[k]).mean(dim=(0, 1)) for k in range(len(views))]
+    )
     red, green, blue = means.mean(dim=0).clamp(0, 1).tolist()
     return red, green, blue
-
-
-def _perceptual(config: ReconstructConfig) -> Callable[[Tensor, Tensor], Tensor] | None:
-    return Lpips() if config.lpips_weight > 0 else None
-
-
-def _distance_field(
-    capture: Capture,
-    frames: ShrunkFrames,
-    gaussians: GaussianScene,
-    factor: int,
-    config: ReconstructConfig,
-) -> tuple[Esdf, FieldDifference | None]:
-    """Fuses depth, rendered or captured; and, if the capture has depth and was optimised, compares
-    the former with that of all captured depth."""
-    every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
-    if config.iterations == 0:
-        return fuse(every, config.voxel_size, config.max_range), None
-    K = capture.K.copy()
-    K[:2] /= factor
-    rendered = rendered_depth(
-        gaussians,
-        config.representation,
-        K,
-        capture.width // factor,
-        capture.height // factor,
-        capture.X_WCs,
-        config.renderer_threads,
-    )
-    unit = unit_of(rendered, capture.metric)
-    voxel_size, max_range = config.voxel_size * unit, config.max_range * unit
-    if not capture.has_depth:
-        return fuse(rendered, voxel_size, max_range), None
-    truth = fuse(every, voxel_size, max_range)
-    field = fuse(with_sky(rendered, frames), voxel_size, max_range, (truth.lower_W, truth.upper_W))
-    difference = compare_fields(field, truth)
-    if config.distance_field == "rendered":
-        return field, difference
-    seen = DepthSource(
-        lambda k: capture.registered_depth(frames.numbers[k]),
-        capture.K,
-        [capture.X_WCs[i] for i in frames.numbers],
-    )
-    return fuse(seen, voxel_size, max_range), difference

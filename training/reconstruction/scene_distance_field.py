@@ -12,6 +12,8 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
@@ -41,7 +43,7 @@ class DepthSource:
         return float(np.median(depth)) if len(depth) else 0.0
 
 
-def rendered_depth(
+def render_depth(
     gaussians: GaussianScene,
     representation: str,
     K: NDArray[np.float64],
@@ -75,7 +77,7 @@ def rendered_depth(
     return DepthSource(load, K, X_WCs)
 
 
-def with_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
+def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
     """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
     number measured nothing within range: there the space before the sky was seen to be free."""
     places = {number: k for k, number in enumerate(frames.numbers)}
@@ -142,3 +144,46 @@ def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
         blocked=float((field.states == FieldState.OCCUPIED)[free].mean()),
         opened=float((d[occupied] > field.voxel_size).mean()),
     )
+
+
+def make_distance_field(
+    capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
+) -> tuple[Esdf, FieldDifference | None]:
+    """Returns the distance field of a reconstruction, from depth rendered or captured; and, if the
+    capture has depth and was optimised, how the former differs from that of all captured depth.
+
+    Args:
+        capture: what was seen.
+        frames: those of its frames that were fitted, as small as they were for that.
+        gaussians: what came of it.
+        config: how.
+    """
+    every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
+    if config.iterations == 0:
+        return fuse(every, config.voxel_size, config.max_range), None
+    K = capture.K.copy()
+    K[:2] /= frames.factor
+    rendered = render_depth(
+        gaussians,
+        config.representation,
+        K,
+        capture.width // frames.factor,
+        capture.height // frames.factor,
+        capture.X_WCs,
+        config.renderer_threads,
+    )
+    unit = unit_of(rendered, capture.metric)
+    voxel_size, max_range = config.voxel_size * unit, config.max_range * unit
+    if not capture.has_depth:
+        return fuse(rendered, voxel_size, max_range), None
+    truth = fuse(every, voxel_size, max_range)
+    field = fuse(add_sky(rendered, frames), voxel_size, max_range, (truth.lower_W, truth.upper_W))
+    difference = compare_fields(field, truth)
+    if config.distance_field == "rendered":
+        return field, difference
+    seen = DepthSource(
+        lambda k: capture.registered_depth(frames.numbers[k]),
+        capture.K,
+        [capture.X_WCs[i] for i in frames.numbers],
+    )
+    return fuse(seen, voxel_size, max_range), difference

@@ -36,7 +36,7 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
             image = capture.load_image(i)
             if not cv2.imwrite(str(images / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
                 raise OSError(f"{images / name}: cannot be written; is the disk full?")
-        model = _posed(capture, numbers, database, images, names)
+        model = _make_posed_model(capture, numbers, database, images, names)
         pairing = pycolmap.SequentialPairingOptions(overlap=_OVERLAP, quadratic_overlap=False)
         # One thread each: others would make the order of images and matches, and with it the last
         # digits of the points, a matter of chance.
@@ -62,7 +62,7 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
     return SfmPoints(p_WQ[order], colors[order])
 
 
-def _posed(
+def _make_posed_model(
     capture: Capture, numbers: Sequence[int], database: Path, images: Path, names: Sequence[str]
 ) -> pycolmap.Reconstruction:
     """Extracts features into the database and returns a model of the cameras, without points."""

@@ -1,6 +1,7 @@
 """The images that a reconstruction is compared with, shrunk and ready."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import overload
 
 import cv2
@@ -16,6 +17,8 @@ from splatpilot.training.reconstruction.photometry import Photometry
 
 # Depths within a pixel that differ by more than this fraction belong to different surfaces.
 _ONE_SURFACE = 0.1
+# [bytes], of colour and depth together, and what the frames of a capture may take.
+_PIXEL_SIZE, _MEMORY = 7, 1e9
 
 
 def shrink_factor(width: int, wanted: int) -> int:
@@ -60,6 +63,8 @@ def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
 class ShrunkFrames(Sequence[CaptureFrame]):
     """Some frames of a capture, shrunk by a whole factor, each loaded when asked for.
 
+    They are kept from then on, unless all of them would take more than 1 GB.
+
     Args:
         capture: what was seen.
         numbers: the frames to take.
@@ -67,7 +72,10 @@ class ShrunkFrames(Sequence[CaptureFrame]):
     """
 
     def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
-        self._capture, self.numbers, self._factor = capture, list(numbers), factor
+        self._capture, self.numbers, self.factor = capture, list(numbers), factor
+        pixels = len(self.numbers) * (capture.width // factor) * (capture.height // factor)
+        small = pixels * _PIXEL_SIZE <= _MEMORY
+        self._load = cache(self._load_and_shrink) if small else self._load_and_shrink
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -78,8 +86,11 @@ class ShrunkFrames(Sequence[CaptureFrame]):
     def __getitem__(self, k: slice) -> "ShrunkFrames": ...
     def __getitem__(self, k):
         if isinstance(k, slice):
-            return ShrunkFrames(self._capture, self.numbers[k], self._factor)
-        return shrink(self._capture.frame(self.numbers[k]), self._factor)
+            return ShrunkFrames(self._capture, self.numbers[k], self.factor)
+        return self._load(range(len(self))[k])
+
+    def _load_and_shrink(self, k: int) -> CaptureFrame:
+        return shrink(self._capture.frame(self.numbers[k]), self.factor)
 
 
 class ReconstructionViews:
@@ -103,6 +114,7 @@ class ReconstructionViews:
         self.viewmats = torch.stack(viewmats)  # (n, 4, 4) X_CW
         self.K = torch.from_numpy(frames[0].K).float()[None]  # (1, 3, 3) [px]
         self.height, self.width = self.depths.shape[1:]
+        self.vignetting = photometry.vignetting
         self.gains = torch.from_numpy(photometry.gains).float()  # (n,)
         vignette = photometry.factor(0, self.height, self.width) / photometry.gains[0]
         self.vignette = torch.from_numpy(vignette).float()  # (H, W)
@@ -110,17 +122,16 @@ class ReconstructionViews:
     def __len__(self) -> int:
         return len(self.images)
 
-    @property
-    def positions(self) -> NDArray[np.float64]:
-        """(n, 3) [m], p_WC."""
+    def extent(self) -> tuple[NDArray[np.float64], float]:
+        """Returns the mean position (3,) [m] of the cameras and 1.1 times the largest distance from
+        it [m], by which learning rates and sizes are scaled; 1 m if all stand in one place."""
         X_CWs = self.viewmats.double().numpy()
-        return -np.einsum("nji,nj->ni", X_CWs[:, :3, :3], X_CWs[:, :3, 3])
+        p_WCs = -np.einsum("nji,nj->ni", X_CWs[:, :3, :3], X_CWs[:, :3, 3])
+        center = p_WCs.mean(axis=0)
+        extent = 1.1 * float(np.linalg.norm(p_WCs - center, axis=1).max())
+        return center, extent if extent > 1e-6 else 1.0
 
-    def image(self, k: int) -> Tensor:
-        """(H, W, 3) in 0 to 1, as it was taken."""
-        return self.images[k] / 255
-
-    def target(self, k: int) -> Tensor:
+    def target(self, k: int, gain: Tensor) -> Tensor:
         """(H, W, 3), the image freed of its gain and vignetting: what the scene should look like,
         about 0 to 1."""
-        return self.images[k] * (1 / (255 * self.gains[k] * self.vignette))[..., None]
+        return self.images[k] * (1 / (255 * gain * self.vignette))[..., None]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.fidelity.off_path import choose_withheld, displaced_poses, without
+from splatpilot.analysis.fidelity.off_path import choose_withheld, displace_pose, drop_frames
 
 
 def test_withheld_stretches():
@@ -15,7 +15,7 @@ def test_withheld_stretches():
 
 def test_capture_without_frames(place):
     """The rest of a capture has the other frames, in order, with their images and depths."""
-    rest = without(place.capture, [0, 2, 3])
+    rest = drop_frames(place.capture, [0, 2, 3])
     assert len(rest) == 13
     for k, i in ((0, 1), (1, 4), (12, 15)):
         assert rest.X_WCs[k] is place.capture.X_WCs[i]
@@ -32,7 +32,7 @@ def test_displaced_poses():
     p_WC = path[1].translation()
     left = np.array([-2, 1, 0]) / np.sqrt(5)
     expected = (0.4 * left, -0.4 * left, [0, 0, 0.4], [0, 0, -0.4])
-    for X_WC, step in zip(displaced_poses(path, 1, 0.4), expected, strict=True):
+    for X_WC, step in zip(displace_pose(path, 1, 0.4), expected, strict=True):
         np.testing.assert_allclose(X_WC.translation(), p_WC + step, atol=1e-12)
         np.testing.assert_array_equal(X_WC.rotation().matrix(), R_WC.matrix())
 
@@ -42,5 +42,5 @@ def test_displaced_poses_without_a_way():
     R_WC = RotationMatrix.MakeZRotation(0.3)
     climb = [RigidTransform(R_WC, [0.0, 0.0, 1.0 * i]) for i in range(3)]
     for path in (climb[:1], climb):
-        left = displaced_poses(path, 0, 0.5)[0].translation() - path[0].translation()
+        left = displace_pose(path, 0, 0.5)[0].translation() - path[0].translation()
         np.testing.assert_allclose(left, -0.5 * R_WC.matrix()[:, 0], atol=1e-12)

@@ -10,7 +10,7 @@ from splatpilot.analysis.cli import main
 from splatpilot.analysis.fidelity import run as fidelity
 from splatpilot.analysis.fidelity.run import FidelityConfig
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
-from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures.capture import CaptureFrame
 
@@ -156,7 +156,7 @@ def test_capture_without_depth(place, monkeypatch, capsys):
     from splatpilot.training.captures.capture import no_depth
 
     blind = replace(place.capture, load_depth=no_depth)
-    monkeypatch.setattr(measure_scene, "read_capture", lambda path: blind)
+    monkeypatch.setattr(measure_scene, "read_capture", lambda path, config: blind)
     scene = place.scene("blind")
     assert main(["fidelity", str(scene), "--out", str(place.folder / "out")]) == 1
     assert "has no metric depth" in capsys.readouterr().err

@@ -3,14 +3,14 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.analysis.fidelity.view_support import ViewSupport
-from splatpilot.training.reconstruction.measures import ViewRenderer
+from splatpilot.training.reconstruction.measures import SceneRenderer
 
 
 @pytest.fixture
 def support(place) -> ViewSupport:
     """Of a camera at 1 m from the left end of the room, looking along it."""
     capture = place.capture
-    renderer = ViewRenderer(place.gaussians, "3dgs")
+    renderer = SceneRenderer(place.gaussians, "3dgs")
     X_WC = RigidTransform(capture.X_WCs[0].rotation(), [1.0, 1.5, 1.2])
     return ViewSupport(renderer, capture.K, capture.width, capture.height, [X_WC])
 
@@ -53,8 +53,8 @@ def test_what_stands_behind_something_is_not_seen(place):
     R_WC = capture.X_WCs[0].rotation()
     poses = [RigidTransform(R_WC, [x, 1.5, 1.2]) for x in (1.0, 3.5)]
     args = (capture.K, capture.width, capture.height, poses[:1])
-    open_room = ViewSupport(ViewRenderer(place.gaussians, "3dgs"), *args)
-    walled = ViewSupport(ViewRenderer(place.gaussians.merged_with(wall), "3dgs"), *args)
+    open_room = ViewSupport(SceneRenderer(place.gaussians, "3dgs"), *args)
+    walled = ViewSupport(SceneRenderer(place.gaussians.merged_with(wall), "3dgs"), *args)
     assert open_room.of(poses[1]) > 0.3
     assert walled.of(poses[1]) < 0.02
 
@@ -62,7 +62,7 @@ def test_what_stands_behind_something_is_not_seen(place):
 def test_seen_from_afar_is_not_seen(place):
     """A surface that was seen from more than twice as far does not count."""
     capture = place.capture
-    renderer = ViewRenderer(place.gaussians, "3dgs")
+    renderer = SceneRenderer(place.gaussians, "3dgs")
     R_WC = capture.X_WCs[0].rotation()
     far = ViewSupport(
         renderer, capture.K, capture.width, capture.height, [RigidTransform(R_WC, [0.5, 1.5, 1.2])]

@@ -34,7 +34,7 @@ def level_camera(p: tuple, yaw: float, pitch: float, roll: float = 0.0) -> Rigid
 
 
 @dataclass
-class View:
+class RoomView:
     X_WC: RigidTransform
     image: np.ndarray  # (H, W, 3) red, green, blue
     depth: np.ndarray  # (H, W) [m]
@@ -49,7 +49,7 @@ POSES = [
 ]  # fmt: skip
 
 
-def trace(X_WC: RigidTransform, rays: np.ndarray) -> View:
+def trace(X_WC: RigidTransform, rays: np.ndarray) -> RoomView:
     """What a camera sees along rays (H, W, 2), x/z and y/z."""
     d_C = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
     d_W = d_C @ X_WC.rotation().matrix().T
@@ -57,7 +57,7 @@ def trace(X_WC: RigidTransform, rays: np.ndarray) -> View:
     with np.errstate(divide="ignore"):
         depth = np.where(d_W > 0, UPPER - p_W, p_W - LOWER) / np.abs(d_W)
     depth = depth.min(axis=-1)
-    return View(X_WC, color_at(p_W + depth[..., None] * d_W), depth)
+    return RoomView(X_WC, color_at(p_W + depth[..., None] * d_W), depth)
 
 
 def pinhole_rays(K: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -84,17 +84,17 @@ def assert_shows_room(capture, X_RW=None, color=6.0, depth: float | None = 1e-5)
 
 
 @pytest.fixture
-def room_views() -> Callable[..., list[View]]:
+def room_views() -> Callable[..., list[RoomView]]:
     """Returns the views of the room along rays (H, W, 2), or of a pinhole K with width, height."""
 
-    def views(K: np.ndarray, width: int, height: int, poses=POSES) -> list[View]:
+    def views(K: np.ndarray, width: int, height: int, poses=POSES) -> list[RoomView]:
         return [trace(X_WC, pinhole_rays(K, width, height)) for X_WC in poses]
 
     return views
 
 
 @pytest.fixture
-def trace_rays() -> Callable[..., View]:
+def trace_rays() -> Callable[..., RoomView]:
     """See `trace`."""
     return trace
 

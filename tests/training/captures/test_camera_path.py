@@ -8,7 +8,12 @@ from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanc
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import Box
-from splatpilot.training.captures.camera_path import beside, looking, poses_along, visiting_path
+from splatpilot.training.captures.camera_path import (
+    look_along,
+    move_left,
+    poses_along,
+    visiting_path,
+)
 
 LOWER_W, UPPER_W = np.array([0.0, 0.0, 0.0]), np.array([12.0, 8.0, 3.0])
 
@@ -75,8 +80,8 @@ def test_one_point_is_one_stop():
 
 def test_beside_is_exactly_lateral():
     """The displaced camera stands the offset to its own left and looks in parallel."""
-    X_WC = looking(np.array([1.0, 2, 3]), 0.7, -0.2)
-    X_WD = beside(X_WC, 0.5)
+    X_WC = look_along(np.array([1.0, 2, 3]), 0.7, -0.2)
+    X_WD = move_left(X_WC, 0.5)
     moved = X_WC.inverse() @ X_WD
     np.testing.assert_allclose(moved.translation(), [-0.5, 0, 0], atol=1e-12)
     assert moved.rotation().IsNearlyEqualTo(RotationMatrix(), 1e-12)

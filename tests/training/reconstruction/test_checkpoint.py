@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.optimize import Optimization
-from splatpilot.training.reconstruction.reconstruct import run
+from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 CONFIG = ReconstructConfig(
     iterations=24,
@@ -32,8 +33,9 @@ CONFIG = ReconstructConfig(
 _CHILD = """
 import os, signal, sys, torch
 from pathlib import Path
+from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.optimize import Optimization
-from splatpilot.training.reconstruction.reconstruct import run
+from splatpilot.training.reconstruction.reconstruct import reconstruct
 from tests_config import CONFIG
 
 room, out, when = sys.argv[1:]
@@ -54,7 +56,7 @@ if when == "step":
     Optimization.take_step = step
 else:
     torch.save = save_half
-run(capture=room, out=out, config=CONFIG)
+reconstruct(read_capture(room), out, CONFIG)
 """
 
 
@@ -76,7 +78,7 @@ def room(tmp_path, write_room):
 
 
 def assert_same_scene(tmp_path, room, out) -> None:
-    run(capture=room, out=tmp_path / "whole", config=CONFIG)
+    reconstruct(read_capture(room), tmp_path / "whole", CONFIG)
     for file in ("gaussians.ply", "scene.yaml", "esdf.npz"):
         assert (out / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
 
@@ -87,10 +89,10 @@ def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_r
     out = tmp_path / "scene"
     kill_a_run(tmp_path, room, out, "step")
     with pytest.raises(ValueError, match=r"with depth_weight 0\.2, not 0\.3; .* --restart"):
-        run(capture=room, out=out, config=replace(CONFIG, depth_weight=0.3))
+        reconstruct(read_capture(room), out, replace(CONFIG, depth_weight=0.3))
     other = write_room(tmp_path / "other", brightness=lambda i, rho: np.full(1, 0.9))
     with pytest.raises(ValueError, match="an interrupted run on another capture"):
-        run(capture=other, out=out, config=CONFIG)
+        reconstruct(read_capture(other), out, CONFIG)
     assert not out.exists()
 
     steps = []
@@ -98,7 +100,7 @@ def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_r
     monkeypatch.setattr(
         Optimization, "take_step", lambda self: (steps.append(self.step), take_step(self))
     )
-    run(capture=room, out=out, config=CONFIG)
+    reconstruct(read_capture(room), out, CONFIG)
     assert steps == list(range(16, 24))
     assert not (tmp_path / ".scene.partial").exists()
     assert_same_scene(tmp_path, room, out)
@@ -109,15 +111,15 @@ def test_a_run_killed_while_it_wrote_a_checkpoint(tmp_path, room):
     refused, and discarded by `restart`."""
     out = tmp_path / "scene"
     kill_a_run(tmp_path, room, out, "checkpoint")
-    run(capture=room, out=out, config=CONFIG)
+    reconstruct(read_capture(room), out, CONFIG)
     assert_same_scene(tmp_path, room, out)
 
     file = tmp_path / ".scene.partial" / "checkpoint.pt"
     file.parent.mkdir()
     file.write_bytes(b"half of it")
     with pytest.raises(ValueError, match=r"checkpoint\.pt: not a readable checkpoint"):
-        run(capture=room, out=out, config=CONFIG)
-    run(capture=room, out=out, config=CONFIG, restart=True)
+        reconstruct(read_capture(room), out, CONFIG)
+    reconstruct(read_capture(room), out, CONFIG, restart=True)
     assert_same_scene(tmp_path, room, out)
     assert not file.exists()
 
@@ -130,7 +132,7 @@ def test_a_full_disk_is_one_message_and_leaves_the_last_checkpoint(tmp_path, roo
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
         with pytest.raises(OSError, match=r"checkpoint\.pt: the checkpoint cannot be written"):
-            run(capture=room, out=out, config=CONFIG)
+            reconstruct(read_capture(room), out, CONFIG)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)

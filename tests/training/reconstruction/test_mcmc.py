@@ -6,7 +6,7 @@ import torch
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.mcmc import McmcStrategy, shared
+from splatpilot.training.reconstruction.mcmc import McmcStrategy, share_out
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 
 RATES = {
@@ -34,7 +34,7 @@ def test_shared_gaussians_are_as_opaque_and_as_wide(count):
     """Copies in one place let through what the one did at its centre, and stop as much light over
     a line through it (the condition that the published equation is derived from)."""
     opacity, scale = torch.tensor([0.8]), torch.tensor([[0.3, 0.2, 0.1]])
-    new_opacity, new_scale = shared(opacity, scale, torch.tensor([count]))
+    new_opacity, new_scale = share_out(opacity, scale, torch.tensor([count]))
     assert 1 - (1 - new_opacity.item()) ** count == pytest.approx(0.8, abs=1e-5)
     x = np.linspace(-6, 6, 20001)
     ratio = (new_scale / scale)[0]

@@ -4,9 +4,8 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.measures import (
-    ViewRenderer,
+    SceneRenderer,
     depth_mae_m,
     depth_relative,
     fit_exposure,
@@ -15,9 +14,8 @@ from splatpilot.training.reconstruction.measures import (
     measure_view,
     psnr_db,
     ssim,
-    vignette,
 )
-from splatpilot.training.reconstruction.photometry import Photometry
+from splatpilot.training.reconstruction.vignette import vignette
 
 HEIGHT, WIDTH = 24, 32
 K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])
@@ -96,7 +94,7 @@ def test_a_plane_in_front_is_all_floater(representation):
     camera = (K, WIDTH, HEIGHT, RigidTransform(), (0.0, 0.0, 0.0))
     truth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
     for distance, error, fraction in ((3.0, 0.0, 0.0), (2.5, 0.5, 1.0)):
-        view = ViewRenderer(plane(distance), representation).render(*camera)
+        view = SceneRenderer(plane(distance), representation).render(*camera)
         assert view.alpha.min() > 0.99
         assert view.color == pytest.approx(np.full((HEIGHT, WIDTH, 3), 0.6), abs=0.01)
         assert depth_mae_m(view.depth, truth) == pytest.approx(error, abs=2e-3)
@@ -107,7 +105,7 @@ def test_a_plane_in_front_is_all_floater(representation):
 def test_both_representations_stand_where_the_camera_is_told(representation):
     """A camera moved towards a plane sees it nearer by that much, whatever the representation."""
     X_WC = RigidTransform([0.3, -0.2, 1.0])
-    view = ViewRenderer(plane(3.0), representation).render(K, WIDTH, HEIGHT, X_WC, (0, 0, 0))
+    view = SceneRenderer(plane(3.0), representation).render(K, WIDTH, HEIGHT, X_WC, (0, 0, 0))
     np.testing.assert_allclose(view.depth, 2.0, atol=2e-3)
 
 
@@ -120,12 +118,6 @@ def test_a_veil_that_draws_depth_forward_is_a_floater():
         depth = weight * 1.0 + (1 - weight) * truth
         found.append(floater_fraction(depth, np.ones_like(depth), truth))
     assert found == [0.0, 1.0]
-
-
-def test_vignette_is_that_of_the_photometry():
-    """The darkening of corners is the factor by which reconstruction divides its images."""
-    expected = Photometry(np.array([1.0]), -0.3).factor(0, HEIGHT, WIDTH)
-    np.testing.assert_allclose(vignette(-0.3, WIDTH, HEIGHT), expected, rtol=1e-6)
 
 
 def test_exposure_is_fitted():
@@ -149,10 +141,12 @@ def test_measures_of_a_view():
     color = noise().astype(np.float32)
     exposed = 1.2 * color * vignette(-0.2, WIDTH, HEIGHT)[..., None]
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
-    frame = CaptureFrame(np.round(255 * exposed).astype(np.uint8), depth, RigidTransform(), K)
+    image = np.round(255 * exposed).astype(np.uint8)
     near = depth.copy()
     near[:6] = 1.0  # a quarter
-    found = measure_view(RenderedView(color, near, np.ones_like(depth)), frame, vignetting=-0.2)
+    found = measure_view(
+        RenderedView(color, near, np.ones_like(depth)), image, depth, vignetting=-0.2
+    )
     assert found.psnr_db > 50 and found.ssim > 0.999
     assert found.gain == pytest.approx(1.2, rel=1e-3)
     assert found.lpips is None
@@ -164,13 +158,12 @@ def test_measures_of_a_view():
 def test_lpips_is_of_the_exposed_image():
     """The perceptual distance is asked of the image in the frame's exposure."""
     color = noise().astype(np.float32)
-    frame = CaptureFrame(
-        np.round(255 * 1.2 * color).astype(np.uint8), np.ones((HEIGHT, WIDTH)), RigidTransform(), K
-    )
-    view = RenderedView(color, np.ones((HEIGHT, WIDTH)), np.ones((HEIGHT, WIDTH)))
+    image = np.round(255 * 1.2 * color).astype(np.uint8)
+    depth = np.ones((HEIGHT, WIDTH), np.float32)
+    view = RenderedView(color, depth, np.ones((HEIGHT, WIDTH)))
 
     def difference(a, b):
         assert a.shape == (HEIGHT, WIDTH, 3)
         return (a - b).abs().max()
 
-    assert measure_view(view, frame, lpips=difference).lpips == pytest.approx(0, abs=0.01)
+    assert measure_view(view, image, depth, lpips=difference).lpips == pytest.approx(0, abs=0.01)

@@ -4,12 +4,15 @@ from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.tartanair import read_tartanair_v1
-from splatpilot.training.reconstruction.overlap import STRIDE, View, find_new_pixels, load_views
+from splatpilot.training.reconstruction.overlap import STRIDE, ThinnedFrame, find_new_pixels
 
 
 @pytest.fixture
-def views(tmp_path, write_room) -> list[View]:
-    return list(load_views(read_tartanair_v1(write_room(tmp_path / "room"))))
+def views(tmp_path, write_room) -> list[ThinnedFrame]:
+    return [
+        ThinnedFrame.of(frame)
+        for frame in read_tartanair_v1(write_room(tmp_path / "room")).frames()
+    ]
 
 
 def test_points_lie_on_the_walls(views, room_in_W):
@@ -60,7 +63,8 @@ def test_pixel_size_of_a_slanted_plane():
     slanted = np.tile(np.float32(2 / (1 - np.tan(np.pi / 3) * u)), (48, 1))
     image = np.zeros((48, 64, 3), np.uint8)
     sizes = [
-        View.of(CaptureFrame(image, depth, X_WC, K)).pixel_size[12, 16] for depth in (flat, slanted)
+        ThinnedFrame.of(CaptureFrame(image, depth, X_WC, K)).pixel_size[12, 16]
+        for depth in (flat, slanted)
     ]
     assert sizes[0] == pytest.approx(2 / 200, rel=1e-3)
     assert sizes[1] == pytest.approx(2 * 2 / 200, rel=0.05)
@@ -77,7 +81,10 @@ def test_every_point_is_kept_once_or_nearly_so(views):
 def test_slow_walk_keeps_little_more_than_one_view(tmp_path, write_room):
     """Of ten views a hand's breadth apart, little more is kept than one of them shows."""
     poses = [((2 + 0.05 * i, 0.0, -1.2), 1.2, -0.3) for i in range(10)]
-    views = list(load_views(read_tartanair_v1(write_room(tmp_path / "walk", poses=poses))))
+    views = [
+        ThinnedFrame.of(frame)
+        for frame in read_tartanair_v1(write_room(tmp_path / "walk", poses=poses)).frames()
+    ]
     new = find_new_pixels(views)
     assert 1 <= sum(mask.mean() for mask in new) < 2
 

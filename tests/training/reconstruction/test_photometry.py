@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.tartanair import read_tartanair_v1
-from splatpilot.training.reconstruction.overlap import load_views
+from splatpilot.training.reconstruction.overlap import ThinnedFrame
 from splatpilot.training.reconstruction.photometry import Photometry, estimate_photometry
 
 
@@ -16,7 +16,7 @@ def test_recovers_gains_and_vignetting(tmp_path, write_room):
         height=120,
         brightness=lambda i, rho: truth.gains[i] * np.exp(truth.vignetting * rho),
     )
-    views = list(load_views(read_tartanair_v1(room)))
+    views = [ThinnedFrame.of(frame) for frame in read_tartanair_v1(room).frames()]
     found = estimate_photometry(views, seed=0)
     np.testing.assert_allclose(found.gains, truth.gains, rtol=0.02)
     assert found.vignetting == pytest.approx(truth.vignetting, abs=0.03)
@@ -26,7 +26,10 @@ def test_recovers_gains_and_vignetting(tmp_path, write_room):
 
 def test_views_that_share_nothing_have_gain_one(tmp_path, write_room):
     """Without common points nothing is corrected."""
-    views = list(load_views(read_tartanair_v1(write_room(tmp_path / "room"))))[:1]
+    views = [
+        ThinnedFrame.of(frame)
+        for frame in read_tartanair_v1(write_room(tmp_path / "room")).frames()
+    ][:1]
     found = estimate_photometry(views, seed=0)
     assert (found.gains.tolist(), found.vignetting) == ([1.0], 0.0)
 

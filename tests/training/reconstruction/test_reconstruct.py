@@ -5,13 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.photometry import Photometry
-from splatpilot.training.reconstruction.reconstruct import run
+from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 CONFIG = ReconstructConfig(iterations=0, voxel_size=0.1)
 
@@ -20,11 +22,11 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((a - b) ** 2)))
 
 
-def test_room_end_to_end(tmp_path, write_room, room_in_W, capsys):
+def test_room_end_to_end(tmp_path, write_room, room_in_W):
     """From a capture of a room comes a scene that looks, measures and flies like the room."""
     room = write_room(tmp_path / "room", width=128, height=96)
-    summary = run(capture=room, out=tmp_path / "scene", config=CONFIG)
-    assert f"Gaussians          {summary.gaussians}\n" in capsys.readouterr().out
+    summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
+    assert f"Gaussians          {summary.gaussians}\n" in str(summary)
     world = read_scene(tmp_path / "scene")
     metadata = read_scene_metadata(tmp_path / "scene")
     assert (world.name, len(world.gaussians)) == ("room", summary.gaussians)
@@ -60,7 +62,7 @@ def test_same_capture_same_scene(tmp_path, write_room):
     """Reconstructing twice gives the same bytes."""
     room = write_room(tmp_path / "room")
     for name in ("a", "b"):
-        run(capture=room, out=tmp_path / name, config=CONFIG)
+        reconstruct(read_capture(room), tmp_path / name, CONFIG)
     for file in ("gaussians.ply", "scene.yaml"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
@@ -68,14 +70,29 @@ def test_same_capture_same_scene(tmp_path, write_room):
 def test_number_of_gaussians_is_kept(tmp_path, write_room):
     """No more Gaussians than allowed are made, and too tight a limit is an error."""
     room = write_room(tmp_path / "room")
-    free = run(capture=room, out=tmp_path / "a", config=CONFIG).gaussians
-    limited = run(
-        capture=room, out=tmp_path / "b", config=replace(CONFIG, max_gaussians=free // 3)
+    free = reconstruct(read_capture(room), tmp_path / "a", CONFIG).gaussians
+    limited = reconstruct(
+        read_capture(room), tmp_path / "b", replace(CONFIG, max_gaussians=free // 3)
     ).gaussians
     assert 0 < limited <= free // 3
     with pytest.raises(ValueError, match="10 Gaussians are too few for 12 frames"):
-        run(capture=room, out=tmp_path / "c", config=replace(CONFIG, max_gaussians=10))
+        reconstruct(read_capture(room), tmp_path / "c", replace(CONFIG, max_gaussians=10))
     assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("iterations", [0, 2])
+def test_images_are_read_once(tmp_path, write_room, iterations):
+    """However often its frames are looked at, each image is decoded once."""
+    capture = read_capture(write_room(tmp_path / "room"))
+    read: list[int] = []
+
+    def load_image(i: int) -> np.ndarray:
+        read.append(i)
+        return capture.load_image(i)
+
+    counted = replace(capture, load_image=load_image)
+    reconstruct(counted, tmp_path / "scene", replace(CONFIG, iterations=iterations))
+    assert sorted(read) == list(range(len(capture)))
 
 
 @pytest.mark.parametrize(
@@ -92,9 +109,11 @@ def test_number_of_gaussians_is_kept(tmp_path, write_room):
     ],
 )
 def test_bad_config(tmp_path, write_room, change, message):
-    """Values that make no sense are refused before any work, with value and limit."""
+    """Values that make no sense are refused with value and limit, and nothing is written."""
+    room = write_room(tmp_path / "room")
     with pytest.raises(ValueError, match=message):
-        run(capture=tmp_path, out=tmp_path / "scene", config=replace(CONFIG, **change))
+        reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, **change))
+    assert not (tmp_path / "scene").exists()
 
 
 def test_bad_capture_leaves_nothing(tmp_path, write_room):
@@ -103,22 +122,8 @@ def test_bad_capture_leaves_nothing(tmp_path, write_room):
     for i in (4, 5, 6):
         (room / "image_left" / f"{i:06d}_left.png").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"000004_left\.png: not a readable image"):
-        run(capture=room, out=tmp_path / "scene", config=CONFIG)
+        reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
     assert list(tmp_path.iterdir()) == [room]
-
-
-def test_unknown_capture(tmp_path):
-    """A folder that is no capture, or none at all, is refused."""
-    with pytest.raises(ValueError, match="no capture of a known kind; known are TartanAir V1"):
-        run(capture=tmp_path, out=tmp_path / "scene", config=CONFIG)
-    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
-        run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=CONFIG)
-
-
-def test_occupied_output_is_refused_before_any_work(tmp_path, write_room):
-    """A folder that holds something else is refused at once."""
-    with pytest.raises(ValueError, match="exists and is no scene"):
-        run(capture=tmp_path / "nowhere", out=write_room(tmp_path / "room"), config=CONFIG)
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
@@ -139,7 +144,7 @@ def test_hospital(tmp_path):
     (part / "pose_left.txt").write_text("\n".join(poses[number] for number in numbers))
 
     config = ReconstructConfig(iterations=0, max_gaussians=100_000, voxel_size=0.1)
-    summary = run(capture=part, out=tmp_path / "scene", config=config)
+    summary = reconstruct(read_capture(part), tmp_path / "scene", config)
     assert summary.geodesic > 6
     assert -0.4 < summary.vignetting < -0.2
     world, sequence = read_scene(tmp_path / "scene"), read_tartanair_v1(part)

@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.reconstruction.scene_distance_field import DepthSource, fuse, with_sky
+from splatpilot.training.reconstruction.scene_distance_field import DepthSource, add_sky, fuse
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
 K = np.array([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
@@ -30,7 +30,7 @@ def test_space_before_the_sky_is_free_only_where_a_fitted_frame_measured_it():
     rendered[:15] = 2.0
     half = np.diag([0.5, 0.5, 1.0]) @ K
     source = DepthSource(lambda i: rendered, half, capture.X_WCs)
-    sky = with_sky(source, ShrunkFrames(capture, [1], 2))
+    sky = add_sky(source, ShrunkFrames(capture, [1], 2))
     np.testing.assert_array_equal(sky.load(0), rendered)
     expected = rendered.copy()
     expected[15:, :20] = np.inf

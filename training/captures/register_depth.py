@@ -4,11 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.training.captures.lens import back_project
+
 # [m], stands for "beyond range" while points are moved; far enough that no baseline matters.
 _FAR = 1e9
 
 
-def registered_depth(
+def register_depth(
     depth: NDArray[np.floating],
     K_D: NDArray[np.float64],
     X_CD: RigidTransform,
@@ -36,9 +38,8 @@ def registered_depth(
     z = np.where(np.isinf(depth), _FAR, depth).repeat(finer, axis=0).repeat(finer, axis=1)
     rows, columns = np.nonzero(z > 0)
     z = z[rows, columns].astype(np.float64)
-    x = ((columns + 0.5) / finer - K_D[0, 2]) / K_D[0, 0] * z
-    y = ((rows + 0.5) / finer - K_D[1, 2]) / K_D[1, 1] * z
-    x, y, z = X_CD.multiply(np.stack([x, y, z]))
+    p_DQ = back_project(K_D, (columns + 0.5) / finer, (rows + 0.5) / finer, z)
+    x, y, z = X_CD.multiply(p_DQ.T)
     front = z > 0
     x, y, z = x[front], y[front], z[front]
     u = np.floor(K_C[0, 0] * x / z + K_C[0, 2])

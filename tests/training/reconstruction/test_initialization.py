@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.tartanair import read_tartanair_v1
-from splatpilot.training.reconstruction.initial_gaussians import (
+from splatpilot.training.reconstruction.initialization import (
     SHELL,
     Detail,
     gaussians_from_depth,
     gaussians_from_points,
+    put_on_shell,
     random_points,
-    with_shell,
 )
-from splatpilot.training.reconstruction.overlap import View
+from splatpilot.training.reconstruction.overlap import ThinnedFrame
 from splatpilot.training.reconstruction.photometry import estimate_photometry
 
 
@@ -22,7 +22,7 @@ def test_what_is_beyond_range_stands_on_a_shell(write_room, tmp_path):
     frame = read_tartanair_v1(write_room(tmp_path / "room")).frame(0)
     depth = frame.depth.copy()
     depth[:10], depth[10:12], depth[12:14] = np.inf, 0, 1e4
-    far = with_shell(replace(frame, depth=depth))
+    far = put_on_shell(replace(frame, depth=depth))
     rows, columns = np.mgrid[0:48, 0:64] + 0.5
     distance = np.linalg.norm(far.back_project(columns, rows, far.depth), axis=-1)
     beyond = (depth > SHELL) & (np.arange(48)[:, None] < 14)
@@ -36,7 +36,7 @@ def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
     large ones, each of them one of all; without optimisation it is an error."""
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     frames = list(capture.frames())
-    photometry = estimate_photometry([View.of(frame) for frame in frames], 0)
+    photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
     coarse = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
     detail = Detail(max_gaussians=100_000, optimized=True, **coarse)
     every, _ = gaussians_from_depth(frames, photometry, detail)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures.registered_depth import registered_depth
+from splatpilot.training.captures.register_depth import register_depth
 
 K_D = np.array([[58.5, 0, 32], [0, 58.5, 24], [0, 0, 1.0]])
 K_C = np.array([[52.0, 0, 32], [0, 52.0, 24], [0, 0, 1.0]])
@@ -24,7 +24,7 @@ def test_plane(finer):
     n_C = X_CD.rotation().multiply(n)
     d_C = d + n_C @ X_CD.translation()
     depth = plane_depth(n, d, K_D, 64, 48).astype(np.float32)
-    got = registered_depth(depth, K_D, X_CD, K, 64 * finer, 48 * finer)
+    got = register_depth(depth, K_D, X_CD, K, 64 * finer, 48 * finer)
     want = plane_depth(n_C, d_C, K, 64 * finer, 48 * finer)
     inner = np.s_[8 * finer : -8 * finer, 8 * finer : -8 * finer]
     # Half a pixel of the coarser camera on this slope.
@@ -35,7 +35,7 @@ def test_same_camera_changes_nothing():
     """With equal cameras in one place every pixel keeps its value, also 0 and infinity."""
     depth = np.random.default_rng(0).uniform(1, 5, (48, 64)).astype(np.float32)
     depth[3, 4], depth[5, 6] = 0, np.inf
-    got = registered_depth(depth, K_D, RigidTransform(), K_D, 64, 48)
+    got = register_depth(depth, K_D, RigidTransform(), K_D, 64, 48)
     np.testing.assert_allclose(got, depth, rtol=1e-6)
 
 
@@ -43,7 +43,7 @@ def test_nearer_surface_hides_the_farther():
     """Where two surfaces fall into one pixel, the nearer one is kept."""
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:30] = 1.0
-    got = registered_depth(depth, K_D, RigidTransform([0.3, 0, 0]), K_D, 64, 48)
+    got = register_depth(depth, K_D, RigidTransform([0.3, 0, 0]), K_D, 64, 48)
     shift = 0.3 * 58.5
     covered = got[:, int(np.ceil(20 + shift)) : int(30 + shift)]
     np.testing.assert_array_equal(covered, 1.0)

@@ -1,0 +1,31 @@
+"""From the folder of a capture to a scene folder that has been measured."""
+
+from pathlib import Path
+
+from splatpilot.analysis.reconstruction.measure_scene import SceneMeasures, measure_scene
+from splatpilot.diagrams.worlds.scene_folder import check_scene_target
+from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, reconstruct
+
+
+def run(
+    *, capture: str | Path, out: str | Path, config: ReconstructConfig, restart: bool = False
+) -> tuple[ReconstructSummary, SceneMeasures]:
+    """Turns the capture in a folder into the scene folder `out`, with its `metrics.json`, and
+    prints what came of it; see `reconstruct` and `measure_scene`.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: for a damaged capture, a config that makes no sense,
+            a checkpoint of another run, or a folder `out` that cannot be written or holds something
+            else. No scene is written then.
+    """
+    # Said at once: photographs are registered for minutes before `reconstruct` could.
+    config.validate()
+    check_scene_target(out)
+    opened = read_capture(capture, config.capture)
+    summary = reconstruct(opened, out, config, restart=restart)
+    print(summary)
+    measures = measure_scene(Path(out), opened)
+    print(measures)
+    return summary, measures

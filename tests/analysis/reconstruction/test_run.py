@@ -1,0 +1,103 @@
+"""From the folder of a capture to a measured scene."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from splatpilot.analysis.cli import main
+from splatpilot.analysis.reconstruction.measure_scene import read_capture_of
+from splatpilot.analysis.reconstruction.run import run
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.reconstruction.config import ReconstructConfig
+
+SMALL = ReconstructConfig(
+    iterations=4, image_width=0, voxel_size=0.2, initial_gaussians=2000, threads=1
+)
+
+
+@pytest.fixture
+def folder(seen_room, tmp_path):
+    """The room in nerfstudio's format, overexposed, with a focal length that is twice the right
+    one and depth in units of which there are 500 a metre, which the file does not say."""
+    _, capture = seen_room
+    path = tmp_path / "capture"
+    path.mkdir()
+    frames = []
+    for i in range(len(capture)):
+        frame = capture.frame(i)
+        bright = np.clip(1.5 * frame.image.astype(float), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(path / f"{i}.png"), bright[..., ::-1])
+        depth = np.round(500 * frame.depth).astype(np.uint16)
+        cv2.imwrite(str(path / f"{i}.depth.png"), depth)
+        matrix = frame.X_WC.GetAsMatrix4() @ np.diag([1.0, -1, -1, 1])
+        frames.append(
+            {
+                "file_path": f"{i}.png",
+                "depth_file_path": f"{i}.depth.png",
+                "transform_matrix": matrix.tolist(),
+            }
+        )
+    content = {"w": 64, "h": 48, "fl_x": 64.0, "cx": 32.0, "cy": 24.0, "frames": frames}
+    (path / "transforms.json").write_text(json.dumps(content))
+    return path
+
+
+@pytest.fixture
+def config() -> ReconstructConfig:
+    """What makes the capture right."""
+    said = CaptureConfig(intrinsics=[32.0, 32.0, 32.0, 24.0], depth_unit=500.0)
+    return replace(SMALL, capture=said)
+
+
+def test_what_was_said_of_a_capture_stays_with_its_scene(folder, config, tmp_path, capsys):
+    """A capture that is only read rightly with settings is measured with them for ever: `measure`
+    gives the same figures as `reconstruct`, which wrote them, and which are good."""
+    scene = tmp_path / "scene"
+    _, measures = run(capture=folder, out=scene, config=config)
+    written = (scene / "metrics.json").read_bytes()
+    assert json.loads(written) == measures.as_json()
+    assert (measures.mean("depth_relative") or 1) < 0.15
+    metadata = read_scene_metadata(scene)
+    assert metadata.capture_settings == ["intrinsics=[32.0, 32.0, 32.0, 24.0]", "depth_unit=500.0"]
+    assert read_capture_of(scene, metadata).K[0, 0] == 32
+
+    capsys.readouterr()
+    assert main(["measure", str(scene)]) == 0
+    assert (scene / "metrics.json").read_bytes() == written
+    printed = capsys.readouterr().out
+    assert f"made from              nerfstudio capture {folder}, 16 frames" in printed
+    assert "image gains" in printed and "seen free [m^3]" in printed
+
+    (scene / "scene.yaml").write_text(
+        (scene / "scene.yaml").read_text().replace("depth_unit", "depth_units")
+    )
+    assert main(["measure", str(scene)]) == 1
+    message = capsys.readouterr().err
+    assert "scene.yaml: capture_settings: " in message and "did you mean depth_unit" in message
+
+
+def test_there_is_one_held_out_psnr(folder, config, tmp_path):
+    """What the summary says of the withheld frames is what `metrics.json` says, even where images
+    are overexposed."""
+    summary, measures = run(capture=folder, out=tmp_path / "scene", config=config)
+    assert summary.held_out is not None
+    assert summary.held_out.means()["psnr_db"] == pytest.approx(measures.mean("psnr_db"), abs=0.01)
+
+
+def test_refusals(tmp_path, config, capsys):
+    """A folder that holds something else is refused before the capture is opened; one that is no
+    capture, or none at all, and steps given in two ways are refused too."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="exists and is no scene"):
+        run(capture=tmp_path / "nowhere", out=tmp_path, config=config)
+    with pytest.raises(ValueError, match="no capture of a known kind; known are TartanAir V1"):
+        run(capture=tmp_path, out=tmp_path / "scene", config=config)
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
+        run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=config)
+    words = ["reconstruct", "nowhere", "--out", str(tmp_path / "scene"), "--iterations", "5"]
+    assert main([*words, "--set", "iterations=6"]) == 1
+    assert "iterations are given by --iterations and by --set" in capsys.readouterr().err
