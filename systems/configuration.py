@@ -180,11 +180,24 @@ def _check_names(config: Any, given: Any, prefix: str) -> None:
         raise ValueError(f"{prefix.rstrip('.') or 'the file'} is {given}; it must be fields")
     for name, value in given.items():
         if name not in known:
-            close = difflib.get_close_matches(str(name), known)
-            hint = f"did you mean {' or '.join(prefix + other for other in close)}?"
+            close = _nested_fields(config, str(name), prefix) or [
+                prefix + other for other in difflib.get_close_matches(str(name), known)
+            ]
+            hint = f"did you mean {' or '.join(close)}?"
             listed = f"the fields are {', '.join(sorted(prefix + other for other in known))}"
             raise ValueError(f"there is no field {prefix}{name}; {hint if close else listed}")
         _check_names(getattr(config, name), value, f"{prefix}{name}.")
+
+
+def _nested_fields(config: Any, name: str, prefix: str) -> list[str]:
+    """The dotted names of the fields called `name` of the configurations that `config` holds."""
+    found = []
+    for field in sorted(_field_names(config)):
+        held = getattr(config, field)
+        if name in _field_names(held):
+            found.append(f"{prefix}{field}.{name}")
+        found += _nested_fields(held, name, f"{prefix}{field}.")
+    return found
 
 
 def _field_names(config: Any) -> set[str]:

@@ -42,6 +42,8 @@ def test_dumped_scenario_loads_as_itself(tmp_path):
         ("policy.lattice.sped=3", r"no field policy.lattice.sped; did you mean policy.lattice.sp"),
         ("policy.speed=3", r"no field policy.speed; .*policy.lattice"),
         ("camera.fpss=3", r"no field camera.fpss; did you mean camera.fps"),
+        ("speed=3", r"no field speed; did you mean policy.lattice.speed\?"),
+        ("camera.lattice=3", r"no field camera.lattice; the fields are camera\."),
         ("qqqqqq=3", r"no field qqqqqq; the fields are .*timeout"),
         ("policy=3", "'policy=3': policy is 3; it must be fields"),
         ("world=foo", "'world=foo': world is foo; it must be fields"),

@@ -62,7 +62,8 @@ class CaptureConfig:
     """What a capture's files leave open; empty and zero fields take what its kind usually has."""
 
     kind: str = ""
-    """One of `splatpilot.training.captures.read_capture.KINDS`; empty: told from the files."""
+    """A name in `splatpilot.training.captures.read_capture.CAPTURES`, or `module:attribute` of a
+    `CaptureKind`; empty: told from the files."""
     intrinsics: list[float] = field(default_factory=list)
     """fx, fy, cx, cy [px] of the colour camera."""
     depth_intrinsics: list[float] = field(default_factory=list)

@@ -6,13 +6,15 @@ configuration. COLMAP's image coordinates count as ours, from the corner of the 
 
 import dataclasses
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.systems.extras import import_extra
 from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
@@ -21,6 +23,9 @@ from splatpilot.training.captures.lens import Lens, pinhole
 from splatpilot.training.captures.metric_scale import make_metric
 from splatpilot.training.captures.poses import pose_from_matrix
 from splatpilot.training.captures.upright import turn_upright
+
+if TYPE_CHECKING:
+    import pycolmap
 
 _MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "../images", "../../images", "")
@@ -37,6 +42,15 @@ def model_folder(path: Path) -> Path | None:
     return None
 
 
+def import_pycolmap() -> ModuleType:
+    """Imports pycolmap, which only captures that COLMAP registers need.
+
+    Raises:
+        ModuleNotFoundError: if it is not installed; the message says what to install.
+    """
+    return import_extra("pycolmap", "photos")
+
+
 def read_colmap(path: Path, config: CaptureConfig) -> Capture:
     """Opens a COLMAP model with its images.
 
@@ -48,6 +62,7 @@ def read_colmap(path: Path, config: CaptureConfig) -> Capture:
     model = model_folder(path)
     if model is None:
         raise FileNotFoundError(f"{path}: no COLMAP model (cameras, images, points3D) in it")
+    pycolmap = import_pycolmap()
     try:
         reconstruction = pycolmap.Reconstruction(model)
     except Exception as error:  # pycolmap raises what its C++ raises
@@ -67,7 +82,7 @@ def read_colmap(path: Path, config: CaptureConfig) -> Capture:
 def capture_of_model(
     path: Path,
     kind: str,
-    reconstruction: pycolmap.Reconstruction,
+    reconstruction: "pycolmap.Reconstruction",
     images: Path,
     config: CaptureConfig,
     dropped: tuple[str, ...] = (),
@@ -76,7 +91,7 @@ def capture_of_model(
     lenses = {number: _lens(camera, config) for number, camera in reconstruction.cameras.items()}
     depths = path / config.scale.depth_folder if config.scale.depth_folder else None
 
-    def frame(image: pycolmap.Image) -> FrameFiles:
+    def frame(image: "pycolmap.Image") -> FrameFiles:
         world_to_camera = image.cam_from_world().inverse().matrix()
 
         def X_FC() -> RigidTransform:
@@ -124,7 +139,7 @@ def capture_of_model(
     return turn_upright(make_metric(capture, config.scale, locate), config.up or "cameras")
 
 
-def _lens(camera: pycolmap.Camera, config: CaptureConfig) -> Lens:
+def _lens(camera: "pycolmap.Camera", config: CaptureConfig) -> Lens:
     K = pinhole(*config.intrinsics) if config.intrinsics else camera.calibration_matrix()
     if config.intrinsics or camera.is_undistorted():
         return Lens(K, camera.width, camera.height)

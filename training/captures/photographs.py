@@ -8,14 +8,13 @@ import os
 import shutil
 from pathlib import Path
 
-import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
-import pycolmap
 from PIL import Image
 from tqdm import tqdm
 
+from splatpilot.systems.cores import available_cores
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.colmap import capture_of_model
+from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap
 from splatpilot.training.captures.image_files import IMAGE_SUFFIXES, image_size
 
 _MAX_SIZE = 1600
@@ -61,7 +60,7 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     model = _cache(files, config) / "model"
     if not model.is_dir():
         _register(folder, names, _one_camera(files), model)
-    reconstruction = pycolmap.Reconstruction(model)
+    reconstruction = import_pycolmap().Reconstruction(model)
     registered = {image.name for image in reconstruction.images.values() if image.has_pose}
     dropped += [
         f"{folder / name}: not registered, it shares too little with the other photographs"
@@ -81,7 +80,7 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
 def _cache(files: list[Path], config: CaptureConfig) -> Path:
     if config.cache:
         return Path(config.cache)
-    key = hashlib.sha256(f"{pycolmap.__version__} {_MAX_SIZE} {_SEED}".encode())
+    key = hashlib.sha256(f"{import_pycolmap().__version__} {_MAX_SIZE} {_SEED}".encode())
     for file in files:
         status = file.stat()
         key.update(f"{file.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
@@ -116,6 +115,7 @@ def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> 
     work = model.with_name(f".{os.getpid()}.partial")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
+    pycolmap = import_pycolmap()
     pycolmap.set_random_seed(_SEED)
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 2
     try:
@@ -127,7 +127,7 @@ def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> 
         # Enlarging the image first finds more in small ones and takes four times as long.
         small = max(max(image_size(folder / name)) for name in names) < _SMALL
         extraction.sift.first_octave = -1 if small else 0
-        threads = os.cpu_count() or 1
+        threads = available_cores()
         with tqdm(total=len(names), desc="features", unit="photo") as progress:
             for start in range(0, len(names), threads):
                 some = names[start : start + threads]

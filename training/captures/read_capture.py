@@ -1,9 +1,10 @@
 """Opens a capture of any known kind."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatpilot.systems.registry import Registry
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.colmap import model_folder, read_colmap
@@ -18,45 +19,88 @@ from splatpilot.training.captures.tartanair import (
 )
 from splatpilot.training.captures.tum import is_tum, read_tum
 
-Reader = Callable[[Path, CaptureConfig], Capture]
 
-# In this order: what the first fits is not asked of the others.
-_KINDS: dict[str, tuple[Callable[[Path], bool], Reader, str]] = {
-    "tartanair_v1": (
-        is_tartanair_v1,
-        read_tartanair_v1,
-        "TartanAir V1 (image_left/, depth_left/, pose_left.txt)",
-    ),
-    "tartanair_v2": (
-        is_tartanair_v2,
-        read_tartanair_v2,
-        "TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)",
-    ),
-    "nerfstudio": (is_nerfstudio, read_nerfstudio, "nerfstudio (transforms.json)"),
-    "tum": (is_tum, read_tum, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"),
-    "seven_scenes": (
-        is_seven_scenes,
-        read_seven_scenes,
-        "7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
-    ),
-    "colmap": (
-        lambda path: model_folder(path) is not None,
-        read_colmap,
-        "COLMAP (images/, sparse/0/)",
-    ),
-    "photographs": (
-        lambda path: len(photographs_in(path)) > 0,
-        read_photographs,
-        "photographs alone",
-    ),
-}
+@dataclass(frozen=True)
+class CaptureKind:
+    """How captures of one kind are told from others, and opened."""
 
-KINDS = tuple(_KINDS)
-"""The kinds of captures by the names that `CaptureConfig.kind` takes."""
+    recognizes: Callable[[Path], bool]
+    """Tells whether a folder looks like one, whole or not."""
+    read: Callable[[Path, CaptureConfig], Capture]
+    """Opens the capture in a folder. Raises FileNotFoundError, OSError or ValueError that names the
+    file where it is damaged."""
+    description: str = ""
+    """What it is called in messages, with the files by which it is known; empty for its name."""
+
+
+CAPTURES = Registry("kind of capture", "splatpilot.captures", CaptureKind)
+"""All kinds of captures by the names that `CaptureConfig.kind` takes."""
+
+
+def register_capture(
+    name: str,
+    recognizes: Callable[[Path], bool],
+    read: Callable[[Path, CaptureConfig], Capture],
+    *,
+    description: str = "",
+) -> None:
+    """Makes a kind of capture known, so that `read_capture` opens it.
+
+    Args:
+        name: what `capture.kind` calls it.
+        recognizes, read, description: see `CaptureKind`.
+
+    Raises:
+        ValueError: if another kind has the name.
+    """
+    CAPTURES.add(name, CaptureKind(recognizes, read, description))
+
+
+# In this order: what the first recognises is not asked of the others.
+register_capture(
+    "tartanair_v1",
+    is_tartanair_v1,
+    read_tartanair_v1,
+    description="TartanAir V1 (image_left/, depth_left/, pose_left.txt)",
+)
+register_capture(
+    "tartanair_v2",
+    is_tartanair_v2,
+    read_tartanair_v2,
+    description="TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)",
+)
+register_capture(
+    "nerfstudio", is_nerfstudio, read_nerfstudio, description="nerfstudio (transforms.json)"
+)
+register_capture(
+    "tum", is_tum, read_tum, description="TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"
+)
+register_capture(
+    "seven_scenes",
+    is_seven_scenes,
+    read_seven_scenes,
+    description="7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
+)
+register_capture(
+    "colmap",
+    lambda path: model_folder(path) is not None,
+    read_colmap,
+    description="COLMAP (images/, sparse/0/)",
+)
+register_capture(
+    "photographs",
+    lambda path: len(photographs_in(path)) > 0,
+    read_photographs,
+    description="photographs alone",
+)
+
+_OURS = CAPTURES.registered()
 
 
 def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Capture:
     """Opens the capture in a folder, whose kind is told from what lies in it.
+
+    Kinds of other packages are asked first: any folder of images passes for photographs.
 
     Args:
         path: the folder.
@@ -73,10 +117,16 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
         raise FileNotFoundError(f"{path}: no such folder; a capture is a folder")
     said = config or CaptureConfig()
     config = complete_config(path, said)
-    if config.kind and config.kind not in _KINDS:
-        raise ValueError(f"capture.kind is {config.kind!r}; known are {', '.join(KINDS)}")
-    for kind, (fits, read, _) in _KINDS.items():
-        if config.kind == kind or (not config.kind and fits(path)):
-            return replace(read(path, config), folder=str(path.absolute()), config=said)
-    known = ", ".join(description for _, _, description in _KINDS.values())
+    kind = CAPTURES.find(config.kind) if config.kind else _recognize(path)
+    return replace(kind.read(path, config), folder=str(path.absolute()), config=said)
+
+
+def _recognize(path: Path) -> CaptureKind:
+    kinds = {
+        name: CAPTURES.find(name) for name in sorted(CAPTURES.names(), key=lambda n: n in _OURS)
+    }
+    for kind in kinds.values():
+        if kind.recognizes(path):
+            return kind
+    known = ", ".join(kinds[name].description or name for name in CAPTURES.names())
     raise ValueError(f"{path}: no capture of a known kind; known are {known}")

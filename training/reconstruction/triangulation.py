@@ -3,13 +3,17 @@
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import pycolmap
 from tqdm import tqdm
 
 from splatpilot.training.captures.capture import Capture, SfmPoints
+from splatpilot.training.captures.colmap import import_pycolmap
+
+if TYPE_CHECKING:
+    import pycolmap
 
 _OVERLAP = 10  # images after each one that it is matched with
 _FEATURES = 2048  # at most, of an image
@@ -25,6 +29,7 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
         ValueError: if fewer than 100 points are found.
         OSError: if the images cannot be read, or copied into the system's temporary folder.
     """
+    pycolmap = import_pycolmap()
     # COLMAP logs every image on standard error.
     pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)
     pycolmap.set_random_seed(0)
@@ -64,8 +69,9 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
 
 def _make_posed_model(
     capture: Capture, numbers: Sequence[int], database: Path, images: Path, names: Sequence[str]
-) -> pycolmap.Reconstruction:
+) -> "pycolmap.Reconstruction":
     """Extracts features into the database and returns a model of the cameras, without points."""
+    pycolmap = import_pycolmap()
     K = capture.K
     parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     extraction = pycolmap.FeatureExtractionOptions()

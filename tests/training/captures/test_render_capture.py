@@ -7,8 +7,12 @@ import pytest
 import trimesh
 
 from splatpilot.analysis.cli import main
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.diagrams.worlds.room import RoomConfig
+from splatpilot.systems.configuration import load_config
+from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.captures.render_capture import (
     RenderConfig,
@@ -50,6 +54,23 @@ def depth_of_room(frame) -> np.ndarray:
     with np.errstate(divide="ignore"):
         walls = np.where(rays > 0, (SIZE / 2 - p_WC) / rays, (-SIZE / 2 - p_WC) / rays)
     return walls.min(axis=-1)
+
+
+def test_a_world_may_be_named_as_in_the_benchmark(tmp_path, monkeypatch, capsys):
+    """`capture render P02` plans the world of that scenario; a name that is neither is refused."""
+    planned = []
+
+    def plan(config, seed):
+        planned.append((config, seed))
+        raise ValueError("planned")
+
+    monkeypatch.setattr(render_capture, "make_blueprint", plan)
+    words = ["--out", str(tmp_path / "capture"), "--seed", "3"]
+    assert main(["capture", "render", "P02", *words]) == 1
+    assert "planned" in capsys.readouterr().err
+    assert planned == [(load_config(Scenario(), benchmark_scenarios()["P02"]).world, 3)]
+    assert main(["capture", "render", "P99", *words]) == 1
+    assert "P99: there is no such file" in capsys.readouterr().err
 
 
 def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
