@@ -9,7 +9,7 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import SceneConfig
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.training.captures import render_capture
-from splatpilot.training.captures.render_capture import RenderConfig
+from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 

@@ -23,7 +23,7 @@ from .systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
 from .systems.vehicle.quadrotor_plant import QuadrotorPlant
 from .systems.vehicle.state_to_pose import StateToPose
 from .training.captures.capture import Capture
-from .training.captures.read_capture import read_capture
+from .training.captures.read_capture import read_capture, register_capture
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
@@ -59,6 +59,7 @@ __all__ = [
     "read_capture",
     "read_ply",
     "reconstruct",
+    "register_capture",
     "register_policy",
     "register_sensor",
     "register_world",

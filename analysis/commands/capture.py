@@ -56,8 +56,9 @@ def _add_render(actions: argparse._SubParsersAction) -> None:
 def _render(options: argparse.Namespace) -> None:
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import render_capture
+    from splatpilot.training.captures.render_config import RenderConfig
 
-    config = render_capture.RenderConfig()
+    config = RenderConfig()
     if options.up is not None:
         config.up = options.up
     if options.path is not None:

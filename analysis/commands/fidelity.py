@@ -20,7 +20,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _fidelity(options: argparse.Namespace) -> None:
     from splatpilot.analysis.fidelity import run as fidelity
+    from splatpilot.analysis.fidelity.config import FidelityConfig
     from splatpilot.systems.configuration import load_config
 
-    config = load_config(fidelity.FidelityConfig(), overrides=options.overrides)
+    config = load_config(FidelityConfig(), overrides=options.overrides)
     fidelity.run(options.scenes, options.out, config)

@@ -16,7 +16,8 @@ from splatpilot.analysis.reconstruction.figures import (
     save,
     write_sheet,
 )
-from splatpilot.analysis.reconstruction.measure_scene import SceneViews, depth_panels
+from splatpilot.analysis.reconstruction.measure_scene import depth_panels
+from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.measures import fit_exposure
 

@@ -8,7 +8,7 @@ made for this. From it follows how far poses may be perturbed in training (Sec. 
 import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +16,15 @@ from pydrake.common.yaml import yaml_dump_typed
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
+from splatpilot.analysis.fidelity.config import FidelityConfig
 from splatpilot.analysis.fidelity.figures import write_curves, write_views
 from splatpilot.analysis.fidelity.off_path import choose_withheld, displace_pose, drop_frames
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
 from splatpilot.analysis.fidelity.trust import first_crossing
 from splatpilot.analysis.fidelity.view_support import ViewSupport
-from splatpilot.analysis.reconstruction.measure_scene import (
-    SceneViews,
-    measure_scene,
-    read_measures,
-)
+from splatpilot.analysis.reconstruction.measure_scene import measure_scene
+from splatpilot.analysis.reconstruction.scene_measures import read_measures
+from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import (
     SceneMetadata,
     read_scene_metadata,
@@ -35,7 +34,6 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render_capture import true_camera
-from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 TrueCamera = Callable[[RigidTransform], CaptureFrame]
@@ -43,42 +41,6 @@ TrueCamera = Callable[[RigidTransform], CaptureFrame]
 
 RECIPE = "reconstruct.yaml"
 _GRID = 0.1  # [m], steps in which the surroundings of a pose are tried
-
-
-@dataclass(kw_only=True)
-class FidelityConfig:
-    """What is tried, and what counts as trusted."""
-
-    offsets: list[float] = field(
-        default_factory=lambda: [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0]
-    )
-    """[m], to the left and right of the path, in worlds that can be rendered."""
-    clearance: float = 0.2
-    """[m], that a displaced camera keeps from everything."""
-    stretches: list[int] = field(default_factory=lambda: [1, 3, 7, 13])
-    """Lengths of the stretches of frames that are withheld, in turn, where nothing can be
-    rendered."""
-    kept: int = 5
-    """Frames kept between them."""
-    max_depth_error: float = 0.05
-    """Relative error of depth, mean over a view, of which the median view is still trusted."""
-    max_psnr_drop: float = 6.0
-    """[dB] below the held-out frames on the path that is still trusted: errors twice as large."""
-    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    """How to reconstruct without the withheld frames."""
-
-    def validate(self) -> None:
-        """Raises ValueError for values that make no sense."""
-        self.reconstruct.validate()
-        if sorted(set(self.offsets)) != self.offsets or not self.offsets or self.offsets[0] < 0:
-            raise ValueError(f"offsets are {self.offsets}; at least one, rising from 0 is needed")
-        if not self.stretches or min(self.stretches) < 1 or self.kept < 1:
-            raise ValueError(
-                f"stretches are {self.stretches} and kept is {self.kept}: at least 1 is needed"
-            )
-        for name in ("clearance", "max_depth_error", "max_psnr_drop"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}, more than 0 is needed")
 
 
 def run(

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from splatpilot.analysis.reconstruction.measure_scene import SceneMeasures, measure_scene
+from splatpilot.analysis.reconstruction.measure_scene import measure_scene
+from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig

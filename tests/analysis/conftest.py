@@ -8,7 +8,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.reconstruction import ablation, measure_scene
+from splatpilot.analysis.reconstruction import ablation, scene_views
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
@@ -104,7 +104,7 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
         assert str(path) == "room"
         return capture
 
-    for module in (measure_scene, ablation):
+    for module in (scene_views, ablation):
         monkeypatch.setattr(module, "read_capture", read_capture)
     monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
     return Place(gaussians, capture, tmp_path)

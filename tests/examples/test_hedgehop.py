@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hedgehop"
@@ -53,6 +55,33 @@ def test_its_world_sensor_and_policy_fly_in_a_study(installed, tmp_path):
     assert "climber" in (tmp_path / "study" / "report.html").read_text()
     replay = splatpilot("replay", "study", "hedges-climber-2-001", path=installed, cwd=tmp_path)
     assert "equals the recorded flight to the last bit" in replay
+
+
+def test_its_captures_are_read(installed, tmp_path):
+    """A capture of its kind is told from its files, and has the poses and the camera that it
+    says: the camera looks where the body does."""
+    log = tmp_path / "log"
+    log.mkdir()
+    (log / "capture.yaml").write_text("intrinsics: [20, 20, 16, 12]\n")
+    lines = ["image,x,y,z,qx,qy,qz,qw"]
+    for i in range(3):
+        cv2.imwrite(str(log / f"{i}.png"), np.full((24, 32, 3), 40 * i, np.uint8))
+        lines.append(f"{i}.png,{0.5 * i},0,1,0,0,0,1")
+    (log / "flight_log.csv").write_text("\n".join(lines) + "\n")
+    program = (
+        "import splatpilot as sp\n"
+        "capture = sp.read_capture('log')\n"
+        "print(capture.source, len(capture), capture.K[0, 0])\n"
+        "print(*capture.X_WCs[2].multiply([0, 0, 1]))\n"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(installed)},
+    )
+    assert answer.stdout == f"flight log {log} 3 20.0\n2.0 0.0 1.0\n", answer.stderr
 
 
 def test_it_flies_uninstalled(tmp_path):

@@ -43,8 +43,8 @@ def register_capture(
     read: Callable[[Path, CaptureConfig], Capture],
     *,
     description: str = "",
-) -> None:
-    """Makes a kind of capture known, so that `read_capture` opens it.
+) -> CaptureKind:
+    """Makes a kind of capture known, so that `read_capture` opens it, and returns the kind.
 
     Args:
         name: what `capture.kind` calls it.
@@ -53,7 +53,9 @@ def register_capture(
     Raises:
         ValueError: if another kind has the name.
     """
-    CAPTURES.add(name, CaptureKind(recognizes, read, description))
+    kind = CaptureKind(recognizes, read, description)
+    CAPTURES.add(name, kind)
+    return kind
 
 
 # In this order: what the first recognises is not asked of the others.

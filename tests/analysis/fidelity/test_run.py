@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.analysis.cli import main
 from splatpilot.analysis.fidelity import run as fidelity
-from splatpilot.analysis.fidelity.run import FidelityConfig
+from splatpilot.analysis.fidelity.config import FidelityConfig
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.splats.baked_scene import BakedScene
@@ -152,11 +152,11 @@ def test_bad_settings(place, capsys, setting, message):
 
 def test_capture_without_depth(place, monkeypatch, capsys):
     """Without metric depth there is nothing to compare depth with."""
-    from splatpilot.analysis.reconstruction import measure_scene
+    from splatpilot.analysis.reconstruction import scene_views
     from splatpilot.training.captures.capture import no_depth
 
     blind = replace(place.capture, load_depth=no_depth)
-    monkeypatch.setattr(measure_scene, "read_capture", lambda path, config: blind)
+    monkeypatch.setattr(scene_views, "read_capture", lambda path, config: blind)
     scene = place.scene("blind")
     assert main(["fidelity", str(scene), "--out", str(place.folder / "out")]) == 1
     assert "has no metric depth" in capsys.readouterr().err

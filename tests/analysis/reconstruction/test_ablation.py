@@ -7,8 +7,9 @@ import pytest
 
 from splatpilot.analysis.cli import main
 from splatpilot.analysis.reconstruction import ablation
-from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
-from splatpilot.analysis.reconstruction.measure_scene import SceneMeasures
+from splatpilot.analysis.reconstruction.ablation import arm_config
+from splatpilot.analysis.reconstruction.ablation_result import ARMS, AblationResult
+from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.measures import ViewMeasures

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis.cli import main
-from splatpilot.analysis.reconstruction.measure_scene import (
-    SceneViews,
-    measure_scene,
-    read_measures,
-)
+from splatpilot.analysis.reconstruction.measure_scene import measure_scene
+from splatpilot.analysis.reconstruction.scene_measures import read_measures
+from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 

@@ -14,12 +14,8 @@ from splatpilot.diagrams.worlds.room import RoomConfig
 from splatpilot.systems.configuration import load_config
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.captures.render_capture import (
-    RenderConfig,
-    mesh_distance,
-    run,
-    true_camera,
-)
+from splatpilot.training.captures.render_capture import mesh_distance, run, true_camera
+from splatpilot.training.captures.render_config import RenderConfig
 
 SIZE = np.array([6.0, 4.0, 3.0])  # [m] of a room about the origin, seen from inside
 

@@ -1,0 +1,78 @@
+"""The figures of a scene against the frames of its capture: `metrics.json`."""
+
+import json
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from splatpilot.training.reconstruction.measures import ViewMeasures, mean_measure
+
+METRICS = "metrics.json"
+NAMES = {
+    "psnr_db": ("PSNR [dB]", "{:.2f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS-squeeze", "{:.3f}"),
+    "depth_mae_m": ("depth MAE [m]", "{:.3f}"),
+    "depth_relative": ("depth error, relative", "{:.2%}"),
+    "floater_fraction": ("floaters", "{:.2%}"),
+}
+"""How measures are called and written in tables."""
+
+
+@dataclass(frozen=True)
+class SceneMeasures:
+    """A scene against the frames of its capture."""
+
+    held_out: bool
+    """Whether the frames had no part in making the scene."""
+    width: int  # [px], at which it was measured: images are shrunk as they were for the making
+    height: int
+    frames: dict[int, ViewMeasures]
+    lpips_missing: str
+    """Why there is no LPIPS; empty if there is."""
+
+    def mean(self, name: str) -> float | None:
+        """Returns the mean of a measure over the frames that have it; None if none has."""
+        return mean_measure(self.frames.values(), name)
+
+    def as_json(self) -> dict:
+        """Returns the content of `metrics.json`: means, and the measures of each frame."""
+        return {
+            **{name: self.mean(name) for name in NAMES},
+            "held_out": self.held_out,
+            "width": self.width,
+            "height": self.height,
+            "lpips_missing": self.lpips_missing,
+            "frames": {str(i): asdict(frame) for i, frame in self.frames.items()},
+        }
+
+    def __str__(self) -> str:
+        kind = "held-out frames" if self.held_out else "frames the scene was made from"
+        lines = [f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}"]
+        for name, (title, form) in NAMES.items():
+            lines.append(f"{title:<22} {format_measure(self.mean(name), form)}")
+        if self.lpips_missing:
+            lines.append(f"no LPIPS: {self.lpips_missing}")
+        return "\n".join(lines)
+
+
+def format_measure(value: float | None, form: str) -> str:
+    """Returns a figure as text, a dash for None."""
+    return "-" if value is None else form.format(value)
+
+
+def read_measures(scene: Path) -> SceneMeasures | None:
+    """Returns what `metrics.json` of the scene folder says; None if there is none.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    file = scene / METRICS
+    if not file.is_file():
+        return None
+    try:
+        content = json.loads(file.read_text())
+        said = {field.name: content[field.name] for field in fields(SceneMeasures)}
+        said["frames"] = {int(i): ViewMeasures(**frame) for i, frame in said["frames"].items()}
+        return SceneMeasures(**said)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file}: {error!r}; delete the file and measure again") from error

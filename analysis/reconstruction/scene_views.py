@@ -1,0 +1,88 @@
+"""A scene folder beside the capture that it was made from."""
+
+from pathlib import Path
+
+from pydrake.math import RigidTransform
+
+from splatpilot.diagrams.worlds.scene_metadata import SceneMetadata, read_scene_metadata
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.gaussian_ply import read_ply
+from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.reconstruction.lpips import Lpips
+from splatpilot.training.reconstruction.measures import SceneRenderer, ViewMeasures, measure_view
+from splatpilot.training.reconstruction.views import shrink, shrink_factor
+
+
+def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
+    """Opens the capture that a scene folder was made from, with the settings it was made with.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: if `metadata` names none, or it cannot be opened.
+    """
+    file = scene / "scene.yaml"
+    if not metadata.capture:
+        raise ValueError(
+            f"{file}: names no capture to compare the scene with; reconstruct it again"
+        )
+    try:
+        config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
+    except ValueError as error:
+        raise ValueError(f"{file}: capture_settings: {error}") from None
+    return read_capture(metadata.capture, config)
+
+
+class SceneViews:
+    """A scene folder beside its capture: frames as they were, and as the scene shows them.
+
+    Args:
+        scene: the scene folder.
+        capture: what it was made from; read from where `scene.yaml` says if None.
+
+    Raises:
+        FileNotFoundError, ValueError: for a damaged scene, or one whose capture is not found.
+    """
+
+    def __init__(self, scene: Path, capture: Capture | None = None):
+        self.metadata: SceneMetadata = read_scene_metadata(scene)
+        if capture is None:
+            capture = read_capture_of(scene, self.metadata)
+        self.capture = capture
+        lost = [i for i in self.metadata.held_out if i >= len(capture)]
+        if lost:
+            raise ValueError(
+                f"{scene / 'scene.yaml'}: frame {lost[0]} is held out, but {capture.source} has "
+                f"only {len(capture)} frames; the capture has changed, reconstruct the scene again"
+            )
+        self.factor = shrink_factor(capture.width, self.metadata.image_width)
+        self.renderer = SceneRenderer(
+            read_ply(scene / "gaussians.ply"), self.metadata.representation
+        )
+
+    def frame(self, i: int) -> CaptureFrame:
+        """Returns frame i of the capture in the size at which the scene was made."""
+        return self.shrink(self.capture.frame(i))
+
+    def shrink(self, frame: CaptureFrame) -> CaptureFrame:
+        """Returns a frame of the capture's camera in the size at which the scene was made."""
+        return shrink(frame, self.factor)
+
+    @property
+    def fitted_poses(self) -> list[RigidTransform]:
+        """The poses of the cameras that the scene was made from."""
+        held_out = set(self.metadata.held_out)
+        return [X_WC for i, X_WC in enumerate(self.capture.X_WCs) if i not in held_out]
+
+    def render(self, frame: CaptureFrame) -> RenderedView:
+        """Returns what the scene shows the camera of `frame`."""
+        height, width = frame.depth.shape
+        background = self.metadata.background
+        return self.renderer.render(frame.K, width, height, frame.X_WC, background)
+
+    def measure(self, frame: CaptureFrame, lpips: Lpips | None = None) -> ViewMeasures:
+        """Compares both."""
+        return measure_view(
+            self.render(frame), frame.image, frame.depth, self.metadata.vignetting, lpips
+        )

@@ -1,0 +1,62 @@
+"""A kind of capture: the log of a drone that takes photographs where it flies."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot import Capture, register_capture
+from splatpilot.training.captures.capture import FileAxes
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.frame_files import FrameFiles, open_frames
+from splatpilot.training.captures.lens import Lens, pinhole
+from splatpilot.training.captures.poses import pose_from_quaternion
+
+LOG = "flight_log.csv"
+COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+# The camera looks along the body's x axis; the body's y is left and z up, as the world's.
+_AXES = FileAxes(
+    "x forward, y left, z up",
+    R_WF=RotationMatrix(),
+    R_BC=RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])),
+)
+
+
+def is_flight_log(path: Path) -> bool:
+    """Tells whether the folder holds a `flight_log.csv`."""
+    return (path / LOG).exists()
+
+
+def read_flight_log(path: Path, config: CaptureConfig) -> Capture:
+    """
+    Opens a log: lines `image, x, y, z, qx, qy, qz, qw`, metres, with a heading of these names.
+
+    Raises:
+        ValueError: for a line that is none, or without `capture.intrinsics`.
+    """
+    file = path / LOG
+    if not config.intrinsics:
+        raise ValueError(f"{path}: its intrinsics are unknown; set capture.intrinsics")
+    K = pinhole(*config.intrinsics)
+
+    def frame(row: dict[str, str], line: int) -> FrameFiles:
+        def pose() -> RigidTransform:
+            try:
+                numbers = np.array([float(row[name]) for name in COLUMNS])
+            except (KeyError, TypeError, ValueError):
+                raise ValueError(f"{file}, line {line}: no pose {', '.join(COLUMNS)}") from None
+            return pose_from_quaternion(numbers, f"{file}, line {line}")
+
+        return FrameFiles(path / row["image"], pose)
+
+    def lens(width: int, height: int) -> Lens:
+        return Lens(K, width, height)
+
+    with file.open(newline="") as stream:
+        frames = [frame(row, line) for line, row in enumerate(csv.DictReader(stream), start=2)]
+    return open_frames(path, "flight log", frames, axes=_AXES, lens=lens)
+
+
+FLIGHT_LOG = register_capture("flight_log", is_flight_log, read_flight_log)
