@@ -27,7 +27,7 @@ class Lens:
             return rays @ self.K[:2, :2].T + self.K[:2, 2]
         return self.project(rays)
 
-    def scaled(self, width: int, height: int) -> "Lens":
+    def scale_to(self, width: int, height: int) -> "Lens":
         """Returns the lens of the same camera's images at another resolution."""
         a = np.array([width / self.width, height / self.height])
         project = self.project
@@ -100,7 +100,7 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
     first = lenses[0]
     edge = _border(first.width, first.height)
 
-    def covered(zoom: float) -> bool:
+    def covers(zoom: float) -> bool:
         rays = (edge - first.K[:2, 2]) / (zoom * np.diag(first.K)[:2])
         for lens in lenses:
             pixels = lens.pixels(rays)
@@ -110,7 +110,7 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
         return True
 
     low, high = 1.0, 1.0
-    while not covered(high):
+    while not covers(high):
         low, high = high, 1.25 * high
         if high > 4:
             raise ValueError(
@@ -119,7 +119,7 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
             )
     while high - low > 1e-3:
         middle = (low + high) / 2
-        low, high = (low, middle) if covered(middle) else (middle, high)
+        low, high = (low, middle) if covers(middle) else (middle, high)
     K = first.K.copy()
     K[:2, :2] *= high
     return Lens(K, first.width, first.height)

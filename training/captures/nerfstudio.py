@@ -169,7 +169,7 @@ def _smaller_depth_camera(
                 "resample it to the images' size, or undistort both"
             )
         return lambda width, height: DepthCamera(
-            lens.scaled(width, height).K, width, height, RigidTransform()
+            lens.scale_to(width, height).K, width, height, RigidTransform()
         )
     return None
 

@@ -118,6 +118,8 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder; a capture is a folder")
     said = config or CaptureConfig()
+    if said.cache:  # found again from wherever the capture is opened with these settings
+        said = replace(said, cache=str(Path(said.cache).absolute()))
     config = complete_config(path, said)
     kind = CAPTURES.find(config.kind) if config.kind else _recognize(path)
     return replace(kind.read(path, config), folder=str(path.absolute()), config=said)

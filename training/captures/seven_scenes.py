@@ -62,13 +62,13 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
     def lens(width: int, height: int) -> Lens:
         if config.intrinsics:
             return Lens(pinhole(*config.intrinsics), width, height)
-        return Lens(pinhole(*_COLOR), 640, 480).scaled(width, height)
+        return Lens(pinhole(*_COLOR), 640, 480).scale_to(width, height)
 
     def depth_camera(width: int, height: int) -> DepthCamera:
         if config.depth_intrinsics:
             K = pinhole(*config.depth_intrinsics)
         else:
-            K = Lens(pinhole(*_DEPTH), 640, 480).scaled(width, height).K
+            K = Lens(pinhole(*_DEPTH), 640, 480).scale_to(width, height).K
         return DepthCamera(K, width, height, X_DC.inverse())
 
     capture = open_frames(

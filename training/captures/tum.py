@@ -79,7 +79,7 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
         name = next((name for name in _CAMERAS if name in path.resolve().name), "")
         (fx, fy, cx, cy), distortion = _CAMERAS.get(name, _DEFAULT)
         K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
-        return opencv_lens(K, 640, 480, distortion).scaled(width, height)
+        return opencv_lens(K, 640, 480, distortion).scale_to(width, height)
 
     capture = open_frames(
         path,

@@ -116,6 +116,7 @@ def test_bad_settings(place, capsys, setting, message):
 
 
 def test_two_captures_of_one_name(place, capsys):
-    """Two captures of one name would overwrite each other."""
-    assert main(["ablate", "room", "room", "--out", str(place.folder)]) == 1
-    assert "two captures are called room" in capsys.readouterr().err
+    """Two captures of one name would overwrite each other; a scene stands for its capture."""
+    for other in ("room", str(place.scene("scene"))):
+        assert main(["ablate", "room", other, "--out", str(place.folder / "out")]) == 1
+        assert "two captures are called room" in capsys.readouterr().err

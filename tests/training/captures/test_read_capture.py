@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,7 +70,8 @@ def test_a_kind_of_another_package(folder, tmp_path):
     assert capture.source == f"pair {folder}" and len(capture) == 2
     assert capture.K[0, 0] == 30
     assert (capture.folder, capture.config) == (str(folder), config)
-    assert read_capture(folder, CaptureConfig(kind="pair")).K[0, 0] == 20
+    plain = read_capture(folder, CaptureConfig(kind="pair", cache="kept"))
+    assert plain.K[0, 0] == 20 and plain.config.cache == str(Path("kept").absolute())
 
 
 def test_a_kind_that_is_not_installed(folder):
