@@ -9,10 +9,9 @@ from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
     read_scene,
     read_scene_folder,
-    read_scene_metadata,
     write_scene_folder,
-    write_scene_metadata,
 )
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
@@ -90,10 +89,12 @@ def test_how_it_was_made_is_kept(tmp_path, world):
         provenance="",
         representation="2dgs",
         capture="/captures/hall",
+        capture_settings=["depth_unit=500.0"],
         held_out=[0, 8],
         image_width=320,
     )
     assert (written.representation, written.capture) == ("2dgs", "/captures/hall")
+    assert written.capture_settings == ["depth_unit=500.0"]
     assert (written.held_out, written.image_width) == ([0, 8], 320)
     assert (written.perturbation_bound, written.pose_perturbation_bounds) == (None, [])
     assert read_scene_metadata(folder) == written
@@ -115,6 +116,7 @@ def test_scene_from_before_these_fields(tmp_path, world):
     metadata = read_scene_metadata(folder)
     assert (metadata.representation, metadata.capture, metadata.held_out) == ("3dgs", "", [])
     assert (metadata.image_width, metadata.perturbation_bound) == (0, None)
+    assert metadata.capture_settings == []
 
 
 def test_a_scene_is_replaced_whole(tmp_path, world):
@@ -128,7 +130,7 @@ def test_a_scene_is_replaced_whole(tmp_path, world):
     assert list(tmp_path.iterdir()) == [folder]
 
 
-@pytest.mark.parametrize("failing", ["write_ply", "yaml_dump_typed"])
+@pytest.mark.parametrize("failing", ["write_ply", "write_scene_metadata"])
 def test_failed_write_keeps_the_old_scene(tmp_path, world, monkeypatch, failing):
     """A write that fails at any file leaves the old scene as it was, and nothing beside it."""
     folder = tmp_path / "scene"
