@@ -131,7 +131,8 @@ def measure_reading(reading: Reading, pairs: Sequence[FramePair]) -> ReadingFit:
 
 def _relative_errors(reading: Reading, pair: FramePair) -> NDArray[np.float64]:
     f, c = np.diag(reading.K)[:2], reading.K[:2, 2]
-    rays = back_project(reading.K, *pair.pixels, np.ones(len(pair.depth))).T
+    u, v = pair.pixels
+    rays = back_project(reading.K, u, v, np.ones_like(u)).T
     z = reading.factor * pair.depth
     if reading.is_range:
         z = z / np.linalg.norm(rays, axis=0)

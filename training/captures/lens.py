@@ -46,7 +46,7 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
 
 def back_project(
     K: NDArray[np.float64], u: NDArray, v: NDArray, depth: NDArray
-) -> NDArray[np.floating]:
+) -> NDArray[np.float64]:
     """Returns the points p_CQ (..., 3) that a pinhole camera sees.
 
     Args:
