@@ -36,7 +36,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
-from splatpilot.diagrams.worlds.forest.forest import make_forest
+from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
@@ -146,7 +146,7 @@ def run(*, out: Path, frames: int = 8, seconds: float = 2.1) -> None:
         OSError: if `out` cannot be written.
     """
     require_writable_folder(out)
-    world = make_forest(ForestConfig())
+    world = make_world(ForestConfig(), 0)
     diagram = BuildSplatBackgroundDiagram(world)
     simulator = throw(diagram, world)
     for k, moment in enumerate(np.linspace(0, seconds, frames)):

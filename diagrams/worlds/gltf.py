@@ -10,7 +10,7 @@ import numpy as np
 
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.mesh import Mesh, mesh_of, mesh_of_gaussians
-from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
 from splatpilot.systems.files import written_atomically
 
@@ -38,7 +38,7 @@ def write_gltf(blueprint: Blueprint, path: Path, texel: float = 0.02) -> None:
     meshes = mesh_of(blueprint, light, texel)
     surroundings = blueprint.surroundings()
     if surroundings:
-        meshes.append(mesh_of_gaussians(merged(surroundings)))
+        meshes.append(mesh_of_gaussians(merge(surroundings)))
     with written_atomically(path) as temporary:
         temporary.write_text(json.dumps(_document(meshes)))
 
