@@ -89,9 +89,8 @@ def bounds_of_depth_images(
     max_range, K = _require_range(max_range), _require_intrinsics(K)
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     for depth, X_WC in _pair(depths, X_WCs, "bounding depth"):
-        row, column = np.mgrid[0 : depth.shape[0] : 4, 0 : depth.shape[1] : 4]
         z = np.where(np.isfinite(depth), depth, 0.0)[::4, ::4]
-        x, y = (column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1]
+        x, y = np.meshgrid(*(slopes[::4] for slopes in _ray_slopes(depth.shape, K)))
         ray = np.stack([x, y, np.ones_like(x)], -1)
         reach = np.minimum(z, max_range / np.linalg.norm(ray, axis=-1))
         p_CQ = (reach[..., None] * ray)[z > 0.0]
@@ -220,6 +219,14 @@ def _halve(image: np.ndarray) -> np.ndarray:
     return np.maximum(image[:, ::2], image[:, 1::2])
 
 
+def _ray_slopes(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x / z (W,) and y / z (H,) of the rays through the pixels of an image of shape (H, W)."""
+    height, width = shape
+    x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+    return x, y
+
+
 def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
     """n . (u, v, 1) at each pixel, with n the surface's unit normal and (u, v, 1) the pixel's ray.
 
@@ -231,11 +238,10 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
     Returns:
         (H, W) float32, from _MIN_COSINE to the length of the ray; the former where unknown.
     """
-    height, width = depth.shape
     valid = (depth > 0.0) & np.isfinite(depth)
     w = np.where(valid, 1.0 / np.where(valid, depth, 1.0), np.float32(np.nan)).astype(np.float32)
-    u = ((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]).astype(np.float32)
-    v = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]).astype(np.float32)[:, None]
+    u, v = (slopes.astype(np.float32) for slopes in _ray_slopes(depth.shape, K))
+    v = v[:, None]
 
     def slope(axis: int, focal_length: float) -> np.ndarray:
         missing = np.full_like(w.take([0], axis), np.nan)
