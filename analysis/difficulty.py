@@ -200,7 +200,7 @@ def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray
     return low - VEHICLE_RADIUS
 
 
-def _known(world: World) -> DistanceField:
+def _trusted_field(world: World) -> DistanceField:
     """The exact field of a generated world; of others the grid, unknown space counting as full."""
     field = world.distance_field
     return field.conservative() if isinstance(field, Esdf) else field
@@ -231,7 +231,7 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
                 started = time.process_time()
                 world = make_world(world_config, seed)
                 spent.append(time.process_time() - started)
-                known = _known(world)
+                known = _trusted_field(world)
                 measured = difficulty(known, world.p_WS, world.p_WG, seed)
                 rows.append(list(vars(measured).values()))
         except FileNotFoundError as error:

@@ -53,7 +53,7 @@ def _patches(
         elif face.round:
             uv, extent = _spiral(face, material.spacing, rng)
         else:
-            uv, extent = _closed(face, material.spacing, rng)
+            uv, extent = _lattice(face, material.spacing, rng)
         facing = blueprint.plot.is_faced(*face.at(uv)[:2])
         if not facing.any():
             continue
@@ -93,7 +93,7 @@ _CORNERS = ((0.4, 0.7), (-0.4, -0.7))
 """Places about the middle of a patch, in standard deviations."""
 
 
-def _closed(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Coordinates uv (N, 2) [m] of a jittered lattice that divides the face evenly, and standard
     deviations (N, 2) [m] with which it leaves no holes."""
     size = np.array(face.size)

@@ -121,6 +121,6 @@ def test_file_is_whole_and_the_same_twice(blueprint, tmp_path):
 
 
 def test_a_folder_that_does_not_exist_is_an_error(blueprint, tmp_path):
-    """Where nothing can be written the error names the place."""
+    """Where nothing can be written the error names the folder."""
     with pytest.raises(OSError, match="nowhere"):
         write_gltf(blueprint, tmp_path / "nowhere" / "world.gltf", texel=0.2)

@@ -48,7 +48,7 @@ def test_there_are_seventeen_and_all_are_valid():
 
 @pytest.mark.parametrize("file", GENERATED, ids=lambda file: file.stem)
 def test_instances_are_feasible_and_repeatable(file):
-    """Start and goal are clear, a way is proven, the same seed gives the same place and another
+    """Start and goal are clear, a way is proven, the same seed gives the same world and another
     seed another."""
     config = load_config(Scenario(), file).world
     one, again, other = (make_blueprint(config, seed) for seed in (3, 3, 4))
