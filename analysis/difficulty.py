@@ -28,10 +28,10 @@ from splatpilot.analysis.path_lengths import (
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import (
+    are_connected,
     cell_of,
     conservative_distance,
     grid_distances,
-    joined,
 )
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
@@ -196,11 +196,11 @@ def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray
     low, high = 0.0, float(min(grid[end] for end in ends))
     while high - low > 0.01:
         middle = (low + high) / 2
-        low, high = (middle, high) if joined(grid >= middle, *ends) else (low, middle)
+        low, high = (middle, high) if are_connected(grid >= middle, *ends) else (low, middle)
     return low - VEHICLE_RADIUS
 
 
-def _known(world: World) -> DistanceField:
+def _trusted_field(world: World) -> DistanceField:
     """The exact field of a generated world; of others the grid, unknown space counting as full."""
     field = world.distance_field
     return field.conservative() if isinstance(field, Esdf) else field
@@ -231,7 +231,7 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
                 started = time.process_time()
                 world = make_world(world_config, seed)
                 spent.append(time.process_time() - started)
-                known = _known(world)
+                known = _trusted_field(world)
                 measured = difficulty(known, world.p_WS, world.p_WG, seed)
                 rows.append(list(vars(measured).values()))
         except FileNotFoundError as error:

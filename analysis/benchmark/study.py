@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from splatpilot.diagrams.policies import BENCHMARK_POLICIES, policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.seeds import TRAINING_SEEDS
 
 
 class RolloutSpec(NamedTuple):

@@ -36,7 +36,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
-from splatpilot.diagrams.worlds.forest.forest import make_forest
+from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
@@ -51,8 +51,7 @@ R_BC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 
 
 def BuildSplatBackgroundDiagram(world: World, width: int = 640, height: int = 480) -> Diagram:
-    """
-    A ball and a box above the ground of `world`, watched from its start by an RgbdSensor.
+    """A ball and a box above the ground of `world`, watched from its start by an RgbdSensor.
 
     The diagram exports the sensor's `color_image`, `depth_image_32f` and `label_image`; its systems
     are named `plant`, `scene_graph` and `camera`.
@@ -108,10 +107,8 @@ def _make_camera(world: World, width: int, height: int) -> RgbdSensor:
 
 
 def widest_lane(world: World, nearest: float, farthest: float, half_length: float) -> float:
-    """
-    Where to throw: the x [m], from `nearest` to `farthest` beyond the start, at which a line along
-    y, `half_length` to either side of the start, keeps the greatest distance from all surfaces.
-    """
+    """The x [m], from `nearest` to `farthest` [m] beyond the start, at which a line along y, to
+    `half_length` [m] on either side of the start, keeps the greatest distance from all surfaces."""
     x = world.p_WS[0] + np.arange(nearest, farthest, 0.1)
     y = world.p_WS[1] + np.arange(-half_length, half_length, 0.1)
     p_WQ = np.stack(np.meshgrid(x, y, [1.0], indexing="ij"), axis=-1)
@@ -139,14 +136,13 @@ def throw(diagram: Diagram, world: World) -> Simulator:
 
 
 def run(*, out: Path, frames: int = 8, seconds: float = 2.1) -> None:
-    """
-    Writes `color_K.png` and `depth_K.png` for `frames` moments evenly spread over `seconds`.
+    """Writes `color_K.png` and `depth_K.png` for `frames` moments evenly spread over `seconds`.
 
     Raises:
         OSError: if `out` cannot be written.
     """
     require_writable_folder(out)
-    world = make_forest(ForestConfig())
+    world = make_world(ForestConfig(), 0)
     diagram = BuildSplatBackgroundDiagram(world)
     simulator = throw(diagram, world)
     for k, moment in enumerate(np.linspace(0, seconds, frames)):

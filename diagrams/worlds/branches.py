@@ -1,19 +1,20 @@
 """A forest of thin things: dead limbs on the trunks and wires between them."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.feasibility import CLEARANCE, TRIES, is_feasible
-from splatpilot.diagrams.worlds.fittings import check_count, check_range, clear_of
+from splatpilot.diagrams.worlds.feasibility import TRIES, is_feasible
+from splatpilot.diagrams.worlds.fittings import TIGHT_CLEARING, check_count, check_range, clear_of
 from splatpilot.diagrams.worlds.forest.config import TrunksConfig
 from splatpilot.diagrams.worlds.forest.forest import Forest
 from splatpilot.diagrams.worlds.forest.layout import BARK
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.illumination import Illumination
 from splatpilot.diagrams.worlds.solids.solid import Solid
-from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.diagrams.worlds.solids.surfels import draw
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import Capsule
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -40,32 +41,29 @@ class BranchesConfig(TrunksConfig):
             raise ValueError(f"limb_length = {self.limb_length} m must be 0.2 to 5 m")
 
 
-class Branches(Forest):
-    """What `config` and `seed` determine of such a forest.
+def branches_blueprint(config: BranchesConfig, seed: int) -> Blueprint:
+    """Grows the forest of `config` and puts limbs and wires into it.
 
     Raises:
-        ValueError: see `Forest`; or if limbs and wires leave no way.
+        ValueError: see `forest_blueprint`; or if limbs and wires leave no way.
     """
+    forest = Forest(config, seed)
+    bare = forest.blueprint()
+    for attempt in range(TRIES):
+        thin = _limbs_and_wires(forest, config, np.random.default_rng([seed, 20, attempt]))
+        blueprint = replace(bare, name="branches", solids=[*bare.solids, *thin])
+        if is_feasible(blueprint):
+            return replace(blueprint, gaussians=partial(_gaussians, forest, blueprint, thin))
+    raise ValueError(
+        f"branches: limbs = {config.limbs} and wires = {config.wires} leave no way in {TRIES} "
+        f"draws from seed {seed}; use fewer of them or a wider spacing"
+    )
 
-    def __init__(self, config: BranchesConfig, seed: int) -> None:
-        super().__init__(config, seed)
-        bare = super().blueprint()
-        for attempt in range(TRIES):
-            self.thin = _limbs_and_wires(self, config, np.random.default_rng([seed, 20, attempt]))
-            self._blueprint = replace(bare, name="branches", solids=[*bare.solids, *self.thin])
-            if is_feasible(self._blueprint):
-                return
-        raise ValueError(
-            f"branches: limbs = {config.limbs} and wires = {config.wires} leave no way in {TRIES} "
-            f"draws from seed {seed}; use fewer of them or a wider spacing"
-        )
 
-    def blueprint(self) -> Blueprint:
-        return self._blueprint
-
-    def gaussians(self, esdf: Esdf) -> GaussianScene:
-        light = self._blueprint.light(esdf)
-        return merged([super().gaussians(esdf), draw(self._blueprint, self.thin, light)])
+def _gaussians(
+    forest: Forest, blueprint: Blueprint, thin: list[Solid], light: Illumination
+) -> GaussianScene:
+    return merge([forest.gaussians(), draw(blueprint, thin, light)])
 
 
 def _limbs_and_wires(
@@ -88,4 +86,4 @@ def _limbs_and_wires(
         ends[:, [0, 2]] += rng.uniform(-0.8, 0.8, (2, 2))
         radius = rng.uniform(config.thickness_min, config.thickness_max) / 2
         thin.append(Solid(Capsule(ends[0], ends[1], float(radius)), "cable", k))
-    return [s for s in thin if clear_of(s.shape, [forest.p_WS, forest.p_WG], CLEARANCE + 0.1)]
+    return [s for s in thin if clear_of(s.shape, [forest.p_WS, forest.p_WG], TIGHT_CLEARING)]

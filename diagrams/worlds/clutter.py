@@ -6,25 +6,24 @@ import numpy as np
 from pydrake.math import RollPitchYaw, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.feasibility import draw_feasible
 from splatpilot.diagrams.worlds.fittings import (
+    CLEARING,
     check_count,
     check_positive,
     check_range,
+    check_size,
     clear_of,
     daylight,
     ground,
     start_and_goal,
-    trees_around,
     turned_box,
 )
+from splatpilot.diagrams.worlds.forest.surroundings import trees_around
 from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.systems.collision.shapes import Sphere
-
-_OPEN = 1.0
-"""[m], least distance of obstacles from start and goal."""
 
 _BALLS = ["stone", "concrete", "foliage", "hazard", "metal"]
 _BOXES = ["crate", "wood", "metal", "hazard", "brick", "concrete", "signage", "fabric"]
@@ -57,11 +56,7 @@ class ClutterConfig:
         check_count(self, "spheres", "boxes")
         if not 0 <= self.lean_max <= 45:
             raise ValueError(f"lean_max = {self.lean_max} deg must be 0 to 45 deg")
-        if self.length < 6 or self.width < 4 or self.height < 3:
-            raise ValueError(
-                f"a field of {self.length:g} x {self.width:g} x {self.height:g} m is too small; at "
-                "least 6 x 4 x 3 m are needed"
-            )
+        check_size(self, "field", 6, 4, 3)
 
 
 def clutter_blueprint(config: ClutterConfig, seed: int) -> Blueprint:
@@ -71,46 +66,45 @@ def clutter_blueprint(config: ClutterConfig, seed: int) -> Blueprint:
         ValueError: for values with which none can be made, or without a way through.
     """
     config.validate()
-    lower = np.array([0.0, -config.width / 2, 0.0])
-    upper = np.array([config.length, config.width / 2, config.height])
+    plot = Plot.of_size(config.length, config.width, config.height)
 
     def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(lower, upper, rng)
+        p_WS, p_WG = start_and_goal(plot, rng)
         obstacles: list[Solid] = []
         for make, number in ((_sphere, config.spheres), (_box, config.boxes)):
             for _ in range(number):
                 for _ in range(50):  # elsewhere, if it is too near the start or goal
-                    solid = make(config, lower, upper, rng)
-                    if clear_of(solid.shape, [p_WS, p_WG], _OPEN):
+                    solid = make(config, plot, rng)
+                    if clear_of(solid.shape, [p_WS, p_WG], CLEARING):
                         obstacles.append(solid)
                         break
         hour, light = daylight(rng)
         return Blueprint(
             name="clutter",
-            lower_W=lower,
-            upper_W=upper,
+            lower_W=plot.lower,
+            upper_W=plot.upper,
             solids=[ground(("grass", "paving", "concrete")[rng.integers(3)]), *obstacles],
             p_WS=p_WS,
             p_WG=p_WG,
             light=light,
-            surroundings=trees_around(Plot(lower, upper), hour, seed),
+            surroundings=trees_around(plot, hour, seed),
             seed=seed,
             voxel_size=config.voxel_size,
         )
 
-    return drawn(draw, seed)
+    return draw_feasible(draw, seed)
 
 
-def _sphere(config: ClutterConfig, lower, upper, rng: np.random.Generator) -> Solid:
+def _sphere(config: ClutterConfig, plot: Plot, rng: np.random.Generator) -> Solid:
     radius = rng.uniform(config.sphere_min, config.sphere_max)
-    p = rng.uniform(lower, upper)
+    p = rng.uniform(plot.lower, plot.upper)
     material = _BALLS[rng.integers(len(_BALLS))]
     return Solid(Sphere(p, float(radius)), material, int(rng.integers(1000)))
 
 
-def _box(config: ClutterConfig, lower, upper, rng: np.random.Generator) -> Solid:
+def _box(config: ClutterConfig, plot: Plot, rng: np.random.Generator) -> Solid:
     half = rng.uniform(config.half_min, config.half_max, 3)
-    p = rng.uniform(lower, upper)
+    p = rng.uniform(plot.lower, plot.upper)
     if config.floating:
         turn = RotationMatrix(Rotation.random(rng=rng).as_matrix())
     else:

@@ -8,6 +8,7 @@ from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.esdf_from_distance_field import cubes_of_points
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
@@ -16,11 +17,8 @@ CLEARANCE = 0.8
 TRIES = 60
 """Draws of an instance before its parameters are refused."""
 
-TRAINING_SEEDS = 1_000_000
-"""First seed of worlds for training; benchmarks fly in those below."""
 
-
-def drawn(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Blueprint:
+def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Blueprint:
     """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
 
     Raises:
@@ -71,7 +69,7 @@ def connects(
     """
     grid = grid_distances(field, spacing)
     free = grid > radius + spacing / 2
-    return joined(free, *(cell_of(field, grid, spacing, p) for p in (p_WS, p_WG)))
+    return are_connected(free, *(cell_of(field, grid, spacing, p) for p in (p_WS, p_WG)))
 
 
 def cell_of(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
@@ -80,7 +78,7 @@ def cell_of(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -
     return tuple(int(c) for c in cell)
 
 
-def joined(free: NDArray, a: tuple[int, ...], b: tuple[int, ...]) -> bool:
+def are_connected(free: NDArray, a: tuple[int, ...], b: tuple[int, ...]) -> bool:
     """Whether steps along the axes lead from cell a to cell b of a grid, all of them `free`."""
     part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
     return bool(part[a] == part[b] > 0)
@@ -93,9 +91,6 @@ def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
         low + spacing * (np.arange(n) + 0.5) for low, n in zip(field.lower_W, shape, strict=True)
     )
     grid = np.empty(shape)
-    cube = 8  # points close together share their nearest shapes
-    for i, j, k in np.ndindex(*(-(-shape // cube))):
-        part = tuple(slice(cube * a, cube * (a + 1)) for a in (i, j, k))
-        p = np.stack(np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij"), axis=-1)
-        grid[part] = conservative_distance(field, p)
+    for part, p_WQ in cubes_of_points(x, y, z):
+        grid[part] = conservative_distance(field, p_WQ)
     return grid

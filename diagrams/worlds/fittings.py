@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.diagrams.worlds.forest import surroundings as forest_surroundings
 from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.diagrams.worlds.solids.illumination import Illumination, Lamplight, Sunlight
 from splatpilot.diagrams.worlds.solids.light import Daylight
@@ -14,13 +13,20 @@ from splatpilot.diagrams.worlds.solids.patterns import SIGN
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 WALL = 0.3
 """[m], thickness of walls."""
 
 INSET = 1.5
 """[m], distance of start and goal from the ends of the volume."""
+
+CLEARING, TIGHT_CLEARING = 1.0, 0.9
+"""[m], radius about start and goal in which no obstacles are put: in the open, and among thin or
+reconstructed things. It is more than the `CLEARANCE` that worlds are checked for."""
+
+PASSAGE = 2 * VEHICLE_RADIUS + 0.1
+"""[m], least width of a gap that is left for the vehicle."""
 
 
 def box(lower: ArrayLike, upper: ArrayLike, material: str, seed: int) -> Solid:
@@ -39,10 +45,10 @@ def ground(material: str, seed: int = 0) -> Solid:
     return Solid(HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0), material, seed)
 
 
-def hall(lower: NDArray, upper: NDArray, materials: list[str], rng: np.random.Generator):
-    """Four walls around the volume [lower, upper], their inner faces on its bounds, each of one of
-    the `materials`. Returns the solids."""
-    (x0, y0, _), (x1, y1, z1) = lower, upper
+def hall(plot: Plot, materials: list[str], rng: np.random.Generator) -> list[Solid]:
+    """The walls of a hall about its volume, each of one of the `materials`: its inner face is a
+    bound of the volume; those at the least and greatest y first, then those at its two ends."""
+    (x0, y0, _), (x1, y1, z1) = plot.lower, plot.upper
     sides = (
         ((x0 - WALL, y0 - WALL, 0), (x1 + WALL, y0, z1)),
         ((x0 - WALL, y1, 0), (x1 + WALL, y1 + WALL, z1)),
@@ -55,20 +61,28 @@ def hall(lower: NDArray, upper: NDArray, materials: list[str], rng: np.random.Ge
     ]
 
 
-def roof(lower: NDArray, upper: NDArray) -> Solid:
+def roof(plot: Plot) -> Solid:
     """A ceiling whose lower face is the top of the volume."""
-    low, high = (
-        np.array([*lower[:2] - WALL, upper[2]]),
-        np.array([*upper[:2] + WALL, upper[2] + 0.2]),
-    )
-    return box(low, high, "ceiling", 0)
+    (x0, y0), (x1, y1), z = plot.lower[:2] - WALL, plot.upper[:2] + WALL, plot.upper[2]
+    return box((x0, y0, z), (x1, y1, z + 0.2), "ceiling", 0)
+
+
+def signs_in(walls: list[Solid], aside: int, ahead: int, rng: np.random.Generator) -> list[Solid]:
+    """Signs on the inner faces of the `walls` of a hall: up to `aside` on each of those along it,
+    up to `ahead` on each of those at its ends."""
+    faces, numbers = (3, 2, 1, 0), (aside, aside, ahead, ahead)
+    return [
+        sign
+        for wall, face, number in zip(walls, faces, numbers, strict=True)
+        for sign in signs_on(wall, face, number, rng)
+    ]
 
 
 def signs_on(wall: Solid, face: int, number: int, rng: np.random.Generator) -> list[Solid]:
     """Screws up to `number` signs, 2 cm thick, at heights of 1 to 3.4 m to one upright side of an
     upright box: face 0 is -x, 1 +x, 2 -y, 3 +y."""
     assert isinstance(wall.shape, Box)
-    half, p = np.asarray(wall.shape.size) / 2, wall.shape.X_WS.translation()
+    half, p = np.asarray(wall.shape.size) / 2, wall.shape.X_WO.translation()
     k, sign = face // 2, 2 * (face % 2) - 1
     along = 1 - k
     room = half[along] - SIGN[0] / 2 - 0.1
@@ -91,14 +105,13 @@ def signs_on(wall: Solid, face: int, number: int, rng: np.random.Generator) -> l
 
 def daylight(rng: np.random.Generator) -> tuple[Daylight, Callable[[Esdf], Illumination]]:
     """An hour of the day, and its light with the shadows of a distance field."""
-    hour = Daylight.sampled(rng)
+    hour = Daylight.sample(rng)
     return hour, lambda esdf: Sunlight(hour, esdf)
 
 
-def lamplight(
-    lower: NDArray, upper: NDArray, rng: np.random.Generator
-) -> Callable[[Esdf], Illumination]:
-    """Lamps under the roof z = upper[2], about 4 m apart."""
+def lamplight(plot: Plot, rng: np.random.Generator) -> Callable[[Esdf], Illumination]:
+    """Lamps under the roof, about 4 m apart."""
+    lower, upper = plot.lower, plot.upper
     n = np.maximum(np.round((upper - lower)[:2] / 4.0).astype(int), 1)
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
     plan = lower[:2] + (np.stack([i, j], axis=-1).reshape(-1, 2) + 0.5) * (upper - lower)[:2] / n
@@ -108,27 +121,12 @@ def lamplight(
     return lambda esdf: Lamplight(lamps, tint, esdf)
 
 
-def trees_around(plot: Plot, hour: Daylight, seed: int) -> Callable[[], list[GaussianScene]]:
-    """Draws bushes and two rows of trees far around the volume."""
-
-    def draw() -> list[GaussianScene]:
-        rngs = [np.random.default_rng([seed, 50 + k]) for k in range(3)]
-        return [
-            forest_surroundings.bushes(plot, hour, rngs[0]),
-            forest_surroundings.edge(plot, hour, 15.0, 9.0, rngs[1]),
-            forest_surroundings.edge(plot, hour, 22.0, 14.0, rngs[2]),
-        ]
-
-    return draw
-
-
 def start_and_goal(
-    lower: NDArray,
-    upper: NDArray,
-    rng: np.random.Generator,
-    heights: tuple[float, float] = (1.2, 2.4),
+    plot: Plot, rng: np.random.Generator, heights: tuple[float, float] = (1.2, 2.4)
 ) -> tuple[NDArray, NDArray]:
-    """Draws a start (3,) and a goal (3,) [m] at the two ends of the volume along x."""
+    """Draws a start (3,) and a goal (3,) [m] at the two ends of the volume along x, at `heights`
+    [m] between the two."""
+    lower, upper = plot.lower, plot.upper
     aside = min(0.3 * (upper - lower)[1], (upper - lower)[1] / 2 - INSET)
     y, z = (lower + upper)[1] / 2 + rng.uniform(-aside, aside, 2), rng.uniform(*heights, 2)
     return (
@@ -143,10 +141,7 @@ def clear_of(shape: Shape, points: list[NDArray], clearance: float) -> bool:
 
 
 def check_positive(config: object, *names: str) -> None:
-    """
-    Raises:
-        ValueError: for a field of `config` that is not positive and finite, or above 200.
-    """
+    """Raises ValueError for a field of `config` that is not positive and finite, or above 200."""
     for name in names:
         value = getattr(config, name)
         if not 0 < value <= 200:
@@ -154,20 +149,25 @@ def check_positive(config: object, *names: str) -> None:
 
 
 def check_count(config: object, *names: str) -> None:
-    """
-    Raises:
-        ValueError: for a field of `config` that is not 0 to 1000.
-    """
+    """Raises ValueError for a field of `config` that is not 0 to 1000."""
     for name in names:
         if not 0 <= getattr(config, name) <= 1000:
             raise ValueError(f"{name} = {getattr(config, name)} must be 0 to 1000")
 
 
 def check_range(config: object, low: str, high: str) -> None:
-    """
-    Raises:
-        ValueError: if the fields are not positive, at most 100, or `low` is above `high`.
-    """
+    """Raises ValueError for fields of `config` that are not positive, or more than 100, or of which
+    `low` is above `high`."""
     least, most = getattr(config, low), getattr(config, high)
     if not 0 < least <= most <= 100:
         raise ValueError(f"{low} = {least} and {high} = {most} m must be positive and in order")
+
+
+def check_size(config: object, what: str, length: float, width: float, height: float) -> None:
+    """Raises ValueError for a `config` whose length, width or height [m] is less than that."""
+    size = [getattr(config, name) for name in ("length", "width", "height")]
+    if np.less(size, (length, width, height)).any():
+        raise ValueError(
+            f"a {what} of {size[0]:g} x {size[1]:g} x {size[2]:g} m is too small; at least "
+            f"{length:g} x {width:g} x {height:g} m are needed"
+        )

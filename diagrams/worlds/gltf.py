@@ -1,21 +1,18 @@
 """Worlds as glTF files, for Drake's render engines and everything else that reads meshes."""
 
-import base64
 import json
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.mesh import Mesh, mesh_of, mesh_of_gaussians
-from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.gltf import add_primitive, data_uri
 
-_FLOAT, _UINT = 5126, 5125  # component types
-_VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 _NEAREST, _LINEAR, _CLAMP = 9728, 9729, 33071
 
 
@@ -38,7 +35,7 @@ def write_gltf(blueprint: Blueprint, path: Path, texel: float = 0.02) -> None:
     meshes = mesh_of(blueprint, light, texel)
     surroundings = blueprint.surroundings()
     if surroundings:
-        meshes.append(mesh_of_gaussians(merged(surroundings)))
+        meshes.append(mesh_of_gaussians(merge(surroundings)))
     with written_atomically(path) as temporary:
         temporary.write_text(json.dumps(_document(meshes)))
 
@@ -59,20 +56,9 @@ def _document(meshes: list[Mesh]) -> dict[str, Any]:
     ):  # fmt: skip
         document[name] = []
     for k, mesh in enumerate(meshes):
-        x, y, z = mesh.vertices.T
-        position = np.column_stack([x, z, -y]).astype(np.float32)  # z-up to y-up
-        attributes = {
-            "POSITION": _accessor(document, position, "VEC3", _VERTICES),
-            "TEXCOORD_0": _accessor(document, mesh.uv.astype(np.float32), "VEC2", _VERTICES),
-        }
-        indices = mesh.triangles.astype(np.uint32).reshape(-1, 1)
-        primitive = {
-            "attributes": attributes,
-            "indices": _accessor(document, indices, "SCALAR", _INDICES),
-            "material": k,
-        }
+        primitive = add_primitive(document, mesh.vertices, mesh.uv, mesh.triangles)
         document["nodes"].append({"mesh": k})
-        document["meshes"].append({"primitives": [primitive]})
+        document["meshes"].append({"primitives": [{**primitive, "material": k}]})
         document["materials"].append(
             {
                 "pbrMetallicRoughness": {
@@ -90,31 +76,8 @@ def _document(meshes: list[Mesh]) -> dict[str, Any]:
     return document
 
 
-def _accessor(document: dict[str, Any], array: np.ndarray, kind: str, target: int) -> int:
-    content = array.tobytes()
-    number = len(document["accessors"])
-    document["buffers"].append(
-        {
-            "byteLength": len(content),
-            "uri": "data:application/octet-stream;base64," + base64.b64encode(content).decode(),
-        }
-    )
-    document["bufferViews"].append({"buffer": number, "byteLength": len(content), "target": target})
-    document["accessors"].append(
-        {
-            "bufferView": number,
-            "componentType": _UINT if array.dtype == np.uint32 else _FLOAT,
-            "count": len(array),
-            "type": kind,
-            "min": array.min(axis=0).tolist(),
-            "max": array.max(axis=0).tolist(),
-        }
-    )
-    return number
-
-
 def _picture_uri(mesh: Mesh) -> str:
     """The picture as a data URI: JPEG, but PNG where pixels must not run into each other."""
     kind, options = ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 92]) if mesh.smooth else ("png", [])
     _, content = cv2.imencode(f".{kind}", mesh.picture[..., ::-1], options)
-    return f"data:image/{kind};base64,{base64.b64encode(content.tobytes()).decode()}"
+    return data_uri(f"image/{kind}", content.tobytes())

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.feasibility import TRIES
-from splatpilot.diagrams.worlds.fittings import check_range
+from splatpilot.diagrams.worlds.fittings import TIGHT_CLEARING, check_range
 from splatpilot.diagrams.worlds.scene import SceneSource, read_scene_world
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.illumination import Lamplight
@@ -24,9 +24,6 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 GAP = 1.3 * 2 * VEHICLE_RADIUS
 """[m], least width of a gap."""
-
-_OPEN = 0.9
-"""[m], least distance of what is put in from start and goal."""
 
 _MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
 
@@ -70,10 +67,10 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
             again = int(rng.integers(2**31))
             p_WS, p_WG, _ = draw_start_and_goal(scene.esdf, VEHICLE_RADIUS, again)
             scene = world = replace(scene, p_WS=p_WS, p_WG=p_WG)
-        solids = _drawn(config, world, rng)
+        solids = _draw_solids(config, world, rng)
         if len(solids) < config.least:
             continue
-        esdf = _composed(world.esdf, solids)
+        esdf = _compose(world.esdf, solids)
         if _leaves_way(esdf, world.p_WS, world.p_WG, config.gap):
             return _with(world, solids, esdf, seed)
     raise ValueError(
@@ -82,7 +79,7 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
     )
 
 
-def _drawn(config: InsertedConfig, world: World, rng: np.random.Generator) -> list[Solid]:
+def _draw_solids(config: InsertedConfig, world: World, rng: np.random.Generator) -> list[Solid]:
     """Solids that keep their distances from start, goal and each other."""
     number = int(rng.integers(config.least, config.most + 1))
     way = world.p_WG - world.p_WS
@@ -96,7 +93,7 @@ def _drawn(config: InsertedConfig, world: World, rng: np.random.Generator) -> li
             continue
         shape = _shape(config, p, rng)
         ends = np.stack([world.p_WS, world.p_WG])
-        if _distances(shape, ends).min() < _OPEN:
+        if _distances(shape, ends).min() < TIGHT_CLEARING:
             continue
         surface = _surface(shape)
         if any(_distances(other.shape, surface).min() < config.gap for other in solids):
@@ -128,7 +125,7 @@ def _surface(shape: Shape) -> NDArray:
     return np.concatenate([face.at(s * face.size)[0] for face in faces_of(shape, zero, zero)])
 
 
-def _composed(esdf: Esdf, solids: list[Solid]) -> Esdf:
+def _compose(esdf: Esdf, solids: list[Solid]) -> Esdf:
     """The union of a scene and solids: the nearer of both, exact at voxel centres for solids.
     Solids are known, also where the scene is not."""
     field = AnalyticDistanceField(

@@ -4,16 +4,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from splatpilot.diagrams.worlds.branches import Branches, BranchesConfig
+from splatpilot.diagrams.worlds.branches import BranchesConfig, branches_blueprint
 from splatpilot.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
-from splatpilot.diagrams.worlds.forest.forest import Forest, ForestConfig
+from splatpilot.diagrams.worlds.forest.config import ForestConfig
+from splatpilot.diagrams.worlds.forest.forest import forest_blueprint
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.over_under import OverUnderConfig, over_under_blueprint
 from splatpilot.diagrams.worlds.room import RoomConfig, room_blueprint
 from splatpilot.diagrams.worlds.scene import SceneConfig, read_scene_world
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.surfaces import merged
+from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.walls import WallsConfig, walls_blueprint
 from splatpilot.diagrams.worlds.world import World
@@ -33,12 +34,11 @@ class WorldConfig(Protocol):
 class WorldKind:
     """How a world is configured and made."""
 
-    config: type
-    """The type of its configurations."""
+    config: type  # the type of its configurations
+    # From a configuration and a seed to a world: the same arguments, the same bits.
     make: Callable[[Any, int], World]
-    """From a configuration and a seed to a world: the same arguments, the same bits."""
+    # The same world as solids, start and goal, if it is generated: cheap.
     make_blueprint: Callable[[Any, int], Blueprint] | None = None
-    """The same place as solids, start and goal, of worlds that are generated: cheap."""
 
 
 WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
@@ -94,7 +94,7 @@ def is_procedural(config: WorldConfig) -> bool:
 def make_blueprint(config: WorldConfig, seed: int) -> Blueprint:
     """
     Generates a procedural world as solids, start and goal, without Gaussians and grids: cheap.
-    `write_gltf` exports it as a mesh, `make_world` of the same arguments gives the same place.
+    `write_gltf` exports it as a mesh, `make_world` of the same arguments gives the same world.
 
     Raises:
         ValueError: for a world that is not generated, and parameters no world can be made of.
@@ -110,10 +110,14 @@ def build(blueprint: Blueprint) -> World:
     field = blueprint.distance_field
     esdf = esdf_from_distance_field(field, blueprint.voxel_size)
     light = blueprint.light(esdf)
-    drawn = [draw(blueprint, blueprint.solids, light), *blueprint.surroundings()]
+    if blueprint.gaussians is not None:
+        gaussians = blueprint.gaussians(light)
+    else:
+        solids = draw(blueprint, blueprint.solids, light)
+        gaussians = merge([solids, *blueprint.surroundings()])
     return World(
         name=blueprint.name,
-        gaussians=merged(drawn),
+        gaussians=gaussians,
         distance_field=field,
         esdf=esdf,
         background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),
@@ -122,16 +126,8 @@ def build(blueprint: Blueprint) -> World:
     )
 
 
-register_world(
-    ForestConfig,
-    lambda config, seed: Forest(config, seed).world(),
-    lambda config, seed: Forest(config, seed).blueprint(),
-)
-register_world(
-    BranchesConfig,
-    lambda config, seed: Branches(config, seed).world(),
-    lambda config, seed: Branches(config, seed).blueprint(),
-)
+register_world(ForestConfig, make_blueprint=forest_blueprint)
+register_world(BranchesConfig, make_blueprint=branches_blueprint)
 register_world(ClutterConfig, make_blueprint=clutter_blueprint)
 register_world(WallsConfig, make_blueprint=walls_blueprint)
 register_world(RoomConfig, make_blueprint=room_blueprint)

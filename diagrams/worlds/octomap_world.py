@@ -7,8 +7,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
-from splatpilot.diagrams.worlds.solids.light import Daylight
-from splatpilot.diagrams.worlds.solids.surfaces import COVERAGE, Surfels, colored, perpendicular
+from splatpilot.diagrams.worlds.solids.light import GAMMA, Daylight, develop
+from splatpilot.diagrams.worlds.solids.surfaces import (
+    COVERAGE,
+    Surfels,
+    perpendicular,
+    to_gaussians,
+)
 from splatpilot.diagrams.worlds.solids.textures import fbm, hash_unit, ramp
 from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
 from splatpilot.diagrams.worlds.world import World
@@ -51,7 +56,7 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
         p_WS, p_WG, _ = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed)
     else:
         p_WS, p_WG, _ = choose_start_and_goal(esdf, VEHICLE_RADIUS)
-    hour = Daylight.sampled(np.random.default_rng([seed, 1]))
+    hour = Daylight.sample(np.random.default_rng([seed, 1]))
     return World(
         name=Path(config.path).stem,
         gaussians=voxel_gaussians(esdf, hour),
@@ -84,7 +89,7 @@ def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:
     palette = [(0.42, 0.36, 0.30), (0.45, 0.50, 0.38), (0.66, 0.60, 0.48), (0.55, 0.62, 0.68)]
     albedo = ramp(palette, np.clip(level + 0.15 * fbm(p * 0.8, 3, seed=301), 0, 1))
     albedo = albedo * (0.75 + 0.5 * hash_unit(index, seed=302))[:, None]
-    colors = hour.shaded(albedo, n, np.full(len(p), 0.7))
+    colors = develop(albedo**GAMMA * hour.irradiance(n, np.full(len(p), 0.7)))
     # Voxels of a slanted surface are up to sqrt 3 apart: 1.3 times the closed layer's size.
     extent = np.full((len(p), 2), 1.3 * COVERAGE * esdf.voxel_size)
-    return colored(Surfels(p, n, perpendicular(n), extent), colors, 0.99)
+    return to_gaussians(Surfels(p, n, perpendicular(n), extent), colors, 0.99)

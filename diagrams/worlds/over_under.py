@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.feasibility import draw_feasible
 from splatpilot.diagrams.worlds.fittings import (
     INSET,
+    PASSAGE,
     WALL,
     box,
     check_positive,
@@ -14,11 +15,12 @@ from splatpilot.diagrams.worlds.fittings import (
     hall,
     lamplight,
     roof,
+    signs_in,
     signs_on,
     start_and_goal,
 )
+from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 _MATERIALS = ["brick", "concrete", "hazard", "wood", "metal"]
 
@@ -38,15 +40,14 @@ class OverUnderConfig:
     def validate(self) -> None:
         """Raises ValueError for the first value with which no hall can be built."""
         check_positive(self, "length", "width", "height", "over", "under", "voxel_size")
-        needed = 2 * VEHICLE_RADIUS + 0.1
-        if self.over > self.height - needed:
+        if self.over > self.height - PASSAGE:
             raise ValueError(
-                f"over = {self.over} m must be at most height - {needed:.2f} m = "
-                f"{self.height - needed:.2f} m, or nothing fits under the roof"
+                f"over = {self.over} m must be at most height - {PASSAGE:.2f} m = "
+                f"{self.height - PASSAGE:.2f} m, or nothing fits under the roof"
             )
-        if not needed <= self.under < self.height:
+        if not PASSAGE <= self.under < self.height:
             raise ValueError(
-                f"under = {self.under} m must be {needed:.2f} m, for the vehicle, to below the "
+                f"under = {self.under} m must be {PASSAGE:.2f} m, for the vehicle, to below the "
                 f"height, {self.height:g} m"
             )
         least = 2 * INSET + 2.5 * (self.barriers + 1)
@@ -64,13 +65,11 @@ def over_under_blueprint(config: OverUnderConfig, seed: int) -> Blueprint:
         ValueError: for values with which none can be built, or without a way through.
     """
     config.validate()
-    half = config.width / 2
-    lower = np.array([0.0, -half, 0.0])
-    upper = np.array([config.length, half, config.height])
+    plot = Plot.of_size(config.length, config.width, config.height)
 
     def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(lower, upper, rng)
-        step = (config.length - 2 * INSET) / (config.barriers + 1)
+        p_WS, p_WG = start_and_goal(plot, rng)
+        half, step = config.width / 2, (config.length - 2 * INSET) / (config.barriers + 1)
         first = int(rng.integers(2))
         barriers = []
         for k in range(config.barriers):
@@ -79,27 +78,25 @@ def over_under_blueprint(config: OverUnderConfig, seed: int) -> Blueprint:
             corners = (x - WALL / 2, -half, low), (x + WALL / 2, half, high)
             material = _MATERIALS[rng.integers(len(_MATERIALS))]
             barriers.append(box(*corners, material, int(rng.integers(1000))))
-        sides = hall(lower, upper, ["plaster", "brick", "concrete", "metal"], rng)
+        sides = hall(plot, ["plaster", "brick", "concrete", "metal"], rng)
         signs = [s for wall in barriers for s in signs_on(wall, 0, 2, rng)]
-        signs += [
-            s for wall, face in ((sides[0], 3), (sides[1], 2)) for s in signs_on(wall, face, 3, rng)
-        ]
+        signs += signs_in(sides, 3, 0, rng)
         return Blueprint(
             name="over_under",
-            lower_W=lower,
-            upper_W=upper,
+            lower_W=plot.lower,
+            upper_W=plot.upper,
             solids=[
                 ground(("tiles", "concrete")[rng.integers(2)], int(rng.integers(10))),
-                roof(lower, upper),
+                roof(plot),
                 *sides,
                 *barriers,
                 *signs,
             ],
             p_WS=p_WS,
             p_WG=p_WG,
-            light=lamplight(lower, upper, rng),
+            light=lamplight(plot, rng),
             seed=seed,
             voxel_size=config.voxel_size,
         )
 
-    return drawn(draw, seed)
+    return draw_feasible(draw, seed)

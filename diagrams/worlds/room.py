@@ -7,19 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
-from splatpilot.diagrams.worlds.feasibility import CLEARANCE, drawn
+from splatpilot.diagrams.worlds.feasibility import CLEARANCE, draw_feasible
 from splatpilot.diagrams.worlds.fittings import (
     check_count,
     check_positive,
+    check_size,
     clear_of,
     ground,
     hall,
     lamplight,
     roof,
-    signs_on,
+    signs_in,
     start_and_goal,
     turned_box,
 )
+from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.systems.collision.shapes import Capsule, Cylinder, Sphere
@@ -39,11 +41,7 @@ class RoomConfig:
         """Raises ValueError for the first value with which no room can be furnished."""
         check_positive(self, "length", "width", "height", "voxel_size")
         check_count(self, "items")
-        if self.length < 6 or self.width < 4 or self.height < 2.4:
-            raise ValueError(
-                f"a room of {self.length:g} x {self.width:g} x {self.height:g} m is too small; at "
-                "least 6 x 4 x 2.4 m are needed"
-            )
+        check_size(self, "room", 6, 4, 2.4)
 
 
 def room_blueprint(config: RoomConfig, seed: int) -> Blueprint:
@@ -53,41 +51,36 @@ def room_blueprint(config: RoomConfig, seed: int) -> Blueprint:
         ValueError: for values with which none can be made, or without a way through.
     """
     config.validate()
-    lower = np.array([0.0, -config.width / 2, 0.0])
-    upper = np.array([config.length, config.width / 2, config.height])
+    plot = Plot.of_size(config.length, config.width, config.height)
 
     def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(lower, upper, rng, (1.0, min(1.9, config.height - 0.9)))
+        p_WS, p_WG = start_and_goal(plot, rng, (1.0, min(1.9, config.height - 0.9)))
         furniture: list[Solid] = []
         for _ in range(config.items):
             make = _ITEMS[rng.integers(len(_ITEMS))]
             for _ in range(50):
-                place = rng.uniform(lower[:2] + 0.7, upper[:2] - 0.7)
+                place = rng.uniform(plot.lower[:2] + 0.7, plot.upper[:2] - 0.7)
                 turn = rng.choice(4) * np.pi / 2 + rng.normal(0, 0.12)
                 item = make(place, turn, config.height, int(rng.integers(1000)), rng)
                 if all(clear_of(solid.shape, [p_WS, p_WG], CLEARANCE) for solid in item):
                     furniture += item
                     break
-        sides = hall(lower, upper, ["plaster", "plaster", "wood", "brick"], rng)
-        signs = [
-            s
-            for wall, face in zip(sides, (3, 2, 1, 0), strict=True)
-            for s in signs_on(wall, face, 2, rng)
-        ]
+        sides = hall(plot, ["plaster", "plaster", "wood", "brick"], rng)
+        signs = signs_in(sides, 2, 2, rng)
         floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
         return Blueprint(
             name="room",
-            lower_W=lower,
-            upper_W=upper,
-            solids=[floor, roof(lower, upper), *sides, *signs, *furniture],
+            lower_W=plot.lower,
+            upper_W=plot.upper,
+            solids=[floor, roof(plot), *sides, *signs, *furniture],
             p_WS=p_WS,
             p_WG=p_WG,
-            light=lamplight(lower, upper, rng),
+            light=lamplight(plot, rng),
             seed=seed,
             voxel_size=config.voxel_size,
         )
 
-    return drawn(draw, seed)
+    return draw_feasible(draw, seed)
 
 
 type Item = Callable[[NDArray, float, float, int, np.random.Generator], list[Solid]]

@@ -1,4 +1,4 @@
-"""Where to fly from and to in a place of which only the free space is known."""
+"""Where to fly from and to in a world of which only the free space is known."""
 
 from collections.abc import Iterator
 

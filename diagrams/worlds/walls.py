@@ -5,23 +5,24 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.feasibility import draw_feasible
 from splatpilot.diagrams.worlds.fittings import (
     INSET,
+    PASSAGE,
     WALL,
     box,
     check_positive,
     daylight,
     ground,
     hall,
+    signs_in,
     signs_on,
     start_and_goal,
-    trees_around,
 )
+from splatpilot.diagrams.worlds.forest.surroundings import trees_around
 from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.solid import Solid
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"
 
@@ -51,18 +52,17 @@ class WallsConfig:
         if self.pattern not in PATTERNS:
             raise ValueError(f"pattern = {self.pattern!r} must be one of {', '.join(PATTERNS)}")
         check_positive(self, "length", "width", "height", "wall", "depth", "voxel_size")
-        needed = 2 * VEHICLE_RADIUS + 0.1
         if self.pattern == "slits":
             for slit in self.slits:
-                if not needed <= slit <= self.width / 2:
+                if not PASSAGE <= slit <= self.width / 2:
                     raise ValueError(
-                        f"slits = {self.slits} m: each must be {needed:.2f} m, for the vehicle, to "
-                        f"half the width, {self.width / 2:g} m"
+                        f"slits = {self.slits} m: each must be {PASSAGE:.2f} m, for the vehicle, "
+                        f"to half the width, {self.width / 2:g} m"
                     )
-        elif self.wall > self.width - needed:
+        elif self.wall > self.width - PASSAGE:
             raise ValueError(
-                f"wall = {self.wall} m must be at most width - {needed:.2f} m = "
-                f"{self.width - needed:.2f} m, or it closes the hall"
+                f"wall = {self.wall} m must be at most width - {PASSAGE:.2f} m = "
+                f"{self.width - PASSAGE:.2f} m, or it closes the hall"
             )
         if not 1 <= self.walls <= 20:
             raise ValueError(f"walls = {self.walls} must be 1 to 20")
@@ -85,39 +85,34 @@ def walls_blueprint(config: WallsConfig, seed: int) -> Blueprint:
         ValueError: for values with which none can be built, or without a way through.
     """
     config.validate()
-    lower = np.array([0.0, -config.width / 2, 0.0])
-    upper = np.array([config.length, config.width / 2, config.height])
+    plot = Plot.of_size(config.length, config.width, config.height)
 
     def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(lower, upper, rng)
+        p_WS, p_WG = start_and_goal(plot, rng)
         across = {"big_wall": _big_wall, "u_trap": _u_trap, "slits": _slits, "slalom": _slalom}
         if config.pattern in ("big_wall", "u_trap"):  # both stand in the straight way
             p_WS[1], p_WG[1] = 0.3 * p_WS[1], 0.3 * p_WG[1]
         obstacles = across[config.pattern](config, rng)
-        sides = hall(lower, upper, _FACADES, rng)
-        signs = [
-            sign
-            for wall, face in zip(sides, (3, 2, 1, 0), strict=True)
-            for sign in signs_on(wall, face, 3 if face > 1 else 1, rng)
-        ]
+        sides = hall(plot, _FACADES, rng)
+        signs = signs_in(sides, 3, 1, rng)
         for wall in obstacles:
             signs += signs_on(wall, 0, 1, rng)
         hour, light = daylight(rng)
         floor = ("paving", "grass", "concrete")[rng.integers(3)]
         return Blueprint(
             name=config.pattern,
-            lower_W=lower,
-            upper_W=upper,
+            lower_W=plot.lower,
+            upper_W=plot.upper,
             solids=[ground(floor), *sides, *obstacles, *signs],
             p_WS=p_WS,
             p_WG=p_WG,
             light=light,
-            surroundings=trees_around(Plot(lower, upper), hour, seed),
+            surroundings=trees_around(plot, hour, seed),
             seed=seed,
             voxel_size=config.voxel_size,
         )
 
-    return drawn(draw, seed)
+    return draw_feasible(draw, seed)
 
 
 def _across(config: WallsConfig, x: float, y0: float, y1: float, material: str, seed: int) -> Solid:

@@ -1,4 +1,4 @@
-"""What is flown in: a place to look at, the truth about its surfaces, and where to fly."""
+"""What is flown in: what cameras see, the truth about its surfaces, and where to fly."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,21 +14,17 @@ from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A place, everything in world frame W (z up, metres)."""
+    """What is flown in, everything in world frame W (z up, metres)."""
 
     name: str
-    gaussians: GaussianScene
-    """What cameras see."""
+    gaussians: GaussianScene  # what cameras see
+    # What decides collisions: analytic in procedural worlds, the same object as `esdf` in others.
     distance_field: DistanceField
-    """What collides: analytic in procedural worlds, the same object as `esdf` in others."""
-    esdf: Esdf
-    """The grid that planners and training read."""
+    esdf: Esdf  # the grid that planners and training read
+    # Colour where no Gaussian is seen; red, green, blue in 0 to 1.
     background: tuple[float, float, float]
-    """Colour where no Gaussian is seen; red, green, blue in 0 to 1."""
-    p_WS: NDArray[np.float64]
-    """(3,) [m] default start."""
-    p_WG: NDArray[np.float64]
-    """(3,) [m] default goal."""
+    p_WS: NDArray[np.float64]  # (3,) [m], default start
+    p_WG: NDArray[np.float64]  # (3,) [m], default goal
 
     @cached_property
     def baked(self) -> BakedScene:

@@ -18,12 +18,12 @@ class AnalyticDistanceField:
     far from two shapes) it is one of the candidates. Outside the bounds: NaN, zero, OUTSIDE.
 
     Args:
-      shapes: of any kinds, in any order; may be empty, and the distance then is infinite.
-      lower_W, upper_W: (3,) [m], the bounds.
+        shapes: of any kinds, in any order; may be empty, and the distance then is infinite.
+        lower_W, upper_W: (3,) [m], the bounds.
 
     Raises:
-      ValueError: for shapes with a size that is not positive, coordinates that are not finite, or
-        empty bounds.
+        ValueError: for shapes with a size that is not positive, coordinates that are not finite, or
+            empty bounds.
     """
 
     # Points handled at once. Points near each other share their candidates for the nearest shape.

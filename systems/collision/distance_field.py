@@ -20,34 +20,28 @@ class FieldState(IntEnum):
 
 
 class FieldSample(NamedTuple):
-    """The answer of a distance field at points p_WQ of shape (..., 3).
+    """The answer of a distance field at points p_WQ of shape (..., 3)."""
 
-    Attributes:
-      distance: (...,) [m], signed distance to the nearest occupied surface, negative inside an
-        obstacle. Where the state is UNKNOWN it is the distance to the surfaces that were seen, an
-        upper bound of the true one; where it is OUTSIDE it is NaN, unless the field says otherwise.
-      gradient: (..., 3) [-], d distance / d p_WQ in the world frame; zero where distance is NaN.
-      state: (...,) uint8, a `FieldState`.
-    """
-
+    # (...,) [m] to the nearest occupied surface, negative inside an obstacle. Where the state is
+    # UNKNOWN it is the distance to the surfaces that were seen, an upper bound of the true one;
+    # where it is OUTSIDE it is NaN, unless the field says otherwise.
     distance: np.ndarray
-    gradient: np.ndarray
-    state: np.ndarray
+    gradient: np.ndarray  # (..., 3) [-] d distance / d p_WQ in W; zero where distance is NaN
+    state: np.ndarray  # (...,) uint8, a `FieldState`
 
 
 class DistanceField(Protocol):
-    """A signed distance field over the box [lower_W, upper_W] of the world.
-
-    Attributes:
-      lower_W: (3,) [m], the corner of the box with the smallest coordinates.
-      upper_W: (3,) [m], the corner of the box with the largest coordinates.
-    """
+    """A signed distance field over the box [lower_W, upper_W] of the world."""
 
     @property
-    def lower_W(self) -> np.ndarray: ...
+    def lower_W(self) -> np.ndarray:
+        """(3,) [m], the corner of the box with the smallest coordinates."""
+        ...
 
     @property
-    def upper_W(self) -> np.ndarray: ...
+    def upper_W(self) -> np.ndarray:
+        """(3,) [m], the corner of the box with the largest coordinates."""
+        ...
 
     def query(self, p_WQ: ArrayLike) -> FieldSample:
         """Distance, gradient and state at the points p_WQ (..., 3) [m]."""

@@ -13,12 +13,12 @@ def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
     """Distance from every voxel's centre to the nearest centre of the marked voxels.
 
     Args:
-      voxels: (nx, ny, nz) bool.
-      voxel_size: [m].
+        voxels: (nx, ny, nz) bool.
+        voxel_size: [m].
 
     Returns:
-      (nx, ny, nz) float32 [m], zero at the marked voxels; where none is marked, the diagonal of the
-      grid, which is more than any distance in it.
+        (nx, ny, nz) float32 [m], zero at the marked voxels; where none is marked, the diagonal of
+        the grid, which is more than any distance in it.
     """
     if not voxels.any():
         return np.full(voxels.shape, _diagonal(voxels.shape, voxel_size), dtype=np.float32)
@@ -33,11 +33,11 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     a face is met obliquely; the transform without that half voxel is biased far by 0.2 to 0.5.
 
     Args:
-      occupied: (nx, ny, nz) bool.
-      voxel_size: [m].
+        occupied: (nx, ny, nz) bool.
+        voxel_size: [m].
 
     Returns:
-      (nx, ny, nz) float32 [m], negative in occupied voxels.
+        (nx, ny, nz) float32 [m], negative in occupied voxels.
     """
     outside = distance_to_voxels(occupied, voxel_size) - 0.5 * voxel_size
     inside = distance_to_voxels(~occupied, voxel_size) - 0.5 * voxel_size
@@ -55,14 +55,14 @@ def distances_from_band(
     the s of the six face neighbours along, `sweeps` times, finds others that bound x tighter.
 
     Args:
-      occupied: (nx, ny, nz) bool.
-      band: (nx, ny, nz) float32 [m], signed distance to the surface where it is known, NaN
-        elsewhere; not positive in occupied voxels and not negative in the others.
-      voxel_size: [m].
-      sweeps: rounds of passing sites to neighbours.
+        occupied: (nx, ny, nz) bool.
+        band: (nx, ny, nz) float32 [m], signed distance to the surface where it is known, NaN
+            elsewhere; not positive in occupied voxels and not negative in the others.
+        voxel_size: [m].
+        sweeps: rounds of passing sites to neighbours.
 
     Returns:
-      (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid when the band is empty.
+        (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid when the band is empty.
     """
     sites = np.isfinite(band)
     if not sites.any():
@@ -105,14 +105,14 @@ def conservative_distances(
     """Distances with unknown voxels and everything outside the grid taken as occupied.
 
     Args:
-      distances: (nx, ny, nz) float32 [m], signed, to the occupied surfaces.
-      states: (nx, ny, nz) uint8 `FieldState`.
-      voxel_size: [m].
+        distances: (nx, ny, nz) float32 [m], signed, to the occupied surfaces.
+        states: (nx, ny, nz) uint8 `FieldState`.
+        voxel_size: [m].
 
     Returns:
-      (nx, ny, nz) float32 [m]: in free voxels the smallest of the distance to an occupied surface,
-      to the faces of unknown voxels and to the faces of the grid; in the others minus the distance
-      to free space.
+        (nx, ny, nz) float32 [m]: in free voxels the smallest of the distance to an occupied
+        surface, to the faces of unknown voxels and to the faces of the grid; in the others minus
+        the distance to free space.
     """
     unknown = states == FieldState.UNKNOWN
     result = np.minimum(distances, _distance_to_faces(distances.shape, voxel_size))

@@ -26,27 +26,22 @@ class Esdf:
     interpolant and jumps at the planes through voxel centres. In the outermost half voxel the
     interpolant is extrapolated. The arrays are read-only, so a field is shared by reference.
 
-    Attributes:
-      distances: (nx, ny, nz) float32 [m], at least two voxels an axis, all finite.
-      states: (nx, ny, nz) uint8, `FieldState` FREE, OCCUPIED or UNKNOWN; the state of a point is
-        that of the voxel it lies in.
-      lower_W: (3,) float64 [m], lower corner of the box (a corner of a voxel, not a centre).
-      voxel_size: edge length of a voxel [m].
-      occupied_outside: whether the field goes on outside the box, all of which then counts as
-        occupied: the value at the nearest point of the box minus the distance to it. Otherwise the
-        distance outside is NaN and its gradient zero.
-
     Raises:
-      ValueError: for arrays of the wrong shape, values that are not finite, states that are no
-        `FieldState` of a voxel or a voxel size that is not positive.
+        ValueError: for arrays of the wrong shape, values that are not finite, states that are no
+            `FieldState` of a voxel or a voxel size that is not positive.
     """
 
-    distances: np.ndarray
+    distances: np.ndarray  # (nx, ny, nz) float32 [m], at least two voxels an axis, all finite
+    # (nx, ny, nz) uint8, `FieldState` FREE, OCCUPIED or UNKNOWN; the state of a point is that of
+    # the voxel it lies in.
     states: np.ndarray
-    lower_W: np.ndarray
-    voxel_size: float
+    lower_W: np.ndarray  # (3,) float64 [m] lower corner of the box, the corner of a voxel
+    voxel_size: float  # [m] edge length of a voxel
+    # Whether the field goes on outside the box, all of which then counts as occupied: the value at
+    # the nearest point of the box minus the distance to it. Otherwise the distance outside is NaN
+    # and its gradient zero.
     occupied_outside: bool = False
-    upper_W: np.ndarray = field(init=False)
+    upper_W: np.ndarray = field(init=False)  # (3,) float64 [m]
     # What every query needs, prepared once.
     _first_center_W: np.ndarray = field(init=False)  # (3, 1) [m]
     _last_cell: np.ndarray = field(init=False)  # (3, 1)
@@ -169,7 +164,7 @@ class Esdf:
         return Esdf(distances, self.states, self.lower_W, self.voxel_size, occupied_outside=True)
 
     def save(self, path: str | Path) -> None:
-        """Write the field to `path` (by custom `esdf.npz`), whole or not at all."""
+        """Writes the field to `path` (by custom `esdf.npz`), whole or not at all."""
         write_esdf_arrays(
             path,
             distances=self.distances,
@@ -181,11 +176,11 @@ class Esdf:
 
     @classmethod
     def load(cls, path: str | Path) -> "Esdf":
-        """Read a field that `save` wrote.
+        """Reads a field that `save` wrote.
 
         Raises:
-          FileNotFoundError: if there is no such file.
-          ValueError: if the file is no distance field, or a damaged one; the message names it.
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is no distance field, or a damaged one; the message names it.
         """
         arrays = read_esdf_arrays(path)
         try:

@@ -37,13 +37,13 @@ class EsdfCollision(LeafSystem):
     outputs share one query of the field, which is held by reference.
 
     Args:
-      field: the truth about obstacles.
-      radius: of the vehicle [m].
-      beta: sharpness of the barrier [1/m].
-      margin: of the barrier [m].
+        field: the truth about obstacles.
+        radius: of the vehicle [m].
+        beta: sharpness of the barrier [1/m].
+        margin: of the barrier [m].
 
     Raises:
-      ValueError: if the radius is negative or beta not positive.
+        ValueError: if the radius is negative or beta not positive.
     """
 
     def __init__(

@@ -34,7 +34,7 @@ def write_esdf_arrays(
     """Write the arrays of an `Esdf`; a temporary file beside `path` is renamed at the end.
 
     Raises:
-      OSError: if the folder is missing or not writable.
+        OSError: if the folder is missing or not writable.
     """
     with written_atomically(Path(path)) as partial, partial.open("wb") as file:
         np.savez_compressed(
@@ -52,9 +52,9 @@ def read_esdf_arrays(path: str | Path) -> dict[str, Any]:
     """The constructor arguments of an `Esdf` from a file that `write_esdf_arrays` wrote.
 
     Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is no numpy archive, is damaged, lacks an entry, holds one of another type
-        or was written by a newer version.
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no numpy archive, is damaged, lacks an entry, holds one of another type
+            or was written by a newer version.
     """
     path = Path(path)
     if not path.is_file():

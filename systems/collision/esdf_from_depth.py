@@ -41,21 +41,21 @@ def esdf_from_depth_images(
     `truncation` behind an edge counts as occupied until another image clears it, which is safe.
 
     Args:
-      depths: images (H, W) float [m], planar depth along the optical axis; 0, NaN and negative
-        pixels say nothing, infinite ones that nothing stands in the way, as before the sky. One at
-        a time is held in memory.
-      K: (3, 3) intrinsics [px]; pixel (row i, column j) is centred at (j + 0.5, i + 0.5).
-      X_WCs: the camera's pose of each image (x right, y down, z forward).
-      lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
-      voxel_size: [m].
-      max_range: distance from the camera up to which space is seen [m]; a surface beyond it still
-        clears the space before it.
-      truncation: thickness given to surfaces [m], by default 3 voxels.
+        depths: images (H, W) float [m], planar depth along the optical axis; 0, NaN and negative
+            pixels say nothing, infinite ones that nothing stands in the way, as before the sky. One
+            at a time is held in memory.
+        K: (3, 3) intrinsics [px]; pixel (row i, column j) is centred at (j + 0.5, i + 0.5).
+        X_WCs: the camera's pose of each image (x right, y down, z forward).
+        lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
+        voxel_size: [m].
+        max_range: distance from the camera up to which space is seen [m]; a surface beyond it still
+            clears the space before it.
+        truncation: thickness given to surfaces [m], by default 3 voxels.
 
     Raises:
-      ValueError: for different numbers of images and poses, no images, images of different shapes,
-        intrinsics without focal length, ranges that are not positive, a truncation below 2 voxels
-        or a box that makes no grid (see `grid_shape`).
+        ValueError: for different numbers of images and poses, no images, images of different
+            shapes, intrinsics without focal length, ranges that are not positive, a truncation
+            below 2 voxels or a box that makes no grid (see `grid_shape`).
     """
     truncation = 3.0 * voxel_size if truncation is None else truncation
     if not truncation >= 2.0 * voxel_size:
@@ -64,8 +64,8 @@ def esdf_from_depth_images(
             f"voxels, {2.0 * voxel_size} m, or surfaces fall through the grid."
         )
     fusion = _Fusion(lower_W, upper_W, voxel_size, truncation)
-    for depth, X_WC in _posed(depths, X_WCs, "fusing depth"):
-        fusion.add(depth, _checked_intrinsics(K), X_WC, _checked_range(max_range))
+    for depth, X_WC in _pair(depths, X_WCs, "fusing depth"):
+        fusion.add(depth, _require_intrinsics(K), X_WC, _require_range(max_range))
     distance, seen = fusion.grids()
     occupied = seen & (distance <= 0.0)
     offset = np.where(seen, distance, np.float32(np.nan))
@@ -84,14 +84,13 @@ def bounds_of_depth_images(
     Takes every fourth pixel along both axes; arguments as for `esdf_from_depth_images`.
 
     Returns:
-      lower_W, upper_W: (3,) each [m].
+        lower_W, upper_W: (3,) each [m].
     """
-    max_range, K = _checked_range(max_range), _checked_intrinsics(K)
+    max_range, K = _require_range(max_range), _require_intrinsics(K)
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
-    for depth, X_WC in _posed(depths, X_WCs, "bounding depth"):
-        row, column = np.mgrid[0 : depth.shape[0] : 4, 0 : depth.shape[1] : 4]
+    for depth, X_WC in _pair(depths, X_WCs, "bounding depth"):
         z = np.where(np.isfinite(depth), depth, 0.0)[::4, ::4]
-        x, y = (column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1]
+        x, y = np.meshgrid(*(slopes[::4] for slopes in _ray_slopes(depth.shape, K)))
         ray = np.stack([x, y, np.ones_like(x)], -1)
         reach = np.minimum(z, max_range / np.linalg.norm(ray, axis=-1))
         p_CQ = (reach[..., None] * ray)[z > 0.0]
@@ -209,15 +208,23 @@ class _Fusion:
                 for c in columns:
                     reached = farthest[r.astype(int), c.astype(int)]
                     seen[of_level] |= near[of_level] < reached + _MAX_DEPTH_BEHIND * self.truncation
-            farthest = _halved(farthest)
+            farthest = _halve(farthest)
         return possible[seen]
 
 
-def _halved(image: np.ndarray) -> np.ndarray:
+def _halve(image: np.ndarray) -> np.ndarray:
     """The maximum over squares of 2 x 2 pixels, ((H + 1) // 2, (W + 1) // 2)."""
     image = np.pad(image, [(0, n % 2) for n in image.shape])
     image = np.maximum(image[::2], image[1::2])
     return np.maximum(image[:, ::2], image[:, 1::2])
+
+
+def _ray_slopes(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x / z (W,) and y / z (H,) of the rays through the pixels of an image of shape (H, W)."""
+    height, width = shape
+    x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+    return x, y
 
 
 def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
@@ -229,13 +236,12 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
     smaller is taken, which stays on the pixel's own surface at a silhouette.
 
     Returns:
-      (H, W) float32, from _MIN_COSINE to the length of the ray; the former where unknown.
+        (H, W) float32, from _MIN_COSINE to the length of the ray; the former where unknown.
     """
-    height, width = depth.shape
     valid = (depth > 0.0) & np.isfinite(depth)
     w = np.where(valid, 1.0 / np.where(valid, depth, 1.0), np.float32(np.nan)).astype(np.float32)
-    u = ((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]).astype(np.float32)
-    v = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]).astype(np.float32)[:, None]
+    u, v = (slopes.astype(np.float32) for slopes in _ray_slopes(depth.shape, K))
+    v = v[:, None]
 
     def slope(axis: int, focal_length: float) -> np.ndarray:
         missing = np.full_like(w.take([0], axis), np.nan)
@@ -250,7 +256,7 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
     return np.fmax(w / length, np.float32(_MIN_COSINE))
 
 
-def _posed(
+def _pair(
     depths: Iterable[np.ndarray], X_WCs: Sequence[RigidTransform], what: str
 ) -> Iterator[tuple[np.ndarray, RigidTransform]]:
     """Pairs images, pixels that say nothing set to 0, with poses; checks and shows progress."""
@@ -273,7 +279,7 @@ def _posed(
         )
 
 
-def _checked_intrinsics(K: np.ndarray) -> np.ndarray:
+def _require_intrinsics(K: np.ndarray) -> np.ndarray:
     K = np.asarray(K, dtype=float)
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
         raise ValueError(
@@ -283,7 +289,7 @@ def _checked_intrinsics(K: np.ndarray) -> np.ndarray:
     return K
 
 
-def _checked_range(max_range: float) -> float:
+def _require_range(max_range: float) -> float:
     if not (np.isfinite(max_range) and max_range > 0.0):
         raise ValueError(f"depth images: max_range is {max_range} m; it must be positive.")
     return max_range

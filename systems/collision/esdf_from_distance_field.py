@@ -1,5 +1,7 @@
 """Distance fields on a grid from other distance fields."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from splatpilot.systems.collision.distance_field import DistanceField
@@ -15,7 +17,7 @@ def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
     point inside. States are the field's own.
 
     Raises:
-      ValueError: see `grid_shape`.
+        ValueError: see `grid_shape`.
     """
     lower_W, upper_W = np.asarray(field.lower_W, float), np.asarray(field.upper_W, float)
     shape = grid_shape(lower_W, upper_W, voxel_size)
@@ -25,14 +27,23 @@ def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
         np.minimum(lower + voxel_size * (np.arange(n) + 0.5), upper)
         for lower, upper, n in zip(lower_W, upper_W, shape, strict=True)
     )
-    # Cubes of voxels rather than slices: fields find the nearest of many shapes faster for points
-    # that lie close together.
-    cube = 8
-    for i in range(0, shape[0], cube):
-        for j in range(0, shape[1], cube):
-            for k in range(0, shape[2], cube):
-                part = np.s_[i : i + cube, j : j + cube, k : k + cube]
-                p_WQ = np.stack(np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij"), -1)
-                sample = field.query(p_WQ)
-                distances[part], states[part] = sample.distance, sample.state
+    for part, p_WQ in cubes_of_points(x, y, z):
+        sample = field.query(p_WQ)
+        distances[part], states[part] = sample.distance, sample.state
     return Esdf(distances, states, lower_W, voxel_size)
+
+
+def cubes_of_points(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: int = 8
+) -> Iterator[tuple[tuple[slice, slice, slice], np.ndarray]]:
+    """The points of the grid x (nx,), y (ny,), z (nz,) in cubes of `edge` points a side: the part
+    of the grid that a cube is, and its points (n, n, n, 3).
+
+    Fields find the nearest of many shapes faster for points that lie close together.
+    """
+    for i in range(0, len(x), edge):
+        for j in range(0, len(y), edge):
+            for k in range(0, len(z), edge):
+                part = np.s_[i : i + edge, j : j + edge, k : k + edge]
+                axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")
+                yield part, np.stack(axes, axis=-1)

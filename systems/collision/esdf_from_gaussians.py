@@ -37,16 +37,17 @@ def esdf_from_gaussians(
     hollow shell of Gaussians space counts as free unless `observed` says otherwise.
 
     Args:
-      scene: the Gaussians.
-      voxel_size: [m].
-      lower_W, upper_W: (3,) [m], by default the box of all centres and half a metre.
-      threshold: density of the surface, more than 0 and less than 1.
-      observed: (nx, ny, nz) bool, voxels about which something is known, of the shape `grid_shape`
-        gives for the box; by default all. Others that are not occupied are UNKNOWN.
+        scene: the Gaussians.
+        voxel_size: [m].
+        lower_W, upper_W: (3,) [m], by default the box of all centres and half a metre.
+        threshold: density of the surface, more than 0 and less than 1.
+        observed: (nx, ny, nz) bool, voxels about which something is known, of the shape
+            `grid_shape` gives for the box; by default all. Others that are not occupied are
+            UNKNOWN.
 
     Raises:
-      ValueError: for an empty scene without bounds, a threshold out of range, `observed` of another
-        shape, or bounds that make no grid or too large a one (see `grid_shape`).
+        ValueError: for an empty scene without bounds, a threshold out of range, `observed` of
+            another shape, or bounds that make no grid or too large a one (see `grid_shape`).
     """
     if not 0.0 < threshold < 1.0:
         raise ValueError(f"esdf_from_gaussians: the threshold is {threshold}; needed is 0 to 1.")

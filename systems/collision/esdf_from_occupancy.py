@@ -14,8 +14,8 @@ def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> t
     """Voxels along each axis that cover the box [lower_W, upper_W]; the last may reach beyond it.
 
     Raises:
-      ValueError: if the box is empty or not finite, the voxel size is not positive, or the grid
-        would have fewer than 2 voxels along an axis or more than `MAX_VOXELS`.
+        ValueError: if the box is empty or not finite, the voxel size is not positive, or the grid
+            would have fewer than 2 voxels along an axis or more than `MAX_VOXELS`.
     """
     extent = np.asarray(upper_W, dtype=float) - np.asarray(lower_W, dtype=float)
     if extent.shape != (3,) or not np.isfinite(extent).all() or (extent <= 0.0).any():
@@ -56,18 +56,18 @@ def esdf_from_occupancy(
     average (far) and 0.07 to 0.2 rms, and near zero within a voxel of the surface.
 
     Args:
-      occupied: (nx, ny, nz) bool.
-      unknown: (nx, ny, nz) bool, voxels never observed, none of them occupied; None for none.
-      lower_W: (3,) [m], lower corner of the grid.
-      voxel_size: [m].
-      surface_offset: (nx, ny, nz) [m], signed distance of a voxel's centre from the surface, not
-        positive in occupied voxels and not negative in others; NaN where it is not known. Values
-        beyond one voxel are not used. Where a surface has no value on either side of it, it is the
-        faces of its voxels.
+        occupied: (nx, ny, nz) bool.
+        unknown: (nx, ny, nz) bool, voxels never observed, none of them occupied; None for none.
+        lower_W: (3,) [m], lower corner of the grid.
+        voxel_size: [m].
+        surface_offset: (nx, ny, nz) [m], signed distance of a voxel's centre from the surface, not
+            positive in occupied voxels and not negative in others; NaN where it is not known.
+            Values beyond one voxel are not used. Where a surface has no value on either side of it,
+            it is the faces of its voxels.
 
     Raises:
-      ValueError: for arrays of different shapes, voxels both occupied and unknown, or offsets whose
-        sign contradicts the occupancy.
+        ValueError: for arrays of different shapes, voxels both occupied and unknown, or offsets
+            whose sign contradicts the occupancy.
     """
     occupied = np.asarray(occupied, dtype=bool)
     unknown = np.zeros_like(occupied) if unknown is None else np.asarray(unknown, dtype=bool)

@@ -22,19 +22,12 @@ _FREE, _OCCUPIED, _INNER = 1, 2, 3  # the two bits of a child
 
 @dataclass(frozen=True, eq=False)
 class Octomap:
-    """The leaves of an occupancy octree: cubes of known space.
+    """The leaves of an occupancy octree: cubes of known space."""
 
-    Attributes:
-      resolution: edge length of the smallest voxel [m].
-      corners: (N, 3) int, lower corner of each leaf in voxels from the world's origin.
-      sizes: (N,) int, edge length of each leaf in voxels, a power of two.
-      occupied: (N,) bool, the others are free.
-    """
-
-    resolution: float
-    corners: np.ndarray
-    sizes: np.ndarray
-    occupied: np.ndarray
+    resolution: float  # [m] edge length of the smallest voxel
+    corners: np.ndarray  # (N, 3) int, lower corner of each leaf in voxels from the world's origin
+    sizes: np.ndarray  # (N,) int, edge length of each leaf in voxels, a power of two
+    occupied: np.ndarray  # (N,) bool, the others are free
 
     @property
     def lower_W(self) -> np.ndarray:
@@ -52,11 +45,11 @@ class Octomap:
         """A grid of the map's smallest voxels over a box, by default all the known space.
 
         Returns:
-          states (nx, ny, nz) uint8 `FieldState`, and the grid's lower corner (3,) [m], the box's
-          rounded outwards to a voxel.
+            states (nx, ny, nz) uint8 `FieldState`, and the grid's lower corner (3,) [m], the box's
+            rounded outwards to a voxel.
 
         Raises:
-          ValueError: if the box is empty or the grid would be too large.
+            ValueError: if the box is empty or the grid would be too large.
         """
         lower_W = self.lower_W if lower_W is None else np.asarray(lower_W, dtype=float)
         upper_W = self.upper_W if upper_W is None else np.asarray(upper_W, dtype=float)
@@ -92,8 +85,8 @@ def read_octomap(path: str | Path) -> Octomap:
     """Reads a binary OctoMap (.bt) file.
 
     Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if the file is no binary OctoMap, or is truncated, damaged or empty.
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is no binary OctoMap, or is truncated, damaged or empty.
     """
     path = Path(path)
     if not path.is_file():
@@ -142,11 +135,11 @@ def esdf_from_octomap(
     The surface is the faces of occupied voxels, see `esdf_from_occupancy`: the map knows no better.
 
     Args:
-      path: of the .bt file.
-      lower_W, upper_W: (3,) [m], the part of the map wanted, by default all known space.
+        path: of the .bt file.
+        lower_W, upper_W: (3,) [m], the part of the map wanted, by default all known space.
 
     Raises:
-      FileNotFoundError, ValueError: see `read_octomap` and `Octomap.states`.
+        FileNotFoundError, ValueError: see `read_octomap` and `Octomap.states`.
     """
     octomap = read_octomap(path)
     states, lower_W = octomap.states(lower_W, upper_W)

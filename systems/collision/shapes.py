@@ -2,7 +2,7 @@
 
 Every kind of shape is a dataclass whose static methods take its parameters as arrays: `distances`
 broadcasts points (..., 3) against parameters (M, ...), so it serves all pairs, points (N, 1, 3),
-and matched pairs, points (N, 3), alike.
+and matched pairs, points (N, 3), alike. O is a shape's own frame.
 """
 
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from pydrake.math import RigidTransform
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A ball: centre p_WS (3,) [m], radius [m]."""
+    """A ball: centre p_WO (3,) [m], radius [m]."""
 
-    p_WS: ArrayLike
+    p_WO: ArrayLike
     radius: float
 
     def parameters(self) -> tuple[Any, ...]:
-        return as_point(self.p_WS, "Sphere.p_WS"), _positive(self.radius, "Sphere.radius")
+        return as_point(self.p_WO, "Sphere.p_WO"), _positive(self.radius, "Sphere.radius")
 
     @staticmethod
     def distances(p: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -107,16 +107,16 @@ class Cylinder:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A solid box: pose X_WS of its centre, edge lengths `size` (3,) [m] along its own axes."""
+    """A solid box: pose X_WO of its centre, edge lengths `size` (3,) [m] along its own axes."""
 
-    X_WS: RigidTransform
+    X_WO: RigidTransform
     size: ArrayLike
 
     def parameters(self) -> tuple[Any, ...]:
         size = as_point(self.size, "Box.size")
         if (size <= 0.0).any():
             raise ValueError(f"Box.size is {size} m; each edge must be positive.")
-        return self.X_WS.translation(), self.X_WS.rotation().matrix(), 0.5 * size
+        return self.X_WO.translation(), self.X_WO.rotation().matrix(), 0.5 * size
 
     @staticmethod
     def distances(

@@ -15,16 +15,16 @@ def soft_barrier(distance: Any, radius: float, beta: float = 4.0, margin: float 
     far away from one.
 
     Args:
-      distance: (...,) [m], signed distance; numpy array, float or torch tensor.
-      radius: of the vehicle [m].
-      beta: sharpness [1/m].
-      margin: distance kept beyond the radius [m].
+        distance: (...,) [m], signed distance; numpy array, float or torch tensor.
+        radius: of the vehicle [m].
+        beta: sharpness [1/m].
+        margin: distance kept beyond the radius [m].
 
     Returns:
-      (...,) [m], of the distance's kind; NaN where the distance is NaN.
+        (...,) [m], of the distance's kind; NaN where the distance is NaN.
 
     Raises:
-      ValueError: if beta is not positive.
+        ValueError: if beta is not positive.
     """
     if not beta > 0.0:
         raise ValueError(f"soft_barrier: beta is {beta} 1/m; it must be positive.")

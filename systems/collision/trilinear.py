@@ -25,11 +25,11 @@ def trilinear(corners: Any, fx: Any, fy: Any, fz: Any) -> Any:
     Fractions outside [0, 1] extrapolate the cell's polynomial.
 
     Args:
-      corners: (2, 2, 2, N), indexed by the corner's x, y and z.
-      fx, fy, fz: (N,) each.
+        corners: (2, 2, 2, N), indexed by the corner's x, y and z.
+        fx, fy, fz: (N,) each.
 
     Returns:
-      (N,) values.
+        (N,) values.
     """
     along_yz = corners[0] + fx * (corners[1] - corners[0])  # (2, 2, N)
     along_z = along_yz[0] + fy * (along_yz[1] - along_yz[0])  # (2, N)
@@ -40,7 +40,7 @@ def trilinear_with_gradient(corners: Any, fx: Any, fy: Any, fz: Any) -> tuple[An
     """`trilinear` with its exact partial derivatives by fx, fy and fz.
 
     Returns:
-      value, d/dfx, d/dfy, d/dfz: (N,) each.
+        value, d/dfx, d/dfy, d/dfz: (N,) each.
     """
     slope_x = corners[1] - corners[0]  # (2, 2, N)
     along_yz = corners[0] + fx * slope_x

@@ -1,6 +1,5 @@
 """The onboard camera's picture, as Meshcat shows it."""
 
-import base64
 import json
 from typing import cast
 
@@ -13,6 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
+from splatpilot.systems.gltf import add_primitive, data_uri
 from splatpilot.systems.visualization.flipbook import page_path, show_page
 
 
@@ -90,66 +90,23 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
         corners: (4, 3) [m], the picture's top left, top right, bottom right and bottom left corner.
     """
     _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
-    positions = corners.astype("<f4")
-    texture = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4")
-    indices = np.array([0, 1, 2, 0, 2, 3], "<u2")
-    # glTF's y axis is up while Drake's is z: Drake turns glTF content by 90 degrees about x on the
-    # way in.
-    positions = positions @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], "<f4")
-    binary = positions.tobytes() + texture.tobytes() + indices.tobytes()
-    return json.dumps(
-        {
-            "asset": {"version": "2.0"},
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [
-                {
-                    "primitives": [
-                        {
-                            "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
-                            "indices": 2,
-                            "material": 0,
-                        }
-                    ]
-                }
-            ],
-            "materials": [
-                {
-                    "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
-                    "extensions": {"KHR_materials_unlit": {}},
-                    "doubleSided": True,
-                }
-            ],
-            "extensionsUsed": ["KHR_materials_unlit"],
-            "textures": [{"source": 0}],
-            "images": [{"uri": _data_uri("image/jpeg", jpeg.tobytes())}],
-            "accessors": [
-                {
-                    "bufferView": 0,
-                    "componentType": 5126,
-                    "count": 4,
-                    "type": "VEC3",
-                    "min": positions.min(axis=0).tolist(),
-                    "max": positions.max(axis=0).tolist(),
-                },
-                {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
-                {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
-            ],
-            "bufferViews": [
-                {"buffer": 0, "byteOffset": 0, "byteLength": 48},
-                {"buffer": 0, "byteOffset": 48, "byteLength": 32},
-                {"buffer": 0, "byteOffset": 80, "byteLength": 12},
-            ],
-            "buffers": [
-                {
-                    "byteLength": len(binary),
-                    "uri": _data_uri("application/octet-stream", binary),
-                }
-            ],
-        }
-    )
-
-
-def _data_uri(media_type: str, content: bytes) -> str:
-    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+                "extensions": {"KHR_materials_unlit": {}},
+                "doubleSided": True,
+            }
+        ],
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "textures": [{"source": 0}],
+        "images": [{"uri": data_uri("image/jpeg", jpeg.tobytes())}],
+    }
+    uv, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]])
+    primitive = add_primitive(document, corners, uv, triangles)
+    document["meshes"] = [{"primitives": [{**primitive, "material": 0}]}]
+    return json.dumps(document)

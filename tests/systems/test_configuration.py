@@ -104,9 +104,17 @@ def test_scenario_refuses_what_cannot_be_flown(override, message):
         load_config(Scenario(), overrides=[override]).validate()
 
 
-def test_default_scenario_is_valid():
-    """The defaults can be flown."""
-    Scenario().validate()
+def test_nothing_named_gives_the_defaults_and_they_are_valid(tmp_path):
+    """A file of one default, as good as none, gives all the defaults; those can be flown, but not
+    with a clock that stands."""
+    path = tmp_path / "scenario.yaml"
+    path.write_text("seed: 0\n")
+    scenario = load_config(Scenario(), path)
+    assert dump_config(scenario) == dump_config(Scenario())
+    scenario.validate()
+    scenario.timeout = 0.0
+    with pytest.raises(ValueError, match="timeout is 0"):
+        scenario.validate()
 
 
 def test_override_keeps_the_type_that_a_file_chose(tmp_path):

@@ -6,15 +6,10 @@ import torch
 
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
 from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.training.policies.fields import Course, Fields
-
-VALIDATION_SEEDS = TRAINING_SEEDS + 1_000_000
-"""Worlds of the seeds from here on choose among checkpoints and are not trained in either."""
-
-_LARGEST_RUN = 1000  # courses of one training seed
 
 PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
 """The scenarios whose worlds are made from seeds."""
@@ -43,8 +38,8 @@ class CourseSelection:
             raise ValueError(f"courses.kinds is {self.kinds}; choose from {', '.join(PROCEDURAL)}")
         for name in ("count", "held_out"):
             value = getattr(self, name)
-            if not 1 <= value <= _LARGEST_RUN:
-                raise ValueError(f"courses.{name} is {value}; it must be 1 to {_LARGEST_RUN}")
+            if not 1 <= value <= SEEDS_PER_RUN:
+                raise ValueError(f"courses.{name} is {value}; it must be 1 to {SEEDS_PER_RUN}")
         if not 0.05 <= self.voxel_size <= 0.5:
             raise ValueError(f"courses.voxel_size is {self.voxel_size} m; it must be 0.05 to 0.5")
 
@@ -65,10 +60,8 @@ def training_fields(
     Raises:
         ValueError: if the seed is not 0 to 999.
     """
-    if not 0 <= seed < (VALIDATION_SEEDS - TRAINING_SEEDS) // _LARGEST_RUN:
-        raise ValueError(f"seed is {seed}; it must be 0 to 999")
-    first = TRAINING_SEEDS + seed * _LARGEST_RUN
-    return Fields(_courses(selection, selection.count, first), selection.voxel_size, device)
+    courses = _courses(selection, selection.count, first_training_seed(seed))
+    return Fields(courses, selection.voxel_size, device)
 
 
 def validation_fields(selection: CourseSelection, device: torch.device | str = "cpu") -> Fields:

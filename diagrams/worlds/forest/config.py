@@ -4,16 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-
-CLEARANCE = 1.0
-"""[m], least distance of start and goal from everything."""
-
-INSET = 1.5
-"""[m], distance of start and goal from the ends of the volume."""
-
-PASSAGE = 2 * VEHICLE_RADIUS + 0.1
-"""[m], least gap left between two trunks, at any height."""
+from splatpilot.diagrams.worlds.fittings import CLEARING, INSET, PASSAGE, check_count
 
 
 @dataclass
@@ -44,12 +35,10 @@ class TrunksConfig:
         for name in positive:
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)} m must be positive and finite")
-        for name in ("rocks", "logs"):
-            if not 0 <= getattr(self, name) <= 1000:
-                raise ValueError(f"{name} = {getattr(self, name)} must be 0 to 1000")
+        check_count(self, "rocks", "logs")
         if not 0 <= self.lean_max <= 10:
             raise ValueError(f"lean_max = {self.lean_max} deg must be between 0 and 10 deg")
-        least = 2 * (INSET + CLEARANCE)
+        least = 2 * (INSET + CLEARING)
         if self.length < least:
             raise ValueError(
                 f"length = {self.length} m must be at least {least:g} m, since start and goal are "
@@ -60,10 +49,10 @@ class TrunksConfig:
             raise ValueError(
                 f"width = {self.width} m must be at least {least:g} m, or one trunk can block it"
             )
-        if not CLEARANCE <= self.flight_height <= self.height - CLEARANCE:
+        if not CLEARING <= self.flight_height <= self.height - CLEARING:
             raise ValueError(
-                f"flight_height = {self.flight_height} m must be between {CLEARANCE:g} m and "
-                f"height - {CLEARANCE:g} m = {self.height - CLEARANCE:g} m"
+                f"flight_height = {self.flight_height} m must be between {CLEARING:g} m and "
+                f"height - {CLEARING:g} m = {self.height - CLEARING:g} m"
             )
         if self.radius_max < self.radius_min:
             raise ValueError(

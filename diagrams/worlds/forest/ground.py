@@ -3,13 +3,12 @@
 import numpy as np
 
 from splatpilot.diagrams.worlds.forest.layout import ForestLayout
+from splatpilot.diagrams.worlds.forest.light import ForestLight
 from splatpilot.diagrams.worlds.solids import textures
-from splatpilot.diagrams.worlds.solids.light import HAZE_RANGE, Daylight, Sunlit, hazed
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     Surfels,
-    colored,
-    merged,
+    merge,
     on_ground,
     rectangle,
     sphere,
@@ -18,14 +17,12 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
 from splatpilot.diagrams.worlds.solids.textures import OAK, mix, ramp, smoothstep
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
-SOIL = -0.06
-"""[m], height of the closed layer under leaves and twigs, so that these are drawn in front of it
+SUNK = 0.06
+"""[m], depth of the closed layer under leaves and twigs, so that these are drawn in front of it
 at grazing angles too."""
 
 
-def floor(
-    layout: ForestLayout, light: Daylight, sunlit: Sunlit, rng: np.random.Generator
-) -> GaussianScene:
+def floor(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
     """Covers the ground: soil, moss and needles, fine inside the volume, coarser further out."""
     lower, upper = layout.lower[:2], layout.upper[:2]
     parts = []
@@ -35,49 +32,47 @@ def floor(
         p = p[layout.outside(p) >= inner] if inner else p
         extent = COVERAGE * spacing * rng.uniform(0.8, 1.25, (len(p), 2))
         angle = rng.uniform(0, np.pi, len(p))
-        parts.append(on_ground(p, angle, extent, SOIL - 0.1 * (spacing - 0.18)))
+        parts.append(on_ground(p, angle, extent, -SUNK - 0.1 * (spacing - 0.18)))
         inner = outer
-    surfels = Surfels.joined(parts)
+    surfels = Surfels.concatenate(parts)
     albedo, _ = textures.forest_floor(surfels.p[:, :2])
     albedo = albedo * rng.uniform(0.8, 1.2, (len(albedo), 1))
-    return _on_floor(layout, light, sunlit, surfels, albedo, 0.99)
+    return _on_floor(layout, light, surfels, albedo, 0.99)
 
 
-def litter(
-    layout: ForestLayout, light: Daylight, sunlit: Sunlit, rng: np.random.Generator
-) -> GaussianScene:
+def litter(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
     """Strews leaves, twigs, blades of moss and flat ferns over the ground of the volume."""
     lower, upper = layout.lower[:2] - 0.5, layout.upper[:2] + 0.5
     area = np.prod(upper - lower)
 
-    def strewn(density):
+    def strew(density):
         return rng.uniform(lower, upper, (round(density * area), 2))
 
-    p = strewn(36)
+    p = strew(36)
     _, mossy = textures.forest_floor(p)
     p = p[rng.uniform(size=len(p)) > 0.8 * mossy]
     extent = rng.uniform(0.6, 1.3, (len(p), 1)) * (0.045, 0.026)
     leaves = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, rng.uniform(0.012, 0.025, len(p)))
-    scenes = [_on_floor(layout, light, sunlit, leaves, textures.fallen_leaf(p), 0.93)]
+    scenes = [_on_floor(layout, light, leaves, textures.fallen_leaf(p), 0.93)]
 
-    p = strewn(1.6)
+    p = strew(1.6)
     extent = np.column_stack([rng.uniform(0.05, 0.16, len(p)), np.full(len(p), 0.007)])
     twigs = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.022)
     albedo = ramp([(0.20, 0.15, 0.11), (0.50, 0.43, 0.35)], rng.uniform(size=len(p)))
-    scenes.append(_on_floor(layout, light, sunlit, twigs, albedo, 0.9))
+    scenes.append(_on_floor(layout, light, twigs, albedo, 0.9))
 
-    p = strewn(20)
+    p = strew(20)
     _, mossy = textures.forest_floor(p)
     p = p[rng.uniform(size=len(p)) < mossy]
     extent = rng.uniform(0.7, 1.3, (len(p), 1)) * (0.055, 0.017)
     blades = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.022)
     albedo = textures.moss(blades.p * 3) * rng.uniform(0.6, 1.9, (len(p), 1))
-    scenes.append(_on_floor(layout, light, sunlit, blades, albedo, 0.85))
-    scenes.append(_ferns(layout, light, sunlit, strewn(0.10), rng))
-    return merged(scenes)
+    scenes.append(_on_floor(layout, light, blades, albedo, 0.85))
+    scenes.append(_ferns(layout, light, strew(0.10), rng))
+    return merge(scenes)
 
 
-def _ferns(layout, light, sunlit, p, rng) -> GaussianScene:
+def _ferns(layout, light, p, rng) -> GaussianScene:
     """Spreads a rosette of fronds, each a row of pointed leaflets, flat about each p (N, 2)."""
     fronds, leaflets = 8, 6
     N = len(p)
@@ -100,17 +95,17 @@ def _ferns(layout, light, sunlit, p, rng) -> GaussianScene:
         [(0.20, 0.32, 0.10), (0.38, 0.50, 0.16), (0.52, 0.60, 0.22)],
         0.5 + 0.35 * np.broadcast_to(s, bend.shape).ravel() - rng.uniform(0, 0.4, bend.size),
     )
-    return _on_floor(layout, light, sunlit, surfels, albedo, 0.92)
+    return _on_floor(layout, light, surfels, albedo, 0.92)
 
 
 def rocks_and_logs(
-    layout: ForestLayout, light: Daylight, sunlit: Sunlit, rng: np.random.Generator
+    layout: ForestLayout, light: ForestLight, rng: np.random.Generator
 ) -> list[GaussianScene]:
     """Covers boulders and fallen trunks, mossy on top; the list is empty if there are none."""
     scenes = []
     if len(layout.rocks):
-        surfels = Surfels.joined([sphere(rock[:3], rock[3], 0.06) for rock in layout.rocks])
-        scenes.append(_mossy(layout, light, sunlit, surfels, textures.stone(surfels.p)))
+        surfels = Surfels.concatenate([sphere(rock[:3], rock[3], 0.06) for rock in layout.rocks])
+        scenes.append(_grow_moss(light, surfels, textures.stone(surfels.p)))
     if len(layout.logs):
         parts = []
         for log in layout.logs:
@@ -118,33 +113,26 @@ def rocks_and_logs(
             for p_E, inwards in ((log[:3], log[3:6] - log[:3]), (log[3:6], log[:3] - log[3:6])):
                 cap = sphere(p_E, log[6], 0.06)
                 parts.append(cap[cap.n @ inwards < 0])
-        surfels = Surfels.joined(parts)
+        surfels = Surfels.concatenate(parts)
         rotten = textures.bark(OAK, surfels.p) * (0.82, 0.68, 0.54)
-        scenes.append(_mossy(layout, light, sunlit, surfels, rotten))
+        scenes.append(_grow_moss(light, surfels, rotten))
     return scenes
 
 
-def _mossy(layout, light, sunlit, surfels, albedo) -> GaussianScene:
+def _grow_moss(light, surfels, albedo) -> GaussianScene:
     seen = surfels.p[:, 2] > -0.05
     surfels, albedo = surfels[seen], albedo[seen]
     cover = surfels.n[:, 2] - 0.35 + 0.9 * textures.fbm(surfels.p * 2.5, 3, seed=81)
     moss = textures.moss(surfels.p * 3)
     albedo = mix(albedo, moss, 0.9 * smoothstep(0.2, 0.5, cover))
     albedo = albedo * (1 + 0.25 * textures.value_noise(surfels.p * 16, seed=82)[:, None])
-    return _lit(layout, light, sunlit, surfels, albedo, 0.99)
+    return light.paint(surfels, albedo, 0.99)
 
 
-def _on_floor(layout, light, sunlit, surfels, albedo, opacity) -> GaussianScene:
+def _on_floor(layout, light, surfels, albedo, opacity) -> GaussianScene:
     """Colours patches of the ground: none under trunks, rocks and logs, dark against their feet."""
     room = layout.room(surfels.p)
     open_ = room > -0.05
     shade = 0.55 + 0.45 * smoothstep(-0.05, 0.45, room)
     albedo = albedo * shade[:, None]
-    return _lit(layout, light, sunlit, surfels[open_], albedo[open_], opacity)
-
-
-def _lit(layout, light, sunlit, surfels, albedo, opacity) -> GaussianScene:
-    """Shades and colours patches."""
-    colors = light.shaded(albedo, surfels.n, sunlit(surfels.p))
-    colors = hazed(colors, light.haze, layout.outside(surfels.p), HAZE_RANGE)
-    return colored(surfels, colors, opacity)
+    return light.paint(surfels[open_], albedo[open_], opacity)

@@ -109,8 +109,8 @@ def lay_out(
 ) -> ForestLayout:
     """Places everything, leaving discs of radius `clearance` [m] about `clear` (K, 2) open."""
     clear = np.asarray(clear)
-    lower = np.array([0.0, -config.width / 2, 0.0])
-    upper = np.array([config.length, config.width / 2, config.height])
+    plot = Plot.of_size(config.length, config.width, config.height)
+    lower, upper = plot.lower, plot.upper
     base = poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
     N = len(base)
     radius = rng.uniform(config.radius_min, config.radius_max, N)

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.forest.layout import ForestLayout
+from splatpilot.diagrams.worlds.forest.light import ForestLight
+from splatpilot.diagrams.worlds.forest.surroundings import paint_leaves
 from splatpilot.diagrams.worlds.solids import textures
-from splatpilot.diagrams.worlds.solids.light import HAZE_RANGE, Daylight, Sunlit, hazed
-from splatpilot.diagrams.worlds.solids.surfaces import Surfels, colored, merged, perpendicular, tube
+from splatpilot.diagrams.worlds.solids.light import Daylight
+from splatpilot.diagrams.worlds.solids.surfaces import Surfels, merge, perpendicular, tube
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE, mix, smoothstep
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -34,9 +36,7 @@ _MARKS = {
 }
 
 
-def trunks(
-    layout: ForestLayout, light: Daylight, sunlit: Sunlit, rng: np.random.Generator
-) -> GaussianScene:
+def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
     """Covers all trunks: a closed layer in the colour of fissures, marks of bark on top of it."""
     trees, ceiling = layout.trees, layout.upper[2]
     away = layout.outside(trees.base)
@@ -63,28 +63,22 @@ def trunks(
         for layer, tubes in layers.items():
             if not tubes:
                 continue
-            surfels = Surfels.joined([patches for patches, _ in tubes])
+            surfels = Surfels.concatenate([patches for patches, _ in tubes])
             tree = np.repeat([i for _, i in tubes], [len(patches) for patches, _ in tubes])
-            keep = _faces(layout, surfels)
+            keep = layout.is_faced(surfels.p, surfels.n)
             opacity = np.full(len(surfels), 0.99)
             if layer == "marks":
                 keep &= rng.uniform(size=len(keep)) < marks.kept
-                surfels = _roughened(surfels, marks, rng)
+                surfels = _roughen(surfels, marks, rng)
                 opacity = rng.uniform(0.75, 0.97, len(surfels))
             surfels, tree = surfels[keep], tree[keep]
-            colors = _bark(layout, light, sunlit, species, layer, surfels, tree)
-            scenes.append(colored(surfels, colors, opacity[keep]))
-    return merged(scenes)
+            albedo = _bark(layout, light, species, layer, surfels, tree)
+            scenes.append(light.paint(surfels, albedo, opacity[keep]))
+    return merge(scenes)
 
 
-def _faces(layout: ForestLayout, surfels: Surfels) -> NDArray[np.bool_]:
-    """Whether the front of a patch faces any point of the flyable volume."""
-    corner = np.where(surfels.n > 0, layout.upper, layout.lower)
-    return np.einsum("nk,nk->n", surfels.n, corner - surfels.p) > 0
-
-
-def _roughened(surfels: Surfels, marks: _Marks, rng: np.random.Generator) -> Surfels:
-    """Returns patches of a closed layer as single marks of various sizes and directions."""
+def _roughen(surfels: Surfels, marks: _Marks, rng: np.random.Generator) -> Surfels:
+    """Patches of a closed layer as single marks of various sizes and directions."""
     N = len(surfels)
     extent = surfels.extent * marks.fill * rng.uniform(0.6, 1.25, (N, 2))
     turn = rng.normal(0, marks.turn, N)[:, None]
@@ -92,8 +86,8 @@ def _roughened(surfels: Surfels, marks: _Marks, rng: np.random.Generator) -> Sur
     return Surfels(surfels.p, surfels.n, t, extent)
 
 
-def _bark(layout, light, sunlit, species, layer, surfels, tree) -> NDArray:
-    """Returns colours (N, 3) of patches of one species; `tree` (N,) says whose they are."""
+def _bark(layout, light, species, layer, surfels, tree) -> NDArray:
+    """Albedo (N, 3) of patches of one species; `tree` (N,) says whose they are."""
     trees = layout.trees
     z = surfels.p[:, 2]
     p_T = surfels.p.copy()  # along the trunk's own axis, every trunk elsewhere in the texture
@@ -109,13 +103,14 @@ def _bark(layout, light, sunlit, species, layer, surfels, tree) -> NDArray:
     warm = textures.hash_unit(tree[:, None], seed=72)[:, None] - 0.5
     albedo = albedo * (0.78 + 0.42 * tone) * (1 + warm * np.array([0.12, 0.0, -0.14]))
     # Moss climbs the shady, damp side of the foot.
-    damp = surfels.n[:, :2] @ -light.direction[:2] + 0.9 * textures.fbm(p_T * 2.2, 3, seed=73)
+    damp = surfels.n[:, :2] @ -light.daylight.direction[:2] + 0.9 * textures.fbm(
+        p_T * 2.2, 3, seed=73
+    )
     moss = smoothstep(0.35, 0.85, damp + 0.55 - 0.45 * z) * (0.35 if species == BIRCH else 0.9)
     albedo = mix(albedo, textures.moss(p_T * 2.0), moss)
 
     shade = 0.55 + 0.45 * smoothstep(-0.1, 0.5, z)  # the ground hides the sky from the foot
-    colors = light.shaded(albedo * shade[:, None], surfels.n, sunlit(surfels.p))
-    return hazed(colors, light.haze, layout.outside(surfels.p), HAZE_RANGE)
+    return albedo * shade[:, None]
 
 
 def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> GaussianScene:
@@ -170,7 +165,6 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
     for kind in (OAK, PINE, BIRCH):
         albedo[species == kind] = textures.leaf(kind, p[species == kind])
     sunlit = smoothstep(ceiling - 1, ceiling + 6, p[:, 2]) * (1 - 0.6 * depth)
-    colors = light.shaded(albedo * (1 - 0.35 * depth)[:, None], n, sunlit, leafy=True)
-    colors = hazed(colors, light.haze, layout.outside(p), HAZE_RANGE)
+    albedo *= (1 - 0.35 * depth)[:, None]
     opacity = rng.uniform(0.7, 0.95, len(p))
-    return colored(Surfels(p, n, t, size), colors, opacity)
+    return paint_leaves(Surfels(p, n, t, size), albedo, light, sunlit, layout.outside(p), opacity)

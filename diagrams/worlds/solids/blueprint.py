@@ -23,19 +23,18 @@ class Blueprint:
     name: str
     lower_W: Array  # (3,) [m], flyable volume
     upper_W: Array  # (3,) [m]
-    solids: list[Solid]
-    """What can be hit, and is seen."""
+    solids: list[Solid]  # what can be hit, and is seen
     p_WS: Array  # (3,) [m], start
     p_WG: Array  # (3,) [m], goal
-    light: Callable[[Esdf], Illumination]
-    """The light, given a grid of the distances."""
+    light: Callable[[Esdf], Illumination]  # the light, given a grid of the distances
     seed: int = 0
-    voxel_size: float = 0.15
-    """[m], of the distance grid."""
+    voxel_size: float = 0.15  # [m], of the distance grid
+    # Solids so far outside the volume that its ground or walls are always nearer.
     scenery: list[Solid] = field(default_factory=list)
-    """Solids so far outside the volume that its ground or walls are always nearer."""
+    # Draws what else is out of reach: leaves overhead, bushes and trees around the volume.
     surroundings: Callable[[], list[GaussianScene]] = list
-    """Draws what else is out of reach: leaves overhead, bushes and trees around the volume."""
+    # Draws all that cameras see; by default the solids in their materials, and the surroundings.
+    gaussians: Callable[[Illumination], GaussianScene] | None = None
 
     @property
     def distance_field(self) -> AnalyticDistanceField:

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.solids.light import GAMMA, HAZE_RANGE, Daylight, developed, hazed
+from splatpilot.diagrams.worlds.solids.light import Daylight, develop
 from splatpilot.systems.collision.esdf import Esdf
 
 Array = NDArray[np.floating]
@@ -23,13 +23,6 @@ class Illumination(Protocol):
     def irradiance(self, p_W: Array, n_W: Array) -> Array:
         """Light, linear (N, 3), on surfaces at p_W (N, 3) [m] with unit normals n_W (N, 3)."""
         ...
-
-
-def shade(albedo: Array, irradiance: Array, haze: Array, outside: Array) -> Array:
-    """Colours (N, 3), sRGB, of surfaces of `albedo` (N, 3), sRGB, under `irradiance` (N, 3),
-    linear, that are `outside` (N,) [m] the volume in the haze."""
-    colors = developed(np.clip(albedo, 0, 1) ** GAMMA * irradiance)
-    return hazed(colors, haze, outside, HAZE_RANGE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +73,7 @@ class Lamplight:
 
     @property
     def haze(self) -> Array:
-        return developed(0.25 * self.tint)
+        return develop(0.25 * self.tint)
 
     def irradiance(self, p_W: Array, n_W: Array) -> Array:
         total = np.full(len(p_W), 0.45)

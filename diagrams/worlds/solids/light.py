@@ -1,6 +1,5 @@
 """Daylight baked into colours: sun, sky and light thrown back by the ground."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +11,6 @@ GAMMA = 2.2
 
 HAZE_RANGE = 16.0
 """[m], way through the surroundings in which light fades by a factor e."""
-
-type Sunlit = Callable[[NDArray], NDArray]
-"""Maps points (N, 3) [m] to the part of the sun that reaches them, (N,) in [0, 1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +24,7 @@ class Daylight:
     haze: NDArray[np.float64]  # (3,) sRGB, what everything fades to with distance
 
     @classmethod
-    def sampled(cls, rng: np.random.Generator) -> "Daylight":
+    def sample(cls, rng: np.random.Generator) -> "Daylight":
         """Draws the hour: the lower the sun, the warmer its light."""
         azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(32, 58))
         warmth = 0.8 * float(smoothstep(58, 32, np.rad2deg(elevation)))
@@ -46,24 +42,16 @@ class Daylight:
             haze=np.array([0.80, 0.86, 0.86]) + warmth * np.array([0.05, 0.0, -0.06]),
         )
 
-    def shaded(
-        self, albedo: ArrayLike, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
-    ) -> NDArray[np.float32]:
-        """Returns the colours, sRGB (N, 3), of surfaces in this light.
+    def irradiance(
+        self, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
+    ) -> NDArray[np.float64]:
+        """The light, linear (N, 3), that falls on surfaces.
 
         Args:
-            albedo: (N, 3), sRGB.
             normal: (N, 3), unit, in W.
             sunlit: (N,) in [0, 1], the part of the sun that reaches the surface.
             leafy: leaves let light through, so both their sides are lit by sun on either.
         """
-        linear = np.asarray(albedo) ** GAMMA * self.irradiance(normal, sunlit, leafy)
-        return developed(linear)
-
-    def irradiance(
-        self, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
-    ) -> NDArray[np.float64]:
-        """Returns the light, linear (N, 3), that falls on surfaces; arguments as of `shaded`."""
         normal = np.asarray(normal)
         facing = normal @ self.direction
         facing = 0.35 + 0.65 * np.abs(facing) if leafy else np.clip(facing, 0, None)
@@ -110,12 +98,27 @@ class Daylight:
         return lit
 
 
-def developed(linear: ArrayLike) -> NDArray[np.float32]:
-    """Returns the sRGB colours of linear light: exposed like film, so that nothing clips."""
+def shade(
+    albedo: NDArray, irradiance: ArrayLike, haze: ArrayLike, distance: ArrayLike
+) -> NDArray[np.float64]:
+    """Colours (N, 3), sRGB, of surfaces as they are seen.
+
+    Args:
+        albedo: (N, 3), sRGB, not negative.
+        irradiance: (N, 3), linear, the light that falls on them.
+        haze: (3,), sRGB, what they fade to.
+        distance: (N,) [m], the way through the haze.
+    """
+    return fade(develop(albedo**GAMMA * np.asarray(irradiance)), haze, distance)
+
+
+def develop(linear: ArrayLike) -> NDArray[np.float32]:
+    """The sRGB colours of linear light: exposed like film, so that nothing clips."""
     return ((1 - np.exp(-1.25 * np.asarray(linear))) ** (1 / GAMMA)).astype(np.float32)
 
 
-def hazed(colors: ArrayLike, haze: ArrayLike, distance: ArrayLike, range_: float) -> NDArray:
-    """Fades `colors` (N, 3) to `haze` (3,) as exp(-distance / range_); distance (N,) [m]."""
-    clear = np.exp(-np.asarray(distance, dtype=np.float64) / range_)[:, None]
+def fade(colors: ArrayLike, haze: ArrayLike, distance: ArrayLike) -> NDArray[np.float64]:
+    """`colors` (N, 3) mixed with `haze` (3,): exp(-distance / HAZE_RANGE) of them is left after
+    `distance` (N,) [m]."""
+    clear = np.exp(-np.asarray(distance, dtype=np.float64) / HAZE_RANGE)[:, None]
     return np.asarray(colors) * clear + np.asarray(haze) * (1 - clear)

@@ -22,10 +22,8 @@ class Material:
     """A surface's colours and the spacing of the Gaussians that show them."""
 
     albedo: patterns.Pattern
-    spacing: float
-    """[m], of the closed layer, which has the mean colours of the pattern."""
-    marks: tuple[Marks, ...] = ()
-    """In front of it, in the pattern's own colours."""
+    spacing: float  # [m], of the closed layer, which has the mean colours of the pattern
+    marks: tuple[Marks, ...] = ()  # in front of it, in the pattern's own colours
 
 
 def _joints(width: float, height: float, line: float, bond: bool = False) -> tuple[Marks, ...]:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.illumination import Illumination, shade
+from splatpilot.diagrams.worlds.solids.illumination import Illumination
+from splatpilot.diagrams.worlds.solids.light import shade
 from splatpilot.diagrams.worlds.solids.materials import MATERIALS
 from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
 from splatpilot.systems.collision.shapes import HalfSpace
@@ -34,8 +35,7 @@ class Mesh:
     uv: Array  # (V, 2) in [0, 1], from the upper left corner of the picture
     triangles: Indices  # (T, 3), counter-clockwise seen from outside
     picture: NDArray[np.uint8]  # (H, W, 3), sRGB red, green, blue
-    smooth: bool = True
-    """Whether the picture is interpolated between its pixels."""
+    smooth: bool = True  # whether the picture is interpolated between its pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def _paint(tile: _Tile, blueprint: Blueprint, light: Illumination) -> NDArray[np
 
     uv = at(np.arange(width) + 0.5, np.arange(height) + 0.5)
     p, *_ = tile.face.at(uv)
-    albedo = tile.solid.albedo(uv, p)
+    albedo = np.clip(tile.solid.albedo(uv, p), 0, 1)
     coarse = max(2, -(-width // _LIGHT_STEP)), max(2, -(-height // _LIGHT_STEP))
     columns, rows = (
         (np.arange(n) + 0.5) * size / n for n, size in zip(coarse, (width, height), strict=True)

@@ -1,8 +1,4 @@
-"""Procedural colours of surfaces.
-
-A pattern is a function of face coordinates uv (N, 2) [m] (v upwards on upright faces), of points p
-(N, 3) [m] in the solid's own frame, and of the solid's seed, to colours (N, 3), sRGB in 0 to 1.
-"""
+"""Procedural colours of surfaces: a `Pattern` each."""
 
 from collections.abc import Callable
 from functools import cache
@@ -26,6 +22,8 @@ from splatpilot.diagrams.worlds.solids.textures import (
 
 Array = NDArray[np.floating]
 type Pattern = Callable[[Array, Array, int], Array]
+"""Maps face coordinates uv (N, 2) [m] (v upwards on upright faces), points p (N, 3) [m] in the
+solid's own frame and the solid's seed to colours (N, 3), sRGB in 0 to 1."""
 
 
 def _tone(seed: int, strength: float = 0.35) -> Array:
@@ -55,6 +53,7 @@ BRICK = 0.30, 0.15
 
 
 def brick(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of bricks in running bond with mortar, weathered; the seed picks the clay."""
     cell, edge = _cells(uv, *BRICK, 0.5)
     stone = ramp(_BRICKS[seed % len(_BRICKS)], hash_unit(cell, seed))
     stone = stone * (1 + 0.12 * value_noise(p * 30, seed=101))[:, None]
@@ -65,6 +64,7 @@ def brick(uv: Array, p: Array, seed: int) -> Array:
 
 
 def concrete(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of cast concrete, streaked by rain, with joints every 2.4 m and 1.2 m."""
     grey = ramp(
         [(0.42, 0.41, 0.39), (0.60, 0.59, 0.57), (0.74, 0.73, 0.70)],
         0.5 + 0.55 * fbm(p * 0.7, 4, seed=111) + 0.12 * value_noise(p * 11, seed=112),
@@ -78,6 +78,7 @@ def concrete(uv: Array, p: Array, seed: int) -> Array:
 
 
 def wood(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of upright planks, 0.18 m wide and 1.6 m long; the seed picks the timber."""
     plank, joint = _cells(uv[:, ::-1], 1.6, 0.18, 0.37)
     pick = hash_unit(plank, seed)
     grain = fbm(np.stack([uv[:, 0] * 22 + 9 * pick, uv[:, 1] * 1.6 + 31 * pick], -1), 3, seed=121)
@@ -104,7 +105,7 @@ _PAINTS = np.array(
 
 
 def metal(uv: Array, p: Array, seed: int) -> Array:
-    """Painted corrugated sheet, rusting in places."""
+    """`Pattern` of painted sheet, corrugated every 0.4 m, rusting in places."""
     paint = _PAINTS[seed % len(_PAINTS)]
     wave = 0.82 + 0.18 * np.sin(uv[:, 0] * (2 * np.pi / 0.4))
     sheet = paint * wave[:, None] * (1 + 0.1 * fbm(p * 1.5, 3, seed=131))[:, None]
@@ -114,7 +115,7 @@ def metal(uv: Array, p: Array, seed: int) -> Array:
 
 
 def hazard(uv: Array, p: Array, seed: int) -> Array:
-    """Slanted warning stripes, worn."""
+    """`Pattern` of slanted warning stripes, worn; two pairs of colours."""
     stripe = smoothstep(-0.08, 0.08, np.sin((uv[:, 0] + uv[:, 1]) * (2 * np.pi / 0.7)))
     pair = (((0.88, 0.68, 0.08), (0.10, 0.10, 0.10)), ((0.86, 0.85, 0.82), (0.72, 0.12, 0.10)))
     light, dark = pair[seed % 2]
@@ -146,6 +147,7 @@ def _sign_board(seed: int) -> Array:
 
 
 def signage(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of signs of `SIGN` [m], one word and an arrow each; the seed picks the word."""
     board = _sign_board(seed % (len(_PAINTS) * len(_WORDS)))
     u, v = (uv / SIGN % 1.0).T
     rows = np.minimum(((1 - v) * board.shape[0]).astype(int), board.shape[0] - 1)
@@ -154,6 +156,7 @@ def signage(uv: Array, p: Array, seed: int) -> Array:
 
 
 def plaster(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of painted plaster with a darker dado up to 1 m above the foot of the face."""
     walls = np.array(
         [(0.86, 0.83, 0.75), (0.74, 0.80, 0.80), (0.83, 0.74, 0.66), (0.80, 0.82, 0.70)]
     )
@@ -166,6 +169,7 @@ def plaster(uv: Array, p: Array, seed: int) -> Array:
 
 
 def tiles(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of floor tiles of 0.5 m, light and dark in turn."""
     cell, edge = _cells(uv, 0.5, 0.5, 0.0)
     odd = cell.sum(axis=-1) % 2
     light, dark = (
@@ -179,6 +183,7 @@ def tiles(uv: Array, p: Array, seed: int) -> Array:
 
 
 def ceiling(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of ceiling panels of 1.2 m by 0.6 m, stained in places."""
     cell, edge = _cells(uv, 1.2, 0.6, 0.0)
     panel = (0.80 + 0.12 * hash_unit(cell, seed))[:, None] * np.array([1.0, 0.99, 0.95])
     stain = smoothstep(0.3, 0.6, fbm(p * 0.9, 3, seed=162))
@@ -187,13 +192,14 @@ def ceiling(uv: Array, p: Array, seed: int) -> Array:
 
 
 def foliage(uv: Array, p: Array, seed: int) -> Array:
-    """A clipped hedge: leaves in clumps, dark between them."""
+    """`Pattern` of a clipped hedge: leaves in clumps, dark between them."""
     clump = 0.5 + 0.6 * fbm(p * 2.2, 3, seed=171) + 0.35 * value_noise(p * 13, seed=172)
     green = textures.leaf((OAK, PINE, BIRCH)[seed % 3], p)
     return green * (0.35 + 0.95 * np.clip(clump, 0, 1))[:, None]
 
 
 def grass(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of a lawn, bare in places; it depends on the plan (x, y) of the points alone."""
     blade = (
         0.5 + 0.45 * fbm(p[:, :2] * 0.6, 4, seed=181) + 0.22 * value_noise(p[:, :2] * 8, seed=182)
     )
@@ -203,6 +209,7 @@ def grass(uv: Array, p: Array, seed: int) -> Array:
 
 
 def paving(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of slabs of 0.8 m, every other row shifted by half a slab."""
     cell, edge = _cells(uv, 0.8, 0.8, 0.5)
     slab = ramp([(0.40, 0.38, 0.36), (0.55, 0.53, 0.50), (0.68, 0.64, 0.58)], hash_unit(cell, 5))
     slab = slab * (0.9 + 0.25 * fbm(p[:, :2] * 0.8, 4, seed=191))[:, None]
@@ -210,33 +217,37 @@ def paving(uv: Array, p: Array, seed: int) -> Array:
 
 
 def forest_floor(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of soil, needles and moss, see `textures.forest_floor`."""
     return textures.forest_floor(p[:, :2])[0]
 
 
 def stone(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of weathered rock, see `textures.stone`."""
     return textures.stone(p) * _tone(seed)
 
 
 def cable(uv: Array, p: Array, seed: int) -> Array:
-    """Black rubber with coloured sleeves."""
+    """`Pattern` of black rubber with a coloured sleeve every 1.5 m along z."""
     sleeve = smoothstep(0.38, 0.42, np.abs(p[:, 2] / 1.5 % 1.0 - 0.5))
     return mix((0.10, 0.10, 0.11), np.broadcast_to(_PAINTS[seed % 3], (len(p), 3)), sleeve)
 
 
 def fabric(uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern` of woven upholstery with soft folds."""
     weave = 0.85 + 0.15 * np.sin(uv * (2 * np.pi / 0.12)).prod(axis=-1)
     fold = 1 + 0.35 * fbm(p * 3, 3, seed=201)
     return _PAINTS[(seed + 3) % len(_PAINTS)] * (0.85 * weave * fold)[:, None]
 
 
 def crate(uv: Array, p: Array, seed: int) -> Array:
-    """Cardboard with tape and a label."""
+    """`Pattern` of cardboard with a strip of tape every 0.8 m."""
     color = np.array((0.66, 0.50, 0.33)) * (1 + 0.1 * fbm(p * 4, 3, seed=211))[:, None]
     tape = smoothstep(0.05, 0.04, np.abs(uv[:, 0] % 0.8 - 0.4))
     return mix(color * _tone(seed), (0.80, 0.74, 0.60), tape)
 
 
 def bark(species: int, uv: Array, p: Array, seed: int) -> Array:
+    """`Pattern`, of a species OAK, PINE or BIRCH, of bark; z runs along the trunk."""
     plates = textures.bark(species, p)
     cracks = value_noise(p * (34, 34, 6), seed=15) + 0.5 * value_noise(p * (60, 60, 14), seed=16)
     dark = plates * (0.80 if species == BIRCH else 0.52)

@@ -22,10 +22,8 @@ class Solid:
     """A shape in W and what it is made of."""
 
     shape: Shape
-    material: str
-    """A key of `MATERIALS`."""
-    seed: int = 0
-    """Solids of different seeds show different parts and tones of their material."""
+    material: str  # a key of `MATERIALS`
+    seed: int = 0  # another one shows another part and tone of the material
 
     def __post_init__(self) -> None:
         if self.material not in MATERIALS:
@@ -44,9 +42,9 @@ class Solid:
         shift = 7.3 * np.array([self.seed % 61, self.seed % 53, 0.0])
         match shape:
             case Sphere():
-                return p_W - np.asarray(shape.p_WS) + shift
+                return p_W - np.asarray(shape.p_WO) + shift
             case Box():
-                return shape.X_WS.inverse().multiply(p_W.T).T + shift
+                return shape.X_WO.inverse().multiply(p_W.T).T + shift
             case Capsule() | Cylinder():
                 p_WA = np.asarray(shape.p_WA, dtype=float)
                 e_1, e_2, axis, _ = _axes(shape)
@@ -60,13 +58,13 @@ class Face:
     """A piece of surface with coordinates u from 0 to size[0] and v from 0 to size[1] [m]."""
 
     size: tuple[float, float]
+    # Maps uv (N, 2) to points (N, 3), unit normals (N, 3) and unit directions of u (N, 3), in W;
+    # coordinates beyond the face are continued or brought back to its edge.
     at: Callable[[Array], tuple[Array, Array, Array]]
-    """Maps uv (N, 2) to points (N, 3), unit normals (N, 3) and unit directions of u (N, 3), in W;
-    coordinates beyond the face are continued or brought back to its edge."""
+    # Radii of curvature [m] along u and v: how finely a mesh must follow.
     curved: tuple[float, float] = (np.inf, np.inf)
-    """Radii of curvature [m] along u and v: how finely a mesh must follow."""
+    # Whether lines of constant u meet at poles, or the face is a disc: not for lattices.
     round: bool = False
-    """Whether lines of constant u meet at poles, or the face is a disc: not for lattices."""
 
 
 def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
@@ -80,7 +78,7 @@ def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
     match shape:
         case Sphere():
             up = np.array([0.0, 0.0, 1.0])
-            return [_dome(np.asarray(shape.p_WS, float), np.eye(3)[0], up, shape.radius, -1.0)]
+            return [_dome(np.asarray(shape.p_WO, float), np.eye(3)[0], up, shape.radius, -1.0)]
         case Box():
             return _box_faces(shape)
         case Capsule() | Cylinder():
@@ -114,7 +112,7 @@ def _flat(corner: Array, e_u: Array, e_v: Array, n: Array, width: float, height:
 
 
 def _box_faces(box: Box) -> list[Face]:
-    R, p = box.X_WS.rotation().matrix(), box.X_WS.translation()
+    R, p = box.X_WO.rotation().matrix(), box.X_WO.translation()
     half = np.asarray(box.size, float) / 2
     faces = []
     for k in range(3):

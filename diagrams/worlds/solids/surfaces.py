@@ -32,17 +32,17 @@ class Surfels:
         return len(self.p)
 
     def __getitem__(self, rows: ArrayLike) -> Self:
-        """Returns the patches of a mask or of indices."""
+        """The patches of a mask or of indices."""
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
-    def joined(cls, parts: list[Surfels]) -> Surfels:
-        """Returns all patches of `parts` in order."""
+    def concatenate(cls, parts: list[Surfels]) -> Surfels:
+        """All patches of `parts` in order."""
         return cls(*(np.concatenate([getattr(s, f.name) for s in parts]) for f in fields(cls)))
 
 
-def colored(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike = 0.99) -> GaussianScene:
-    """Returns the patches as Gaussians with `colors` (N, 3) and `opacity`, a number or (N,)."""
+def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> GaussianScene:
+    """The patches as Gaussians of `colors` (N, 3), sRGB, and `opacity`, a number or (N,)."""
     N = len(surfels)
     R_WP = np.stack([surfels.t, np.cross(surfels.n, surfels.t), surfels.n], axis=-1)
     return GaussianScene.from_colors(
@@ -54,14 +54,14 @@ def colored(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike = 0.99) -> G
     )
 
 
-def merged(scenes: list[GaussianScene]) -> GaussianScene:
-    """Returns the Gaussians of all `scenes`, which share one degree of harmonics, in order."""
+def merge(scenes: list[GaussianScene]) -> GaussianScene:
+    """The Gaussians of all `scenes`, which share one degree of harmonics, in order."""
     names = [f.name for f in fields(GaussianScene)]
     return GaussianScene(**{n: np.concatenate([getattr(s, n) for s in scenes]) for n in names})
 
 
 def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
-    """Returns a unit vector perpendicular to each d (..., 3)."""
+    """A unit vector (..., 3) perpendicular to each d (..., 3)."""
     d = np.asarray(d, dtype=np.float64)
     helper = np.where(np.abs(d[..., 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     v = np.cross(helper, d)

@@ -4,10 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.illumination import Illumination, shade
+from splatpilot.diagrams.worlds.solids.illumination import Illumination
+from splatpilot.diagrams.worlds.solids.light import shade
 from splatpilot.diagrams.worlds.solids.materials import MATERIALS, Marks
 from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
-from splatpilot.diagrams.worlds.solids.surfaces import COVERAGE, Surfels, colored, rectangle
+from splatpilot.diagrams.worlds.solids.surfaces import COVERAGE, Surfels, rectangle, to_gaussians
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import HalfSpace
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
@@ -17,9 +18,9 @@ Array = NDArray[np.float64]
 RAISED = 0.004
 """[m], height of marks over the closed layer."""
 
-SOIL = 0.04
-"""[m], depth of the patches of the ground under it. Seen at a slant, the near half of each is drawn
-first, which brings the ground nearer than it is."""
+SUNK = 0.04
+"""[m], depth of the closed layer of the ground under its surface. Seen at a slant, the near half of
+each patch is drawn first, which brings the ground nearer than it is."""
 
 _BURIED = 0.05
 """[m], depth inside another solid at which a patch cannot be seen any more."""
@@ -28,18 +29,15 @@ _BURIED = 0.05
 def draw(blueprint: Blueprint, solids: list[Solid], light: Illumination) -> GaussianScene:
     """Covers `solids`, all or some of the blueprint's, with Gaussians."""
     rng = np.random.default_rng([blueprint.seed, 99])
-    scenes = []
-    for solid in solids:
-        patches, albedo, opacity = _patches(solid, blueprint, rng)
-        scenes.append((patches, albedo, opacity, solid))
-    surfels = Surfels.joined([patches for patches, *_ in scenes])
-    albedo = np.concatenate([albedo for _, albedo, *_ in scenes])
-    opacity = np.concatenate([opacity for _, _, opacity, _ in scenes])
-    seen = _seen(blueprint, surfels)
-    surfels, albedo, opacity = surfels[seen], albedo[seen], opacity[seen]
+    drawn = [_patches(solid, blueprint, rng) for solid in solids]
+    patches, albedos, opacities = zip(*drawn, strict=True)
+    surfels = Surfels.concatenate(list(patches))
+    albedo, opacity = np.concatenate(albedos), np.concatenate(opacities)
+    seen = _is_seen(blueprint, surfels)
+    surfels, albedo, opacity = surfels[seen], np.clip(albedo[seen], 0, 1), opacity[seen]
     irradiance = light.irradiance(surfels.p, surfels.n)
     colors = shade(albedo, irradiance, light.haze, blueprint.plot.outside(surfels.p))
-    return colored(surfels, colors, opacity)
+    return to_gaussians(surfels, colors, opacity)
 
 
 def _patches(
@@ -55,13 +53,13 @@ def _patches(
         elif face.round:
             uv, extent = _spiral(face, material.spacing, rng)
         else:
-            uv, extent = _closed(face, material.spacing, rng)
-        facing = _faces(blueprint, *face.at(uv)[:2])
+            uv, extent = _lattice(face, material.spacing, rng)
+        facing = blueprint.plot.is_faced(*face.at(uv)[:2])
         if not facing.any():
             continue
         uv, extent = uv[facing], extent[facing]
         p, n, t = face.at(uv)
-        depth = SOIL if is_ground else 0.0
+        depth = SUNK if is_ground else 0.0
         # Means of the pattern at two places: thin lines tint all the patches they cross instead of
         # dotting some.
         near = [uv + corner * extent for corner in _CORNERS]
@@ -70,7 +68,7 @@ def _patches(
             low, high = np.zeros(2), np.array(face.size)
             if is_ground:
                 low, high = np.full(2, 27.5), high - 27.5
-            uv, extent = _marked(marks, low, high, rng)
+            uv, extent = _place_marks(marks, low, high, rng)
             p, n, t = face.at(uv)
             raised = Surfels(p + (RAISED - depth / 2) * n, n, t, extent)
             layers.append((raised, 0.93, face, [uv]))
@@ -88,14 +86,14 @@ def _patches(
     tinted = np.concatenate(albedo)
     tinted = tinted * rng.uniform(0.95, 1.05, (len(tinted), 1))
     opacity = np.concatenate([np.full(len(patches), o) for patches, o, *_ in layers])
-    return Surfels.joined([patches for patches, *_ in layers]), tinted, opacity
+    return Surfels.concatenate([patches for patches, *_ in layers]), tinted, opacity
 
 
 _CORNERS = ((0.4, 0.7), (-0.4, -0.7))
 """Places about the middle of a patch, in standard deviations."""
 
 
-def _closed(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Coordinates uv (N, 2) [m] of a jittered lattice that divides the face evenly, and standard
     deviations (N, 2) [m] with which it leaves no holes."""
     size = np.array(face.size)
@@ -109,7 +107,9 @@ def _closed(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
     return uv, np.tile(COVERAGE * step, (len(uv), 1))
 
 
-def _marked(marks: Marks, low: Array, high: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def _place_marks(
+    marks: Marks, low: Array, high: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
     """Coordinates uv (N, 2) [m] of the marks between the corners `low` and `high` (2,) of a face,
     and their standard deviations (N, 2) [m]; they stand where the pattern has them."""
     cell = np.array(marks.cell)
@@ -162,20 +162,14 @@ def _ground(
     return np.concatenate(uv), np.concatenate(extent)
 
 
-def _faces(blueprint: Blueprint, p_W: Array, n_W: Array) -> NDArray[np.bool_]:
-    """Whether surfaces at p_W (N, 3) [m] with normals n_W (N, 3) face any point of the volume."""
-    corner = np.where(n_W > 0, blueprint.upper_W, blueprint.lower_W)
-    return np.einsum("nk,nk->n", n_W, corner - p_W) > 1e-9
-
-
-def _seen(blueprint: Blueprint, surfels: Surfels) -> NDArray[np.bool_]:
+def _is_seen(blueprint: Blueprint, surfels: Surfels) -> NDArray[np.bool_]:
     """Whether a patch faces the volume and lies in no other solid."""
-    faces = _faces(blueprint, surfels.p, surfels.n)
+    seen = blueprint.plot.is_faced(surfels.p, surfels.n)
     field = AnalyticDistanceField(
         [solid.shape for solid in blueprint.solids],
         blueprint.lower_W - 40.0,
         blueprint.upper_W + 40.0,
     )
-    rows = np.flatnonzero(faces)
-    faces[rows] = field.distance(surfels.p[rows]) > -_BURIED
-    return faces
+    rows = np.flatnonzero(seen)
+    seen[rows] = field.distance(surfels.p[rows]) > -_BURIED
+    return seen

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatpilot import register_world
-from splatpilot.diagrams.worlds.feasibility import drawn
+from splatpilot.diagrams.worlds.feasibility import draw_feasible
 from splatpilot.diagrams.worlds.fittings import box, daylight, ground, start_and_goal
+from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 
 
@@ -31,21 +32,19 @@ class HedgesConfig:
 def hedges_blueprint(config: HedgesConfig, seed: int) -> Blueprint:
     """The field that `config` and `seed` determine, as solids, start and goal."""
     config.validate()
-    half = config.width / 2
-    lower, upper = np.array([0, -half, 0.0]), np.array([config.length, half, config.height])
+    plot, half = Plot.of_size(config.length, config.width, config.height), config.width / 2
 
     def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(lower, upper, rng)
+        p_WS, p_WG = start_and_goal(plot, rng)
         hedges = []
         for x in np.linspace(0, config.length, config.hedges + 2)[1:-1]:
             top = config.tallest * rng.uniform(0.5, 1.0)
             hedges.append(box([x, -half, 0], [x + 0.5, half, top], "foliage", int(x)))
         _, light = daylight(rng)
-        return Blueprint(
-            "hedges", lower, upper, [ground("tiles"), *hedges], p_WS, p_WG, light, seed
-        )
+        solids = [ground("tiles"), *hedges]
+        return Blueprint("hedges", plot.lower, plot.upper, solids, p_WS, p_WG, light, seed)
 
-    return drawn(draw, seed)
+    return draw_feasible(draw, seed)
 
 
 register_world(HedgesConfig, make_blueprint=hedges_blueprint)

@@ -14,7 +14,7 @@ from splatpilot.diagrams.examples.splat_background import (
     widest_lane,
 )
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
-from splatpilot.diagrams.worlds.forest.forest import make_forest
+from splatpilot.diagrams.worlds.make_world import make_world
 
 
 @pytest.mark.usefixtures("opengl")
@@ -35,7 +35,7 @@ def test_runs(tmp_path):
 @pytest.mark.usefixtures("opengl")
 def test_bodies_bounce_and_keep_clear_of_trunks():
     """Ball and box stay above the ground, move across the view, and never touch what is seen."""
-    world = make_forest(ForestConfig())
+    world = make_world(ForestConfig(), seed=0)
     diagram = BuildSplatBackgroundDiagram(world, 32, 24)
     simulator = throw(diagram, world)
     plant = diagram.GetSubsystemByName("plant")

@@ -35,7 +35,7 @@ WIDTH, HEIGHT, FOCAL = 160, 120, 80.0
 def blueprint() -> Blueprint:
     """One solid of each shape on the ground of a volume of 8 x 6 x 4 m."""
     tilted = RigidTransform(RollPitchYaw(0.3, 0.2, 0.5), [5.0, -1.5, 1.2])
-    hour = Daylight.sampled(np.random.default_rng(3))
+    hour = Daylight.sample(np.random.default_rng(3))
     return Blueprint(
         name="sampler",
         lower_W=np.array([0.0, -2.5, 0]),
@@ -121,6 +121,6 @@ def test_file_is_whole_and_the_same_twice(blueprint, tmp_path):
 
 
 def test_a_folder_that_does_not_exist_is_an_error(blueprint, tmp_path):
-    """Where nothing can be written the error names the place."""
+    """Where nothing can be written the error names the folder."""
     with pytest.raises(OSError, match="nowhere"):
         write_gltf(blueprint, tmp_path / "nowhere" / "world.gltf", texel=0.2)

@@ -48,7 +48,7 @@ def test_there_are_seventeen_and_all_are_valid():
 
 @pytest.mark.parametrize("file", GENERATED, ids=lambda file: file.stem)
 def test_instances_are_feasible_and_repeatable(file):
-    """Start and goal are clear, a way is proven, the same seed gives the same place and another
+    """Start and goal are clear, a way is proven, the same seed gives the same world and another
     seed another."""
     config = load_config(Scenario(), file).world
     one, again, other = (make_blueprint(config, seed) for seed in (3, 3, 4))
@@ -69,7 +69,7 @@ def test_walls_have_the_sizes_asked_for():
         """Widths in y of the free stretches in the planes through the middles of walls across."""
         widths = []
         walls = {
-            round(float(s.shape.X_WS.translation()[0]), 6)
+            round(float(s.shape.X_WO.translation()[0]), 6)
             for s in blueprint.solids
             if isinstance(s.shape, Box) and np.isclose(np.asarray(s.shape.size)[0], 0.3)
         }
@@ -233,6 +233,6 @@ def test_octomap_is_seen_where_it_is_occupied():
     occupied = np.zeros((12, 12, 12), bool)
     occupied[4:8, 4:8, :] = True
     esdf = esdf_from_occupancy(occupied, np.zeros_like(occupied), np.zeros(3), 0.5)
-    scene = voxel_gaussians(esdf, Daylight.sampled(np.random.default_rng(0)))
+    scene = voxel_gaussians(esdf, Daylight.sample(np.random.default_rng(0)))
     assert len(scene) == 12 * (16 - 4)  # the column's outer voxels
     assert (np.abs(esdf.distance(scene.means.astype(float))) <= 0.5).all()

@@ -17,13 +17,13 @@ from splatpilot.systems.collision.shapes import (
     Sphere,
 )
 
-X_WS = RigidTransform(RollPitchYaw(0.4, -0.7, 1.2), np.array([0.3, -0.2, 0.5]))
+X_WO = RigidTransform(RollPitchYaw(0.4, -0.7, 1.2), np.array([0.3, -0.2, 0.5]))
 A, B = np.array([-0.5, 0.2, -0.6]), np.array([0.4, -0.3, 0.9])
 SHAPES = {
     "sphere": Sphere(np.array([0.1, 0.2, -0.3]), 0.8),
     "capsule": Capsule(A, B, 0.4),
     "cylinder": Cylinder(A, B, 0.4),
-    "box": Box(X_WS, np.array([0.6, 1.0, 1.4])),
+    "box": Box(X_WO, np.array([0.6, 1.0, 1.4])),
     "half space": HalfSpace(np.array([1.0, 2.0, -2.0]), 0.1),
 }
 
@@ -40,7 +40,7 @@ def surface_points(name: str) -> np.ndarray:
     way = random.normal(size=(n, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     if name == "sphere":
-        return shape.p_WS + shape.radius * way
+        return shape.p_WO + shape.radius * way
     if name == "half space":
         normal = np.array([1.0, 2.0, -2.0]) / 3.0
         p = random.uniform(-6.0, 6.0, (4 * n, 3))
@@ -48,7 +48,7 @@ def surface_points(name: str) -> np.ndarray:
     if name == "box":
         p = random.uniform(-0.5, 0.5, (n, 3))
         p[np.arange(n), random.integers(0, 3, n)] = random.choice([-0.5, 0.5], n)
-        return X_WS.multiply((p * shape.size).T).T
+        return X_WO.multiply((p * shape.size).T).T
     length = np.linalg.norm(B - A)
     axis = (B - A) / length
     radial = way - np.outer(way @ axis, axis)
@@ -199,9 +199,9 @@ def test_an_empty_union_is_infinitely_far():
         (lambda: Capsule(A, B, -1.0), "Capsule.radius is -1.0"),
         (lambda: Cylinder(A, A, 1.0), "both ends are at"),
         (lambda: Cylinder(A, B, np.nan), "Cylinder.radius is nan"),
-        (lambda: Box(X_WS, np.array([1.0, 0.0, 1.0])), "each edge must be positive"),
+        (lambda: Box(X_WO, np.array([1.0, 0.0, 1.0])), "each edge must be positive"),
         (lambda: HalfSpace(np.zeros(3), 1.0), "normal is zero"),
-        (lambda: Sphere(np.array([0.0, np.nan, 0.0]), 1.0), "Sphere.p_WS is"),
+        (lambda: Sphere(np.array([0.0, np.nan, 0.0]), 1.0), "Sphere.p_WO is"),
     ],
 )
 def test_impossible_shapes_are_refused(make, message):

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.seeds import TRAINING_SEEDS
 from splatpilot.training.policies import courses
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.evaluation import FlightConditions, fly_courses

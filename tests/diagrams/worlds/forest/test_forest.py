@@ -9,9 +9,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.ndimage import label
 from scipy.spatial.distance import pdist
 
-from splatpilot.diagrams.worlds.forest.config import CLEARANCE, PASSAGE, ForestConfig
-from splatpilot.diagrams.worlds.forest.forest import make_forest
+from splatpilot.diagrams.worlds.fittings import CLEARING, INSET, PASSAGE
+from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.forest.layout import lay_out
+from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import Capsule, Sphere
@@ -28,7 +29,7 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return make_forest(ForestConfig())
+    return make_world(ForestConfig(), seed=0)
 
 
 def _inside(world: World) -> np.ndarray:
@@ -46,10 +47,10 @@ def _shapes(world: World) -> tuple:
 
 def _layout(config: ForestConfig, seed: int):
     """Layout, field, start and goal of a forest, without what is seen of it."""
-    p_WS = np.array([1.5, 0, config.flight_height])
-    p_WG = np.array([config.length - 1.5, 0, config.flight_height])
+    p_WS = np.array([INSET, 0, config.flight_height])
+    p_WG = np.array([config.length - INSET, 0, config.flight_height])
     rng = np.random.default_rng(seed)
-    layout = lay_out(config, rng, [p_WS[:2], p_WG[:2]], CLEARANCE)
+    layout = lay_out(config, rng, [p_WS[:2], p_WG[:2]], CLEARING)
     shapes = [solid.shape for solid in layout.solids()[0]]
     field = AnalyticDistanceField(shapes, layout.lower, layout.upper)
     return layout, field, p_WS, p_WG
@@ -69,16 +70,16 @@ def test_the_same_seed_gives_the_same_bits_in_another_process():
     """Two processes that grow one forest agree on every bit of what is seen and what is hit."""
     code = (
         f"import sys; sys.path.insert(0, {str(__file__.rsplit('/', 1)[0])!r})\n"
-        "from test_forest import SMALL, _digest, make_forest\n"
-        "print(_digest(make_forest(SMALL, seed=5)))"
+        "from test_forest import SMALL, _digest, make_world\n"
+        "print(_digest(make_world(SMALL, seed=5)))"
     )
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert other.stdout.strip() == _digest(make_forest(SMALL, seed=5))
+    assert other.stdout.strip() == _digest(make_world(SMALL, seed=5))
 
 
 def test_another_seed_gives_another_forest():
     """Seeds change where trees stand and where the sun is."""
-    a, b = make_forest(SMALL, seed=0), make_forest(SMALL, seed=1)
+    a, b = make_world(SMALL, seed=0), make_world(SMALL, seed=1)
     places = np.random.default_rng(0).uniform((0, -3.5, 1), (9, 3.5, 3), (200, 3))
     difference = a.distance_field.distance(places) - b.distance_field.distance(places)
     assert np.abs(difference).mean() > 0.1
@@ -105,7 +106,7 @@ def test_a_vehicle_can_fly_from_start_to_goal(kind):
     spacing = 0.1
     for seed in range(4):
         _, field, p_WS, p_WG = _layout(config, seed)
-        assert field.distance(np.stack([p_WS, p_WG])).min() >= CLEARANCE
+        assert field.distance(np.stack([p_WS, p_WG])).min() >= CLEARING
         r = VEHICLE_RADIUS
         x = np.arange(r, config.length - r, spacing)
         y = np.arange(r - config.width / 2, config.width / 2 - r, spacing)
@@ -160,7 +161,7 @@ def test_every_shape_to_hit_is_seen(world):
         if isinstance(shape, Capsule):
             centre = (np.asarray(shape.p_WA) + np.asarray(shape.p_WB)) / 2
         elif isinstance(shape, Sphere):
-            centre = np.asarray(shape.p_WS)
+            centre = np.asarray(shape.p_WO)
         else:
             continue
         if ((centre < field.lower_W) | (centre > field.upper_W))[:2].any():
@@ -243,7 +244,7 @@ def test_start_and_goal_face_each_other_with_room_around(world):
     np.testing.assert_allclose(world.p_WS, (1.5, 0, 1.8))
     np.testing.assert_allclose(world.p_WG, (34.5, 0, 1.8))
     ends = np.stack([world.p_WS, world.p_WG])
-    assert world.distance_field.distance(ends).min() >= CLEARANCE
+    assert world.distance_field.distance(ends).min() >= CLEARING
 
 
 def test_the_grid_for_planning_agrees_with_the_truth(world):
@@ -257,7 +258,7 @@ def test_the_grid_for_planning_agrees_with_the_truth(world):
 def test_a_forest_without_rocks_and_logs_grows():
     """Zero rocks and logs leave trunks and ground alone."""
     config = ForestConfig(**{**vars(SMALL), "rocks": 0, "logs": 0})
-    kinds = [type(shape) for shape in _shapes(make_forest(config))]
+    kinds = [type(shape) for shape in _shapes(make_world(config, seed=0))]
     assert Sphere not in kinds and kinds.count(Capsule) == len(kinds) - 1
 
 
@@ -291,7 +292,7 @@ def test_the_config_loads_from_yaml():
 def test_a_forest_that_cannot_be_grown_is_refused(values, message):
     """Each bad value ends with what is wrong, its limit and the remedy."""
     with pytest.raises(ValueError, match=message):
-        make_forest(ForestConfig(**values))
+        make_world(ForestConfig(**values), seed=0)
 
 
 def test_the_spacing_the_error_asks_for_is_enough():
@@ -305,4 +306,4 @@ def test_the_spacing_the_error_asks_for_is_enough():
 def test_a_negative_seed_is_refused():
     """Seeds count from 0."""
     with pytest.raises(ValueError, match="seed = -1 must be 0 or more"):
-        make_forest(SMALL, seed=-1)
+        make_world(SMALL, seed=-1)

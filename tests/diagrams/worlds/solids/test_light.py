@@ -1,20 +1,18 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.solids.light import Daylight, hazed
-
-WHITE = np.full((1, 3), 0.8)
+from splatpilot.diagrams.worlds.solids.light import HAZE_RANGE, Daylight, fade
 
 
 @pytest.fixture
 def light() -> Daylight:
-    return Daylight.sampled(np.random.default_rng(0))
+    return Daylight.sample(np.random.default_rng(0))
 
 
 def test_the_sun_is_up_and_its_direction_follows_from_the_seed():
     """Directions are unit vectors 32 to 58 degrees above the horizon, the same for a seed."""
     for seed in range(20):
-        a, b = (Daylight.sampled(np.random.default_rng(seed)) for _ in range(2))
+        a, b = (Daylight.sample(np.random.default_rng(seed)) for _ in range(2))
         np.testing.assert_array_equal(a.direction, b.direction)
         assert np.linalg.norm(a.direction) == pytest.approx(1)
         assert 32 <= np.rad2deg(np.arcsin(a.direction[2])) <= 58
@@ -23,18 +21,17 @@ def test_the_sun_is_up_and_its_direction_follows_from_the_seed():
 def test_surfaces_facing_the_sun_are_brightest(light):
     """Sun brightens the face turned to it, and changes nothing on the face turned away."""
     to_sun = light.direction[None]
-    sunny, shady = (light.shaded(WHITE, to_sun, np.array([s])) for s in (1.0, 0.0))
+    sunny, shady = (light.irradiance(to_sun, np.array([s])) for s in (1.0, 0.0))
     assert (sunny > shady + 0.1).all()
     np.testing.assert_array_equal(
-        light.shaded(WHITE, -to_sun, np.ones(1)), light.shaded(WHITE, -to_sun, np.zeros(1))
+        light.irradiance(-to_sun, np.ones(1)), light.irradiance(-to_sun, np.zeros(1))
     )
 
 
 def test_leaves_shine_from_both_sides(light):
     """Sun on the back of a leaf lights it as on the front."""
     front, back = (
-        light.shaded(WHITE, n, np.ones(1), leafy=True)
-        - light.shaded(WHITE, n, np.zeros(1), leafy=True)
+        light.irradiance(n, np.ones(1), leafy=True) - light.irradiance(n, np.zeros(1), leafy=True)
         for n in _horizontal(light)
     )
     assert front.min() > 0.05
@@ -77,7 +74,7 @@ def test_sun_flecks_move_with_the_point_against_the_sun(light):
 def test_haze_swallows_the_distance():
     """Nothing changes at the eye, 1 - 1/e of the way is done at the range, all is haze far off."""
     color, haze = np.array([[0.1, 0.2, 0.3]] * 3), np.array([0.8, 0.9, 1.0])
-    faded = hazed(color, haze, [0, 16, 1e4], 16.0)
+    faded = fade(color, haze, [0, HAZE_RANGE, 1e4])
     np.testing.assert_allclose(faded[0], color[0])
     np.testing.assert_allclose(faded[1], haze + (color[1] - haze) / np.e)
     np.testing.assert_allclose(faded[2], haze)

@@ -5,11 +5,11 @@ from scipy.spatial.transform import Rotation
 from splatpilot.diagrams.worlds.solids.surfaces import (
     THICKNESS,
     Surfels,
-    colored,
-    merged,
+    merge,
     on_ground,
     rectangle,
     sphere,
+    to_gaussians,
     tube,
 )
 
@@ -86,7 +86,7 @@ def test_gaussians_are_as_flat_and_oriented_as_their_patches():
     """Means and colours are kept, the axes of the Gaussians are t, n x t and n, in that order."""
     surfels = _tube()
     colors = np.random.default_rng(2).uniform(size=(len(surfels), 3))
-    scene = colored(surfels, colors, 0.7)
+    scene = to_gaussians(surfels, colors, 0.7)
     np.testing.assert_allclose(scene.means, surfels.p, atol=1e-6)
     np.testing.assert_allclose(scene.base_colors, colors, atol=1e-6)
     np.testing.assert_allclose(scene.opacities, 0.7)
@@ -101,9 +101,10 @@ def test_merging_keeps_every_gaussian_in_order():
     """The merged scene is the concatenation of its parts."""
     surfels = _tube()
     parts = [
-        colored(surfels[np.arange(10)], np.full((10, 3), 0.2)),
-        colored(surfels[np.arange(10, 14)], np.ones((4, 3))),
+        to_gaussians(surfels[np.arange(10)], np.full((10, 3), 0.2), 0.99),
+        to_gaussians(surfels[np.arange(10, 14)], np.ones((4, 3)), 0.5),
     ]
-    scene = merged(parts)
+    scene = merge(parts)
     np.testing.assert_array_equal(scene.means, np.concatenate([s.means for s in parts]))
+    np.testing.assert_array_equal(scene.opacities, np.repeat(np.float32([0.99, 0.5]), (10, 4)))
     np.testing.assert_array_equal(scene.sh, np.concatenate([s.sh for s in parts]))
