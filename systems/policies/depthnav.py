@@ -16,7 +16,7 @@ from splatpilot.systems.policies.depthnav_inference import (
     IMAGE_SIZE,
     RATE,
     decide,
-    yaw_of,
+    heading_yaw,
 )
 from splatpilot.systems.policies.recurrent_network import load_network
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -89,7 +89,7 @@ class DepthNav(LeafSystem):
         X_WB = pose_from_state(state)
         start_yaw = float(context.get_discrete_state(int(self._start_yaw)).value()[0])
         if np.isnan(start_yaw):
-            start_yaw = yaw_of(X_WB.rotation().matrix())
+            start_yaw = heading_yaw(X_WB.rotation().matrix())
         decision = decide(
             self._network,
             np.asarray(image.data)[..., 0],

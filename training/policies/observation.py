@@ -10,7 +10,7 @@ from splatpilot.training.policies.vehicles import Vehicle
 
 
 class Observation(NamedTuple):
-    """What N vehicles know at one moment."""
+    """What N vehicles know at one transition."""
 
     depth: Tensor  # (N, R) [m], planar, inf beyond
     vehicle: Vehicle
@@ -30,7 +30,7 @@ class ObservationNoise:
     # [-] Part of the pixels that read nothing, which is as far as can be seen.
     dropout: float = 0.01
 
-    def disturbed(self, depth: Tensor, generator: torch.Generator) -> Tensor:
+    def disturb(self, depth: Tensor, generator: torch.Generator) -> Tensor:
         """Planar depth (N, R) [m] as a worse camera measures it."""
         normal = torch.empty_like(depth).normal_(generator=generator)
         depth = depth * (1.0 + self.scale * normal)
@@ -64,5 +64,5 @@ def heading_observation(seen: Observation, R_WH: Tensor) -> Tensor:
     return (rows @ R_WH).flatten(1)
 
 
-def limited_acceleration(output: Tensor, limits: Tensor) -> Tensor:
+def limit_acceleration(output: Tensor, limits: Tensor) -> Tensor:
     return limits * torch.tanh(output / limits)

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from splatpilot.training.policies.agile_autonomy import AgileTrainee, AgileTraining
+from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
 from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
-from splatpilot.training.policies.flight_trainee import FlightTrainee
-from splatpilot.training.policies.train import Trainee
+from splatpilot.training.policies.rollout_trainer import RolloutTrainer
+from splatpilot.training.policies.train import Trainer
 
 
 class Recipe(NamedTuple):
@@ -15,20 +15,20 @@ class Recipe(NamedTuple):
 
     config: type
     """Its configuration, a dataclass."""
-    make: Callable[[Any], Trainee]
+    make: Callable[[Any], Trainer]
     """What that configuration makes."""
 
 
-def _diffaero(config: DiffAeroTraining) -> Trainee:
-    return FlightTrainee("diffaero", DiffAeroLearner(config.loss, config.device), config)
+def _diffaero(config: DiffAeroTraining) -> Trainer:
+    return RolloutTrainer("diffaero", DiffAeroLearner(config.loss, config.device), config)
 
 
-def _depthnav(config: DepthNavTraining) -> Trainee:
-    return FlightTrainee("depthnav", DepthNavLearner(config.loss, config.device), config)
+def _depthnav(config: DepthNavTraining) -> Trainer:
+    return RolloutTrainer("depthnav", DepthNavLearner(config.loss, config.device), config)
 
 
 RECIPES = {
     "diffaero": Recipe(DiffAeroTraining, _diffaero),
     "depthnav": Recipe(DepthNavTraining, _depthnav),
-    "agile_autonomy": Recipe(AgileTraining, AgileTrainee),
+    "agile_autonomy": Recipe(AgileAutonomyTraining, AgileAutonomyTrainer),
 }

@@ -58,13 +58,15 @@ class PointMass(NamedTuple):
             yaw = self.yaw + dt * yaw_rate(self.yaw, v, control, heading)
         return PointMass(p, v, a_cmd + decay * behind, yaw, self.lag)
 
-    def decayed(self, factor: float) -> "PointMass":
+    def decay_gradient(self, factor: float) -> "PointMass":
         """The same state, its gradient multiplied by `factor` on the way back."""
         return self._replace(
-            p=_decayed(self.p, factor), v=_decayed(self.v, factor), a=_decayed(self.a, factor)
+            p=_decay_gradient(self.p, factor),
+            v=_decay_gradient(self.v, factor),
+            a=_decay_gradient(self.a, factor),
         )
 
-    def detached(self) -> "PointMass":
+    def detach(self) -> "PointMass":
         return PointMass(*(x.detach() for x in self))
 
 
@@ -96,7 +98,7 @@ class BodyRate(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3)."""
-        return rotation_of(self.state[:, 6:10])
+        return rotation_matrix(self.state[:, 6:10])
 
     def step(
         self,
@@ -137,7 +139,7 @@ def flatness_command(
     f = torch.cat([level, lift], 1)
     f = f * (control.max_thrust / f.norm(dim=1, keepdim=True)).clamp(max=1.0)
 
-    R_WB = rotation_of(state[:, 6:10])
+    R_WB = rotation_matrix(state[:, 6:10])
     heading, pull = heading_and_pull(v, control, heading)
     R_BD = R_WB.mT @ attitude_from_thrust(f, heading)
     # First the shortest turn of the body's z axis, about n in its x-y plane, then yaw.
@@ -188,7 +190,7 @@ def attitude_from_thrust(f: Tensor, yaw: Tensor) -> Tensor:
     return torch.stack([x, torch.linalg.cross(z, x), z], 2)
 
 
-def rotation_of(q: Tensor) -> Tensor:
+def rotation_matrix(q: Tensor) -> Tensor:
     """The rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any length."""
     w, x, y, z = torch.nn.functional.normalize(q, dim=1).unbind(1)
     rows = [
@@ -203,5 +205,5 @@ def _up(like: Tensor, size: float) -> Tensor:
     return torch.tensor([0.0, 0.0, size], device=like.device)
 
 
-def _decayed(x: Tensor, factor: float) -> Tensor:
+def _decay_gradient(x: Tensor, factor: float) -> Tensor:
     return x.detach() + factor * (x - x.detach())

@@ -20,7 +20,7 @@ LOOKAHEAD = 3
 """The waypoint that is tracked: at 0.4 s, as the controller's lookahead."""
 
 
-class AgilePilot:
+class AgileAutonomyAgent:
     """Flies by the cheapest hypothesis, as `HypothesisSelector` and `FlatnessController` do."""
 
     rate = RATE
@@ -55,10 +55,10 @@ class AgilePilot:
         waypoints, costs = self.hypotheses(seen)
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
         p_WR = seen.vehicle.p + (seen.R_WB @ best[:, LOOKAHEAD, :, None])[:, :, 0]
-        return reaching(p_WR, seen.vehicle), None, memory
+        return reaching_acceleration(p_WR, seen.vehicle), None, memory
 
 
-def reaching(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
     """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
     T = FlatnessControllerConfig.lookahead
     return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2
