@@ -24,6 +24,7 @@ from .systems.vehicle.quadrotor_plant import QuadrotorPlant
 from .systems.vehicle.state_to_pose import StateToPose
 from .training.captures.capture import Capture
 from .training.captures.read_capture import read_capture
+from .training.policies.registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
@@ -61,6 +62,7 @@ __all__ = [
     "reconstruct",
     "register_policy",
     "register_sensor",
+    "register_trainer",
     "register_world",
     "sample_initial_state",
     "write_ply",

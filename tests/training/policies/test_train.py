@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.diagrams.add_policy import policy_named
+from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.worlds.feasibility import TRAINING_SEEDS
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies import policy_checkpoint
@@ -26,7 +26,7 @@ from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.evaluation import evaluate_agent
 from splatpilot.training.policies.network import TrainableNetwork
-from splatpilot.training.policies.registry import RECIPES
+from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.train import Schedule, run
 
 SMALL = [
@@ -64,7 +64,7 @@ def assert_same(a: Path, b: Path) -> None:
 def finished(tmp_path_factory) -> Path:
     """The folder of a tiny run that was not disturbed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    run(config=tiny(), out=out, make=RECIPES["diffaero"].make)
+    run(config=tiny(), out=out, make=TRAINERS.find("diffaero").make)
     return out
 
 
@@ -92,7 +92,7 @@ def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
         time.sleep(0.002)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    run(config=tiny(), out=tmp_path, make=RECIPES["diffaero"].make)
+    run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     assert_same(tmp_path, finished)
     rows = (tmp_path / "curves.csv").read_text()
     assert rows == (finished / "curves.csv").read_text()
@@ -102,11 +102,11 @@ def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
 def test_interrupted_training_ends_as_whole(policy, tmp_path):
     """A run of each kind of trainer that was interrupted between two checkpoints ends with the same
     weights, which its policy flies by."""
-    recipe = RECIPES[policy]
-    config = load_config(recipe.config(), overrides=[*SMALL, *OF_POLICY[policy]])
+    trainer_kind = TRAINERS.find(policy)
+    config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
 
     def make_interrupted(config):
-        trainer = recipe.make(config)
+        trainer = trainer_kind.make(config)
         begin_update = trainer.begin_update
 
         def interrupt(update: int) -> None:
@@ -117,21 +117,21 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
         trainer.begin_update = interrupt
         return trainer
 
-    run(config=config, out=tmp_path / "whole", make=recipe.make)
+    run(config=config, out=tmp_path / "whole", make=trainer_kind.make)
     with pytest.raises(KeyboardInterrupt):
         run(config=config, out=tmp_path / "again", make=make_interrupted)
-    run(config=config, out=tmp_path / "again", make=recipe.make)
+    run(config=config, out=tmp_path / "again", make=trainer_kind.make)
     assert_same(tmp_path / "again", tmp_path / "whole")
     assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
 
 
-@pytest.mark.parametrize("policy", RECIPES)
+@pytest.mark.parametrize("policy", TRAINERS.registered())
 def test_model_cards_hold_configurations_that_train(policy, tmp_path):
     """What a shipped card says the weights were made with is a configuration of `train`."""
     card = (Path(policy_checkpoint.__file__).parent / "weights" / f"{policy}.md").read_text()
     config = tmp_path / "config.yaml"
     config.write_text(re.search("```yaml\n(.*?)```", card, re.DOTALL)[1])
-    load_config(RECIPES[policy].config(), config).validate()
+    load_config(TRAINERS.find(policy).config(), config).validate()
 
 
 def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
@@ -174,14 +174,14 @@ def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch)
 def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
     """A folder of another run, and a checkpoint that is none, are named with the remedy."""
     with pytest.raises(ValueError, match="another configuration"):
-        run(config=tiny("seed=1"), out=finished, make=RECIPES["diffaero"].make)
+        run(config=tiny("seed=1"), out=finished, make=TRAINERS.find("diffaero").make)
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="delete it to begin anew"):
-        run(config=tiny(), out=tmp_path, make=RECIPES["diffaero"].make)
+        run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"schedule\.updates is 0"):
-        run(config=tiny("schedule.updates=0"), out=tmp_path, make=RECIPES["diffaero"].make)
+        run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"worlds\.kinds is \['P99'\]"):
-        run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=RECIPES["diffaero"].make)
+        run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
 @dataclass
@@ -272,6 +272,6 @@ def test_miniature_learns_to_fly(tmp_path):
     torch.manual_seed(0)
     untrained = DiffAeroLearner(config.loss)
     before = evaluate_agent(untrained, held_out, config.validation, config.rollout.noise)
-    summary = run(config=config, out=tmp_path, make=RECIPES["diffaero"].make)
+    summary = run(config=config, out=tmp_path, make=TRAINERS.find("diffaero").make)
     assert before.measures()["success"] == 0.0
     assert summary["best"]["success"] >= 0.5
