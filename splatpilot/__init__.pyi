@@ -21,6 +21,7 @@ from .systems.splats.splat_render_engine import SplatRenderEngine
 from .systems.vehicle.flatness_controller import FlatnessController
 from .systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
 from .systems.vehicle.quadrotor_plant import QuadrotorPlant
+from .systems.vehicle.quadrotor_state import QuadrotorState
 from .systems.vehicle.state_to_pose import StateToPose
 from .training.captures.capture import Capture
 from .training.captures.read_capture import read_capture
@@ -44,6 +45,7 @@ __all__ = [
     "PrivilegedPlanner",
     "QuadrotorParams",
     "QuadrotorPlant",
+    "QuadrotorState",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",

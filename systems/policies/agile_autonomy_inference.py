@@ -15,6 +15,7 @@ from splatpilot.systems.policies.convolutions import (
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
 from splatpilot.systems.policies.observation import pool_depth, target_velocity
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 RATE = 15.0  # [Hz]
 IMAGE_SIZE = 128, 96  # [px] width and height before pooling
@@ -161,7 +162,8 @@ def plan(
     nearest = pool_depth(depth, spec.image_height, spec.image_width)
     image = 1.0 / np.clip(nearest, NEAREST, FARTHEST)
     R_WB = X_WB.rotation().matrix()
-    observed = state_observation(R_WB, X_WB.translation(), state[3:6], state[10:13], p_WG, speed)
+    _, v_WB, _, w_WB_B = QuadrotorState.of(state)
+    observed = state_observation(R_WB, X_WB.translation(), v_WB, w_WB_B, p_WG, speed)
     waypoints_B, costs = network(image, observed)
     v_target_B = observed[-3:]
     advances = waypoints_B[:, -1] @ v_target_B / max(float(np.linalg.norm(v_target_B)), 1e-6)

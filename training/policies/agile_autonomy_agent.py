@@ -11,6 +11,7 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
     RATE,
 )
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, target_velocity
 from splatpilot.training.policies.ray_casting import PinholeGrid
@@ -38,7 +39,11 @@ class AgileAutonomyAgent:
         """Images (N, 24, 32) and states (N, 18)."""
         spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.R_WB
         image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
-        rates = vehicle.state[:, 10:13] if isinstance(vehicle, BodyRate) else 0.0 * vehicle.v
+        rates = (
+            QuadrotorState.of(vehicle.state).w_WB_B
+            if isinstance(vehicle, BodyRate)
+            else 0.0 * vehicle.v
+        )
         v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
         rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
         state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
