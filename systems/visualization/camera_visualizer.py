@@ -78,7 +78,7 @@ class CameraVisualizer(LeafSystem):
         """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
         visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
         builder.AddNamedSystem("camera_visualizer", visualizer)
-        builder.Connect(camera.GetOutputPort("color_image"), visualizer.color_image_input_port())
+        builder.Connect(camera.color_image_output_port(), visualizer.color_image_input_port())
         return visualizer
 
     def _publish(self, context: Context) -> EventStatus:

@@ -58,8 +58,8 @@ class VideoRecorder(LeafSystem):
         info = camera.camera_info()
         recorder = VideoRecorder(info.width(), info.height(), fps)
         builder.AddNamedSystem("video", recorder)
-        for name in ("color_image", "depth_image_16u"):
-            builder.Connect(camera.GetOutputPort(name), recorder.GetInputPort(name))
+        builder.Connect(camera.color_image_output_port(), recorder.color_image_input_port())
+        builder.Connect(camera.depth_image_16u_output_port(), recorder.depth_image_16u_input_port())
         return recorder
 
     def _clear(self, context: Context) -> EventStatus:
