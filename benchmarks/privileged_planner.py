@@ -38,6 +38,7 @@ from splatpilot.systems.vehicle.flatness_controller import (
 )
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 SIZE = np.array([36.0, 16.0, 6.0])
 START = np.array([1.5, 8.0, 1.5])
@@ -102,7 +103,7 @@ def fly(world: AnalyticDistanceField, speed: float) -> Flight:
     simulator.AdvanceTo(40.0)
     wall = time.perf_counter() - started
     p_WB = np.vstack(
-        [logger.FindLog(context).data()[:3].T, plant_position(context)]
+        [QuadrotorState.of(logger.FindLog(context).data().T).p_WB, plant_position(context)]
     )  # the log ends up to a sample before the flight does
     clearance = float(world.distance(p_WB).min()) - VEHICLE_RADIUS
     length = np.linalg.norm(np.diff(p_WB, axis=0), axis=1).sum()
@@ -112,7 +113,7 @@ def fly(world: AnalyticDistanceField, speed: float) -> Flight:
 
 def plant_position(context: Context) -> np.ndarray:
     """p_WB (3,) [m] from the Context of the flight; the plant has all of its continuous state."""
-    return context.get_continuous_state_vector().CopyToVector()[:3]
+    return QuadrotorState.of(context.get_continuous_state_vector().CopyToVector()).p_WB
 
 
 def least_time(function, repeats: int) -> float:
@@ -133,7 +134,7 @@ def main() -> None:
 
     world = make_forest(0, *FORESTS["dense"])
     state = hover_state(START)
-    state[3] = arguments.speed
+    QuadrotorState.of(state).v_WB[0] = arguments.speed
     lattice = TrajectoryLattice(LatticeConfig(speed=arguments.speed))
     for voxel_size in (0.2, 0.1):
         field = esdf_from_distance_field(world, voxel_size).conservative()

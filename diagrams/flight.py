@@ -17,6 +17,7 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
 class Outcome(enum.StrEnum):
@@ -45,7 +46,8 @@ class Flight:
 
     def summary(self) -> dict[str, float | str]:
         """The flight in numbers; distances along the samples, speed as path length over time."""
-        path_length = float(np.linalg.norm(np.diff(self.states[:, :3], axis=0), axis=1).sum())
+        p_WB = QuadrotorState.of(self.states).p_WB
+        path_length = float(np.linalg.norm(np.diff(p_WB, axis=0), axis=1).sum())
         duration = float(self.times[-1])
         return {
             "outcome": str(self.outcome),
@@ -175,7 +177,7 @@ def flight_outcome(
         return Outcome.COLLISION
     if _evaluated(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
         return Outcome.LEFT_VOLUME
-    p_WB = _evaluated(diagram, "state", context)[:3]
+    p_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).p_WB
     if np.linalg.norm(p_WG - p_WB) <= goal_radius:
         return Outcome.GOAL
     return None
@@ -200,7 +202,7 @@ def _record(
         times=times,
         states=states,
         commands=commands,
-        clearances=world.distance_field.distance(states[:, :3]) - VEHICLE_RADIUS,
+        clearances=world.distance_field.distance(QuadrotorState.of(states).p_WB) - VEHICLE_RADIUS,
         hypotheses=_recorded_plans(diagram, root),
         wall_time=wall_time,
     )

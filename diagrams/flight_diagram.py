@@ -108,8 +108,9 @@ def BuildFlightDiagram(
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
 
     builder.AddNamedSystem("plant", plant)
-    pose = builder.AddNamedSystem("pose", StateToPose())
-    collision = builder.AddNamedSystem("collision", EsdfCollision(world.distance_field))
+    pose, collision = StateToPose(), EsdfCollision(world.distance_field)
+    builder.AddNamedSystem("pose", pose)
+    builder.AddNamedSystem("collision", collision)
     goal = builder.AddNamedSystem("goal", ConstantVectorSource(goal_of(scenario, world)))
     builder.AddNamedSystem("policy", policy)
     builder.AddNamedSystem("controller", controller)
@@ -117,15 +118,15 @@ def BuildFlightDiagram(
     _require_ports("controller", controller, inputs=["state"], outputs=["command"])
 
     state = plant.GetOutputPort("state")
-    builder.Connect(state, pose.GetInputPort("state"))
-    builder.Connect(state, collision.GetInputPort("state"))
+    builder.Connect(state, pose.state_input_port())
+    builder.Connect(state, collision.state_input_port())
     _ConnectDecision(builder, scenario, state, policy, controller)
     builder.Connect(state, controller.GetInputPort("state"))
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
 
     observed = {"state": state, "goal": goal.get_output_port()}
-    observed |= AddObservation(builder, scenario, world, state, pose.GetOutputPort("pose"), policy)
-    measured = AddSensors(builder, sensors, world, state, pose.GetOutputPort("pose"))
+    observed |= AddObservation(builder, scenario, world, state, pose.pose_output_port(), policy)
+    measured = AddSensors(builder, sensors, world, state, pose.pose_output_port())
     _ConnectObservation(builder, observed | measured, policy)
 
     exported = {
@@ -137,7 +138,7 @@ def BuildFlightDiagram(
         exported[policy] = ["hypotheses"]
     if camera:
         onboard = builder.AddNamedSystem("camera", MakeCamera(scenario, world))
-        builder.Connect(pose.GetOutputPort("pose"), onboard.GetInputPort("body_pose"))
+        builder.Connect(pose.pose_output_port(), onboard.GetInputPort("body_pose"))
         exported[onboard] = ["color_image", "depth_image_32f", "depth_image_16u"]
     for system, names in exported.items():
         for name in names:
@@ -156,13 +157,8 @@ def BuildFlightDiagram(
         _AddMeshcat(builder, scenario, world, meshcat)
 
     if video:
-        config = scenario.camera
-        recorder = builder.AddNamedSystem(
-            "video", VideoRecorder(config.width, config.height, config.fps)
-        )
-        for name in ("color_image", "depth_image_16u"):
-            onboard = builder.GetSubsystemByName("camera")
-            builder.Connect(onboard.GetOutputPort(name), recorder.GetInputPort(name))
+        onboard = cast(SplatCamera, builder.GetSubsystemByName("camera"))
+        VideoRecorder.AddToBuilder(builder, onboard, scenario.camera.fps)
 
     diagram = builder.Build()
     diagram.set_name("flight")
@@ -227,13 +223,12 @@ def _ConnectDecision(
     """Leads what the policy decides to the controller's port of that kind."""
     if policy.HasOutputPort("hypotheses"):
         hypotheses = policy.GetOutputPort("hypotheses")
-        selector = builder.AddNamedSystem(
-            "selector",
-            HypothesisSelector(num_hypotheses_in(hypotheses.size()), scenario.controller.lookahead),
-        )
-        builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
-        builder.Connect(state, selector.GetInputPort("state"))
-        builder.Connect(selector.GetOutputPort("waypoint"), controller.GetInputPort("waypoint"))
+        count = num_hypotheses_in(hypotheses.size())
+        selector = HypothesisSelector(count, scenario.controller.lookahead)
+        builder.AddNamedSystem("selector", selector)
+        builder.Connect(hypotheses, selector.hypotheses_input_port())
+        builder.Connect(state, selector.state_input_port())
+        builder.Connect(selector.waypoint_output_port(), controller.GetInputPort("waypoint"))
     else:
         kind = "acceleration" if policy.HasOutputPort("acceleration") else "waypoint"
         if not policy.HasOutputPort(kind):
@@ -273,19 +268,13 @@ def _AddMeshcat(
     draw_distance_slice(meshcat, "/splatpilot/distance_slice", field, float(p_WG[2]))
     meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
 
-    systems = {system.get_name(): system for system in builder.GetMutableSystems()}
-    plant, policy = systems["plant"], systems["policy"]
-    camera = cast(SplatCamera, systems["camera"])
+    plant, policy = (builder.GetSubsystemByName(name) for name in ("plant", "policy"))
     plans = policy.HasOutputPort("hypotheses")
-    count = num_hypotheses_in(policy.GetOutputPort("hypotheses").size()) if plans else 0
-    flight = builder.AddNamedSystem("flight_visualizer", FlightVisualizer(meshcat, count))
-    builder.Connect(plant.GetOutputPort("state"), flight.GetInputPort("state"))
-    if plans:
-        builder.Connect(policy.GetOutputPort("hypotheses"), flight.GetInputPort("hypotheses"))
-    picture = builder.AddNamedSystem(
-        "camera_visualizer",
-        CameraVisualizer(
-            meshcat, camera.camera_info(), camera.X_BC(), period=1 / scenario.camera.fps
-        ),
+    FlightVisualizer.AddToBuilder(
+        builder,
+        plant.GetOutputPort("state"),
+        meshcat,
+        policy.GetOutputPort("hypotheses") if plans else None,
     )
-    builder.Connect(camera.GetOutputPort("color_image"), picture.GetInputPort("color_image"))
+    camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
+    CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)

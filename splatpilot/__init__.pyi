@@ -21,9 +21,11 @@ from .systems.splats.splat_render_engine import SplatRenderEngine
 from .systems.vehicle.flatness_controller import FlatnessController
 from .systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
 from .systems.vehicle.quadrotor_plant import QuadrotorPlant
+from .systems.vehicle.quadrotor_state import QuadrotorState
 from .systems.vehicle.state_to_pose import StateToPose
 from .training.captures.capture import Capture
 from .training.captures.read_capture import read_capture, register_capture
+from .training.policies.registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
@@ -43,6 +45,7 @@ __all__ = [
     "PrivilegedPlanner",
     "QuadrotorParams",
     "QuadrotorPlant",
+    "QuadrotorState",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
@@ -62,6 +65,7 @@ __all__ = [
     "register_capture",
     "register_policy",
     "register_sensor",
+    "register_trainer",
     "register_world",
     "sample_initial_state",
     "write_ply",

@@ -7,6 +7,7 @@ import numpy as np
 from splatpilot.diagrams.flight import Flight, Outcome
 from splatpilot.diagrams.flight_diagram import LOG_PERIOD
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 _JERK_STRIDE = 5
 """Samples between which velocities are differentiated: 0.1 s. The controller's steps every 0.02 s
@@ -34,7 +35,7 @@ def flight_measures(flight: Flight, shortest: float) -> dict[str, float | str | 
     arrived = flight.outcome == Outcome.GOAL
     least = float(np.nanmin(flight.clearances))
     length, duration = float(summary["path_length_m"]), float(summary["flight_time_s"])
-    jerk, smoothness = jerk_measures(flight.states[:, 3:6], flight.times)
+    jerk, smoothness = jerk_measures(QuadrotorState.of(flight.states).v_WB, flight.times)
     return {
         "success": arrived and least >= 0.0,
         "outcome": str(flight.outcome),

@@ -12,6 +12,7 @@ from splatpilot.diagrams.flight import Flight, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.fly import film_flight, open_meshcat
 from splatpilot.systems.files import require_writable_folder
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
 class Agreement(NamedTuple):
@@ -98,6 +99,9 @@ def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:
 def compare(flight: Flight, recorded: dict[str, np.ndarray], recorded_digest: str) -> Agreement:
     """Compares a flight with the arrays and the digest that a study kept."""
     common = min(len(flight.times), len(recorded["times"]))
-    offsets = flight.states[:common, :3] - recorded["states"][:common, :3]
+    flown, before = (
+        QuadrotorState.of(states[:common]).p_WB for states in (flight.states, recorded["states"])
+    )
+    offsets = flown - before
     deviation = float(np.linalg.norm(offsets, axis=1).max())
     return Agreement(digest(flight) == recorded_digest, deviation, str(flight.outcome))

@@ -25,6 +25,7 @@ from splatpilot.analysis.benchmark.tables import (
 from splatpilot.diagrams.flight_diagram import goal_of
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 _COMPARED = ("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")
 
@@ -214,7 +215,7 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str,
     for policy in config.policy_names:
         row, arrays = folder.read(spec._replace(policy=policy))
         if arrays:
-            flights[policy] = arrays["states"][:, :3], row["outcome"]
+            flights[policy] = QuadrotorState.of(arrays["states"]).p_WB, row["outcome"]
     p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
     figure = draw_trajectories(

@@ -22,6 +22,7 @@ from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import dump_config, parse_config
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, way_lengths
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 ARRAYS = "times", "states", "commands", "clearances"
 """The arrays of `Flight` that a study keeps."""
@@ -65,7 +66,7 @@ def fly_rollout(
         diagram = BuildFlightDiagram(flown, world, camera=False)
         flight = fly(diagram, flown, world)
         shortest = shortest_length(
-            _way_lengths(world, flown), flight.states[0, :3], flown.goal_radius
+            _way_lengths(world, flown), QuadrotorState.of(flight.states[0]).p_WB, flown.goal_radius
         )
         measures = flight_measures(flight, shortest) | {"digest": digest(flight)}
         timing |= _flight_timing(diagram, flown, flight)

@@ -7,10 +7,12 @@ from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    train = verbs.add_parser("train", help="train a policy that flies by depth")
+    train = verbs.add_parser("train", help="train a policy")
     train.set_defaults(verb=_train)
     train.add_argument(
-        "policy", choices=["diffaero", "depthnav", "agile_autonomy"], help="which one"
+        "policy",
+        metavar="POLICY",
+        help="name of a trainer, such as diffaero, or module:attribute of one of your own",
     )
     train.add_argument(
         "--out",
@@ -32,22 +34,22 @@ def _train(options: argparse.Namespace) -> None:
     from splatpilot.analysis.benchmark.study import StudyConfig
     from splatpilot.diagrams.scenario_files import scenario_file
     from splatpilot.systems.configuration import load_config
-    from splatpilot.training.policies.registry import RECIPES
+    from splatpilot.training.policies.registry import TRAINERS
     from splatpilot.training.policies.train import run
 
     scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
     for name in scenarios:
         scenario_file(name)  # before the training, not after it
-    recipe = RECIPES[options.policy]
-    run(
-        config=load_config(recipe.config(), options.config, options.overrides),
+    trainer = TRAINERS.find(options.policy)
+    summary = run(
+        config=load_config(trainer.config(), options.config, options.overrides),
         out=options.out,
-        make=recipe.make,
+        make=trainer.make,
     )
     if scenarios:
         study = StudyConfig(
             scenarios=scenarios,
-            policies=[str(options.out / f"{options.policy}.npz")],
+            policies=[str(options.out / f"{summary['policy']}.npz")],
             seeds=5,
         )
         benchmark.run(config=study, out=options.out / "benchmark")

@@ -9,7 +9,9 @@ from pydrake.systems.framework import LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.soft_barrier import in_collision, soft_barrier
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
 class EsdfCollision(LeafSystem):
@@ -45,6 +47,14 @@ class EsdfCollision(LeafSystem):
     Raises:
         ValueError: if the radius is negative or beta not positive.
     """
+
+    state_input_port = input_port("state")
+    distance_output_port = output_port("distance")
+    gradient_output_port = output_port("gradient")
+    clearance_output_port = output_port("clearance")
+    in_collision_output_port = output_port("in_collision")
+    barrier_output_port = output_port("barrier")
+    field_state_output_port = output_port("field_state")
 
     def __init__(
         self,
@@ -88,5 +98,5 @@ class EsdfCollision(LeafSystem):
         declare("field_state", 1, lambda sample: float(sample.state))
 
     def _sample(self, context: Any, sample: Any) -> None:
-        p_WB = np.asarray(self.get_input_port().Eval(context))[:3]
-        sample.set_value(self._field.query(p_WB))
+        state = np.asarray(self.get_input_port().Eval(context))
+        sample.set_value(self._field.query(QuadrotorState.of(state).p_WB))

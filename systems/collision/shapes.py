@@ -1,8 +1,9 @@
 """Analytic solids with exact signed distances.
 
-Every kind of shape is a dataclass whose static methods take its parameters as arrays: `distances`
-broadcasts points (..., 3) against parameters (M, ...), so it serves all pairs, points (N, 1, 3),
-and matched pairs, points (N, 3), alike. O is a shape's own frame.
+Every kind of shape is a dataclass whose static methods take the `parameters()` of M of its kind as
+arrays (M, ...). They broadcast: points (N, 1, 3) give all pairs (N, M), and points (M, 3) matched
+pairs (M,). `parameters()` raises ValueError on a value out of range, naming it and its limit. O is
+a shape's own frame.
 """
 
 from dataclasses import dataclass
@@ -21,14 +22,17 @@ class Sphere:
     radius: float
 
     def parameters(self) -> tuple[Any, ...]:
+        """Centre (3,) and radius [m]."""
         return as_point(self.p_WO, "Sphere.p_WO"), _positive(self.radius, "Sphere.radius")
 
     @staticmethod
     def distances(p: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Signed distances (...,) [m] of points p (..., 3) [m], negative inside."""
         return _norm(p - center) - radius
 
     @staticmethod
     def gradients(p: np.ndarray, center: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Gradients (..., 3) of the distances at points p (..., 3) [m]: outward unit normals."""
         return _unit(p - center)
 
 
@@ -41,6 +45,7 @@ class Capsule:
     radius: float
 
     def parameters(self) -> tuple[Any, ...]:
+        """End (3,) [m], unit axis (3,), length and radius [m]."""
         p_WA, axis, length = _segment(self.p_WA, self.p_WB, "Capsule")
         return p_WA, axis, length, _positive(self.radius, "Capsule.radius")
 
@@ -48,12 +53,14 @@ class Capsule:
     def distances(
         p: np.ndarray, end: np.ndarray, axis: np.ndarray, length: np.ndarray, radius: np.ndarray
     ) -> np.ndarray:
+        """Signed distances (...,) [m] of points p (..., 3) [m], negative inside."""
         return _norm(Capsule._from_segment(p, end, axis, length)) - radius
 
     @staticmethod
     def gradients(
         p: np.ndarray, end: np.ndarray, axis: np.ndarray, length: np.ndarray, radius: np.ndarray
     ) -> np.ndarray:
+        """Gradients (..., 3) of the distances at points p (..., 3) [m]: outward unit normals."""
         return _unit(Capsule._from_segment(p, end, axis, length), axis)
 
     @staticmethod
@@ -75,6 +82,7 @@ class Cylinder:
     radius: float
 
     def parameters(self) -> tuple[Any, ...]:
+        """Centre (3,) [m], unit axis (3,), half length and radius [m]."""
         p_WA, axis, length = _segment(self.p_WA, self.p_WB, "Cylinder")
         half = 0.5 * length
         return p_WA + half * axis, axis, half, _positive(self.radius, "Cylinder.radius")
@@ -83,6 +91,7 @@ class Cylinder:
     def distances(
         p: np.ndarray, center: np.ndarray, axis: np.ndarray, half: np.ndarray, radius: np.ndarray
     ) -> np.ndarray:
+        """Signed distances (...,) [m] of points p (..., 3) [m], negative inside."""
         from_center = p - center
         along = _dot(from_center, axis)
         across = _norm(from_center - along[..., None] * axis)
@@ -94,6 +103,7 @@ class Cylinder:
     def gradients(
         p: np.ndarray, center: np.ndarray, axis: np.ndarray, half: np.ndarray, radius: np.ndarray
     ) -> np.ndarray:
+        """Gradients (..., 3) of the distances at points p (..., 3) [m]: outward unit normals."""
         from_center = p - center
         along = _dot(from_center, axis)
         radial = from_center - along[..., None] * axis
@@ -113,6 +123,7 @@ class Box:
     size: ArrayLike
 
     def parameters(self) -> tuple[Any, ...]:
+        """Centre (3,) [m], rotation R_WS (3, 3) and half sizes (3,) [m]."""
         size = as_point(self.size, "Box.size")
         if (size <= 0.0).any():
             raise ValueError(f"Box.size is {size} m; each edge must be positive.")
@@ -122,6 +133,7 @@ class Box:
     def distances(
         p: np.ndarray, center: np.ndarray, rotation: np.ndarray, half: np.ndarray
     ) -> np.ndarray:
+        """Signed distances (...,) [m] of points p (..., 3) [m], negative inside."""
         # By component: numpy is several times slower along a last axis of three.
         d = [p[..., i] - center[..., i] for i in range(3)]
         along = [sum(d[j] * rotation[..., j, i] for j in range(3)) for i in range(3)]
@@ -133,6 +145,7 @@ class Box:
     def gradients(
         p: np.ndarray, center: np.ndarray, rotation: np.ndarray, half: np.ndarray
     ) -> np.ndarray:
+        """Gradients (..., 3) of the distances at points p (..., 3) [m]: outward unit normals."""
         local = _to_local(p - center, rotation)
         beyond = np.abs(local) - half
         nearest_face = beyond.argmax(axis=-1)[..., None] == np.arange(3)
@@ -152,6 +165,7 @@ class HalfSpace:
     offset: float
 
     def parameters(self) -> tuple[Any, ...]:
+        """Unit normal (3,) and offset [m]."""
         normal = as_point(self.normal, "HalfSpace.normal")
         length = np.linalg.norm(normal)
         if length == 0.0:
@@ -160,10 +174,12 @@ class HalfSpace:
 
     @staticmethod
     def distances(p: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Signed distances (...,) [m] of points p (..., 3) [m], negative inside."""
         return _dot(p, normal) - offset
 
     @staticmethod
     def gradients(p: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Gradients (..., 3) of the distances at points p (..., 3) [m]: outward unit normals."""
         return np.broadcast_to(normal, p.shape)
 
 

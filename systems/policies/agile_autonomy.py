@@ -20,6 +20,7 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
 )
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
 from splatpilot.systems.policies.hypotheses import Hypotheses, unplanned
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
@@ -64,6 +65,11 @@ class AgileAutonomy(LeafSystem):
         ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights
             that are missing, damaged, or of another policy, version or architecture.
     """
+
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+    depth_image_32f_input_port = input_port("depth_image_32f")
+    hypotheses_output_port = output_port("hypotheses")
 
     def __init__(self, config: AgileAutonomyConfig | None = None) -> None:
         super().__init__()

@@ -10,11 +10,12 @@ from splatpilot.systems.policies.convolutions import (
     Layer,
     convolution_shapes,
     layer_sizes,
-    rectified,
+    leaky_relu,
 )
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
-from splatpilot.systems.policies.observation import pooled_depth, target_velocity
+from splatpilot.systems.policies.observation import pool_depth, target_velocity
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 RATE = 15.0  # [Hz]
 IMAGE_SIZE = 128, 96  # [px] width and height before pooling
@@ -102,11 +103,11 @@ class TrajectoryNetwork:
                     f"the policy's {name} has shape {np.shape(array)}, but its network takes "
                     f"{shape}"
                 )
-        x = rectified(self._linear("image_layer", self._convolutions(image)))
-        y = rectified(self._linear("state_layer", np.asarray(state, np.float32)))
-        y = rectified(self._linear("state_layer_2", y))
-        modes = rectified(self._linear("modes", np.concatenate([x, y])))
-        hidden = rectified(self._linear("head", modes.reshape(MODES, -1)))
+        x = leaky_relu(self._linear("image_layer", self._convolutions(image)))
+        y = leaky_relu(self._linear("state_layer", np.asarray(state, np.float32)))
+        y = leaky_relu(self._linear("state_layer_2", y))
+        modes = leaky_relu(self._linear("modes", np.concatenate([x, y])))
+        hidden = leaky_relu(self._linear("head", modes.reshape(MODES, -1)))
         output = self._linear("output", hidden)
         waypoints = WAYPOINT_SCALE * output[:, :-1].reshape(MODES, NUM_WAYPOINTS, 3)
         return waypoints, output[:, -1]
@@ -158,18 +159,19 @@ def plan(
         ValueError: for a depth image of another size.
     """
     spec = network.spec
-    nearest = pooled_depth(depth, spec.image_height, spec.image_width)
+    nearest = pool_depth(depth, spec.image_height, spec.image_width)
     image = 1.0 / np.clip(nearest, NEAREST, FARTHEST)
     R_WB = X_WB.rotation().matrix()
-    observed = state_observation(R_WB, X_WB.translation(), state[3:6], state[10:13], p_WG, speed)
+    _, v_WB, _, w_WB_B = QuadrotorState.of(state)
+    observed = state_observation(R_WB, X_WB.translation(), v_WB, w_WB_B, p_WG, speed)
     waypoints_B, costs = network(image, observed)
     v_target_B = observed[-3:]
     advances = waypoints_B[:, -1] @ v_target_B / max(float(np.linalg.norm(v_target_B)), 1e-6)
     costs = costs.astype(float) - PROGRESS * advances
-    return _continued(Hypotheses(time, X_WB, waypoints_B.astype(float), costs), last)
+    return _prefer_continuation(Hypotheses(time, X_WB, waypoints_B.astype(float), costs), last)
 
 
-def _continued(hypotheses: Hypotheses, last: Hypotheses | None) -> Hypotheses:
+def _prefer_continuation(hypotheses: Hypotheses, last: Hypotheses | None) -> Hypotheses:
     if last is None:
         return hypotheses
     costs = hypotheses.costs

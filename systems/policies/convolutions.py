@@ -38,7 +38,7 @@ class Convolutions:
         x = np.asarray(image, np.float32)[None]
         for patches, padding, filters, bias in self._layers:
             padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-            x = rectified(padded.take(patches) @ filters + bias)  # (height, width, channels)
+            x = leaky_relu(padded.take(patches) @ filters + bias)  # (height, width, channels)
             x = x.transpose(2, 0, 1)
         return x.ravel()
 
@@ -63,7 +63,7 @@ def layer_sizes(image: tuple[int, int, int], layers: Sequence[Layer]) -> list[tu
     return sizes
 
 
-def rectified(x: np.ndarray) -> np.ndarray:
+def leaky_relu(x: np.ndarray) -> np.ndarray:
     """x where positive, else x times `LEAK`."""
     return np.maximum(x, np.float32(LEAK) * x)
 

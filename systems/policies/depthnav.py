@@ -16,10 +16,12 @@ from splatpilot.systems.policies.depthnav_inference import (
     IMAGE_SIZE,
     RATE,
     decide,
-    yaw_of,
+    heading_yaw,
 )
 from splatpilot.systems.policies.recurrent_network import load_network
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
@@ -67,6 +69,12 @@ class DepthNav(LeafSystem):
             that are missing, damaged, or of another policy, version or architecture.
     """
 
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+    depth_image_32f_input_port = input_port("depth_image_32f")
+    acceleration_output_port = output_port("acceleration")
+    heading_output_port = output_port("heading")
+
     def __init__(self, config: DepthNavConfig | None = None) -> None:
         super().__init__()
         self._config = config = config or DepthNavConfig()
@@ -89,12 +97,12 @@ class DepthNav(LeafSystem):
         X_WB = pose_from_state(state)
         start_yaw = float(context.get_discrete_state(int(self._start_yaw)).value()[0])
         if np.isnan(start_yaw):
-            start_yaw = yaw_of(X_WB.rotation().matrix())
+            start_yaw = heading_yaw(X_WB.rotation().matrix())
         decision = decide(
             self._network,
             np.asarray(image.data)[..., 0],
             X_WB,
-            state[3:6],
+            QuadrotorState.of(state).v_WB,
             np.asarray(self._goal_port.Eval(context)),
             self._config.speed,
             start_yaw,

@@ -10,8 +10,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.policies.observation import (
-    limited_acceleration,
-    pooled_depth,
+    limit_acceleration,
+    pool_depth,
     target_velocity,
 )
 from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
@@ -41,12 +41,12 @@ class Decision(NamedTuple):
     memory: np.ndarray  # (H,)
 
 
-def yaw_of(R_WB: np.ndarray) -> float:
+def heading_yaw(R_WB: np.ndarray) -> float:
     """The angle [rad] from world x to the body's x axis, seen from above."""
     return atan2(R_WB[1, 0], R_WB[0, 0])
 
 
-def turn(yaw: float) -> np.ndarray:
+def yaw_rotation(yaw: float) -> np.ndarray:
     """The rotation (3, 3) about z by `yaw` [rad]."""
     return np.array([[cos(yaw), -sin(yaw), 0.0], [sin(yaw), cos(yaw), 0.0], [0.0, 0.0, 1.0]])
 
@@ -75,14 +75,14 @@ def decide(
     Raises:
         ValueError: for a depth image of another size.
     """
-    spec, R_WS = network.spec, turn(start_yaw)
-    nearest = pooled_depth(depth, spec.image_height, spec.image_width)
+    spec, R_WS = network.spec, yaw_rotation(start_yaw)
+    nearest = pool_depth(depth, spec.image_height, spec.image_width)
     image = 1.0 / np.clip(nearest, NEAREST, FARTHEST)
     q_SB = _about_z(-start_yaw, X_WB.rotation().ToQuaternion().wxyz())
     v_target = target_velocity(X_WB.translation(), p_WG, speed)
     state = np.concatenate([v_WB @ R_WS, q_SB, v_target @ R_WS, [speed]])
     output, memory = network.step(image, state, memory)
-    a_WB = R_WS @ limited_acceleration(output[:3], ACCELERATION_LIMITS)
+    a_WB = R_WS @ limit_acceleration(output[:3], ACCELERATION_LIMITS)
     to_goal = atan2(v_target[1], v_target[0])
     heading = to_goal + np.pi * np.tanh(float(output[3]) / np.pi)
     return Decision(a_WB, heading, memory)

@@ -11,7 +11,9 @@ from pydrake.systems.sensors import ImageDepth32F
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, FOV_X, RATE, decide
 from splatpilot.systems.policies.recurrent_network import load_network
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
@@ -54,6 +56,11 @@ class DiffAero(LeafSystem):
             that are missing, damaged, or of another policy, version or architecture.
     """
 
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+    depth_image_32f_input_port = input_port("depth_image_32f")
+    acceleration_output_port = output_port("acceleration")
+
     def __init__(self, config: DiffAeroConfig | None = None) -> None:
         super().__init__()
         self._config = config = config or DiffAeroConfig()
@@ -75,7 +82,7 @@ class DiffAero(LeafSystem):
             self._network,
             np.asarray(image.data)[..., 0],
             pose_from_state(state),
-            state[3:6],
+            QuadrotorState.of(state).v_WB,
             np.asarray(self._goal_port.Eval(context)),
             self._config.speed,
             np.asarray(context.get_discrete_state(int(self._memory)).value()),

@@ -7,8 +7,8 @@ from splatpilot.systems.policies.observation import (
     heading_frame,
     heading_observation,
     inverse_depth,
-    limited_acceleration,
-    pooled_depth,
+    limit_acceleration,
+    pool_depth,
 )
 from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
 
@@ -51,8 +51,8 @@ def decide(
         ValueError: for a depth image of another size.
     """
     R_WB = X_WB.rotation().matrix()
-    nearest = pooled_depth(depth, network.spec.image_height, network.spec.image_width)
+    nearest = pool_depth(depth, network.spec.image_height, network.spec.image_width)
     image = inverse_depth(nearest, NEAREST, FARTHEST)
     state = heading_observation(R_WB, X_WB.translation(), v_WB, p_WG, speed)
     output, memory = network.step(image, state, memory)
-    return heading_frame(R_WB) @ limited_acceleration(output, ACCELERATION_LIMITS), memory
+    return heading_frame(R_WB) @ limit_acceleration(output, ACCELERATION_LIMITS), memory

@@ -11,6 +11,8 @@ from splatpilot.systems.policies.hypotheses import (
     Hypotheses,
     hypotheses_size,
 )
+from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
 class HypothesisSelector(LeafSystem):
@@ -31,6 +33,10 @@ class HypothesisSelector(LeafSystem):
     its waypoints. A plan that has run out holds its last waypoint; before the first plan the
     waypoint is the present position, so that the vehicle hovers. Stateless, no rate of its own.
     """
+
+    hypotheses_input_port = input_port("hypotheses")
+    state_input_port = input_port("state")
+    waypoint_output_port = output_port("waypoint")
 
     def __init__(self, num_hypotheses: int = 3, lookahead: float = 0.4) -> None:
         """Constructs the system.
@@ -62,7 +68,8 @@ class HypothesisSelector(LeafSystem):
             np.asarray(self._hypotheses_port.Eval(context)), self._num_hypotheses
         )
         if plan is None:
-            output.SetFromVector(np.asarray(self._state_port.Eval(context))[0:3])
+            state = np.asarray(self._state_port.Eval(context))
+            output.SetFromVector(QuadrotorState.of(state).p_WB)
         else:
             time = context.get_time() + self._lookahead
             output.SetFromVector(plan.position_W(time, plan.best))

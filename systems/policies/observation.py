@@ -7,7 +7,7 @@ numpy arrays; training repeats the same formulas in torch (`training/policies/ob
 import numpy as np
 
 
-def pooled_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
+def pool_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
     """The nearest depth (height, width) [m] in each block of an image (H, W) of planar depth [m].
 
     Obstacles thinner than a coarse pixel stay visible this way.
@@ -62,6 +62,6 @@ def heading_observation(
     return (rows @ R_WH).ravel()
 
 
-def limited_acceleration(output: np.ndarray, limits: np.ndarray) -> np.ndarray:
+def limit_acceleration(output: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """A network's output (3,) as an acceleration [m/s^2] within +-limits (3,), smoothly."""
     return limits * np.tanh(output / limits)

@@ -12,7 +12,9 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 _STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
@@ -80,7 +82,8 @@ def plan(
             "plant or estimator it comes from."
         )
     X_WB = pose_from_state(state)
-    R_WB, p_WB, v_WB = X_WB.rotation().matrix(), state[0:3], state[3:6]
+    R_WB = X_WB.rotation().matrix()
+    p_WB, v_WB, _, _ = QuadrotorState.of(state)
     _check_way_exists(p_WB, field, toa)
     a_WB = level_acceleration(R_WB, v_WB, params or QuadrotorParams())
     positions_W, costs = lattice.best(p_WB, v_WB, a_WB, field, toa)
@@ -131,6 +134,10 @@ class PrivilegedPlanner(LeafSystem):
             outside the known volume, too close to an obstacle or cut off from the vehicle, or if
             the state is not finite.
     """
+
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+    hypotheses_output_port = output_port("hypotheses")
 
     def __init__(
         self,

@@ -16,6 +16,8 @@ from splatpilot.systems.policies.reactive_planner import (
     responses,
 )
 from splatpilot.systems.policies.velocity_tracking import approach_velocity, tracking_acceleration
+from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
@@ -46,6 +48,11 @@ class Reactive(LeafSystem):
         ValueError: from the constructor on a config out of range.
     """
 
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+    depth_image_32f_input_port = input_port("depth_image_32f")
+    acceleration_output_port = output_port("acceleration")
+
     def __init__(self, config: ReactiveConfig | None = None) -> None:
         super().__init__()
         self._config = config = config or ReactiveConfig()
@@ -68,7 +75,7 @@ class Reactive(LeafSystem):
         p_WG = np.asarray(self._goal_port.Eval(context))
         image = cast(ImageDepth32F, self._depth_port.Eval(context))
         depth = np.asarray(image.data)[..., 0].astype(float)
-        p_WB, v_WB = state[0:3], state[3:6]
+        p_WB, v_WB, _, _ = QuadrotorState.of(state)
         X_WC = pose_from_state(state) @ config.camera.X_BC()
         R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
 

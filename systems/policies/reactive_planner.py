@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.soft_barrier import soft_barrier
-from splatpilot.systems.policies.trajectory_lattice import rotation_to
+from splatpilot.systems.policies.trajectory_lattice import rotation_to, velocity_fan
 from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -48,12 +48,12 @@ class ReactiveConfig:
     memory: int = 20
     # [s] How far ahead candidates are followed.
     horizon: float = 1.5
-    # [-] Number of directions to the sides, and [deg] the largest angle from the goal's direction.
+    # [-] Number of directions to the sides, and [rad] the largest angle from the goal's direction.
     num_yaws: int = 17
-    max_yaw: float = 100.0
-    # [-] Number of directions up and down, and [deg] the largest angle.
+    max_yaw: float = math.radians(100.0)
+    # [-] Number of directions up and down, and [rad] the largest angle.
     num_pitches: int = 3
-    max_pitch: float = 25.0
+    max_pitch: float = math.radians(25.0)
     # [-] Speeds as fractions of the greatest.
     speed_fractions: list[float] = field(default_factory=lambda: [0.33, 0.67, 1.0])
     # [m] Clearance kept for errors of tracking and for what lies between pixels.
@@ -80,8 +80,9 @@ class ReactiveConfig:
                 name, getattr(self, name), 1 <= getattr(self, name) <= largest, f"1 to {largest}"
             )
         _check("horizon", self.horizon, 0.3 <= self.horizon <= 10.0, "0.3 to 10 s")
-        _check("max_yaw", self.max_yaw, 0.0 <= self.max_yaw <= 180.0, "0 to 180 deg")
-        _check("max_pitch", self.max_pitch, 0.0 <= self.max_pitch < 90.0, "0 to less than 90 deg")
+        yaw, pitch = self.max_yaw, self.max_pitch
+        _check("max_yaw", yaw, 0.0 <= yaw <= math.pi, "0 to pi rad")
+        _check("max_pitch", pitch, 0.0 <= pitch < math.pi / 2, "0 to less than pi/2 rad")
         in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
         _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
         weights = [f"{name}_weight" for name in ("height", "barrier", "contact", "unseen")]
@@ -108,15 +109,19 @@ def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
 
 def candidate_velocities(to_goal: np.ndarray, config: ReactiveConfig) -> np.ndarray:
     """The velocities v (N, 3) [m/s] in a fan about the direction to the goal; the last is rest."""
-    yaw, pitch, fraction = np.meshgrid(
-        np.deg2rad(np.linspace(-config.max_yaw, config.max_yaw, config.num_yaws)),
-        np.deg2rad(np.linspace(-config.max_pitch, config.max_pitch, config.num_pitches)),
+    fan = velocity_fan(
+        _even_angles(config.max_yaw, config.num_yaws),
+        _even_angles(config.max_pitch, config.num_pitches),
         config.speed_fractions,
-        indexing="ij",
     )
-    directions = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
-    v = config.speed * (fraction * np.stack(directions)).reshape(3, -1).T
-    return np.vstack([v @ rotation_to(to_goal).T, np.zeros(3)])
+    return np.vstack([config.speed * fan @ rotation_to(to_goal).T, np.zeros(3)])
+
+
+def _even_angles(largest: float, count: int) -> np.ndarray:
+    """`count` angles [rad] from -largest to largest. Of whole degrees, whose even parts a float
+    holds exactly."""
+    degrees = math.degrees(largest)
+    return np.deg2rad(np.linspace(-degrees, degrees, count))
 
 
 def responses(

@@ -15,7 +15,7 @@ from splatpilot.systems.policies.convolutions import (
     Layer,
     convolution_shapes,
     layer_sizes,
-    rectified,
+    leaky_relu,
 )
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
 
@@ -99,7 +99,7 @@ class RecurrentNetwork:
                 )
         x = self._convolutions(image)
         state, hidden = np.asarray(state, np.float32), np.asarray(hidden, np.float32)
-        features = rectified(w["state_layer.weight"] @ state + w["state_layer.bias"])
+        features = leaky_relu(w["state_layer.weight"] @ state + w["state_layer.bias"])
         features = np.concatenate([x, features])
         H = spec.hidden_size
         from_input = w["memory.weight_ih"] @ features + w["memory.bias_ih"]

@@ -10,6 +10,8 @@ from splatpilot.systems.policies.velocity_tracking import (
     approach_velocity,
     tracking_acceleration,
 )
+from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
 @dataclass
@@ -55,6 +57,10 @@ class Straight(LeafSystem):
         ValueError: from the constructor on a config out of range.
     """
 
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+    acceleration_output_port = output_port("acceleration")
+
     def __init__(self, config: StraightConfig | None = None) -> None:
         super().__init__()
         self._config = config or StraightConfig()
@@ -65,7 +71,7 @@ class Straight(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / self._config.rate, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = np.asarray(self._state_port.Eval(context))
+        p_WB, v_WB, _, _ = QuadrotorState.of(np.asarray(self._state_port.Eval(context)))
         p_WG = np.asarray(self._goal_port.Eval(context))
-        v_wanted = approach_velocity(state[0:3], p_WG, self._config.speed)
-        discrete_state.set_value(tracking_acceleration(state[3:6], v_wanted))
+        v_wanted = approach_velocity(p_WB, p_WG, self._config.speed)
+        discrete_state.set_value(tracking_acceleration(v_WB, v_wanted))

@@ -7,6 +7,7 @@ product, and their clearances one batched look-up in the distance field.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -212,20 +213,26 @@ def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.
 
 
 def final_velocities(config: LatticeConfig) -> np.ndarray:
-    """The final velocities (N, 3) in units of the speed; the last is rest.
-
-    In the lattice frame L: x is ahead, yaws are about z and positive to the left, pitches are
-    positive upwards.
-    """
-    yaw, pitch, speed = np.meshgrid(
+    """The final velocities (N, 3) in units of the speed, lattice frame L; the last is rest."""
+    fan = velocity_fan(
         np.linspace(-config.max_yaw, config.max_yaw, config.num_yaws),
         np.linspace(-config.max_pitch, config.max_pitch, config.num_pitches),
         config.speed_fractions,
-        indexing="ij",
     )
+    return np.vstack([fan, np.zeros(3)])
+
+
+def velocity_fan(
+    yaws: np.ndarray, pitches: np.ndarray, speeds: Sequence[float] | np.ndarray
+) -> np.ndarray:
+    """Velocities (N, 3) of each of the speeds in each of the directions.
+
+    Of a frame whose x axis points ahead: yaws [rad] are about z and positive to the left, pitches
+    [rad] positive upwards.
+    """
+    yaw, pitch, speed = np.meshgrid(yaws, pitches, speeds, indexing="ij")
     forward, left, up = np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)
-    velocities = speed * np.stack([forward, left, up])
-    return np.vstack([velocities.reshape(3, -1).T, np.zeros(3)])
+    return (speed * np.stack([forward, left, up])).reshape(3, -1).T
 
 
 def rotation_to(direction_W: np.ndarray) -> np.ndarray:

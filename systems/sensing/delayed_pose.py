@@ -7,6 +7,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.systems.weakly import weakly
 
@@ -29,6 +30,9 @@ class DelayedPose(LeafSystem):
     The discrete state holds samples of time and state every ``period`` (0.02 s); between them
     the state is interpolated linearly, and its quaternion normalised.
     """
+
+    state_input_port = input_port("state")
+    pose_output_port = output_port("pose")
 
     def __init__(self, latency: float, period: float = 0.02) -> None:
         """Constructs the system.

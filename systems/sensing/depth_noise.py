@@ -7,6 +7,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.observation_noise import (
     ObservationNoise,
     image_generator,
@@ -30,6 +31,9 @@ class DepthNoise(LeafSystem):
     Both are planar depth [m]. Stateless: the noise is that of the seed and of the image's number,
     the time in units of 1 / `rate`, so that whoever looks again at the same time sees the same.
     """
+
+    depth_image_32f_input_port = input_port("depth_image_32f")
+    depth_image_32f_output_port = output_port("depth_image_32f")
 
     def __init__(
         self, noise: ObservationNoise, camera: OnboardCamera, rate: float, seed: int

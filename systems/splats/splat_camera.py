@@ -14,6 +14,7 @@ from pydrake.systems.sensors import (
     ImageRgba8U,
 )
 
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.drake_images import (
     color_pixels,
@@ -53,6 +54,17 @@ class SplatCamera(LeafSystem):
     below one half. Labels are `RenderLabel.kUnspecified` where there is a surface and
     `RenderLabel.kEmpty` elsewhere: Gaussians carry no semantics.
     """
+
+    body_pose_input_port = input_port("body_pose")
+    color_image_output_port = output_port("color_image")
+    depth_image_32f_output_port = output_port("depth_image_32f")
+    depth_image_16u_output_port = output_port("depth_image_16u")
+    # As `RgbdSensor` spells them.
+    depth_image_32F_output_port = depth_image_32f_output_port
+    depth_image_16U_output_port = depth_image_16u_output_port
+    label_image_output_port = output_port("label_image")
+    body_pose_in_world_output_port = output_port("body_pose_in_world")
+    image_time_output_port = output_port("image_time")
 
     def __init__(
         self,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.flatness import (
     attitude_error,
     attitude_from_thrust,
@@ -15,6 +16,7 @@ from splatpilot.systems.vehicle.flatness import (
     thrust_for_acceleration,
 )
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 
@@ -128,6 +130,12 @@ class FlatnessController(LeafSystem):
             none or both of the alternative inputs are connected, or if an input is not finite.
     """
 
+    state_input_port = input_port("state")
+    waypoint_input_port = input_port("waypoint")
+    acceleration_input_port = input_port("acceleration")
+    heading_input_port = input_port("heading")
+    command_output_port = output_port("command")
+
     def __init__(
         self,
         config: FlatnessControllerConfig | None = None,
@@ -149,7 +157,7 @@ class FlatnessController(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         config, params = self._config, self._params
         state = self._eval_finite("state", context)
-        p_WB, v_WB = state[0:3], state[3:6]
+        p_WB, v_WB, _, _ = QuadrotorState.of(state)
         R_WB = pose_from_state(state).rotation().matrix()
 
         use_waypoint = self.GetInputPort("waypoint").HasValue(context)

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+
 VEHICLE_RADIUS = 0.354
 """Propeller-tip radius of the vehicle [m]: closer than this to a surface is a collision."""
 
@@ -51,10 +53,8 @@ class QuadrotorParams:
 
 def hover_state(p_WB: Sequence[float] | np.ndarray, yaw: float = 0.0) -> np.ndarray:
     """The state (13,) at rest and level at ``p_WB`` (3,) [m], facing ``yaw`` [rad] from world x."""
-    state = np.zeros(13)
-    state[0:3] = p_WB
-    state[6], state[9] = math.cos(yaw / 2), math.sin(yaw / 2)
-    return state
+    q_WB = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    return QuadrotorState(p_WB, np.zeros(3), q_WB, np.zeros(3)).to_vector()
 
 
 def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> Any:

@@ -10,6 +10,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor_dynamics import (
     QuadrotorParams,
     component_derivatives,
@@ -45,6 +46,9 @@ def QuadrotorPlant_(T):
         Raises:
             ValueError: if a parameter is out of range, see :class:`QuadrotorParams`.
         """
+
+        command_input_port = input_port("command")
+        state_output_port = output_port("state")
 
         def _construct(self, params: QuadrotorParams | None = None, converter=None):
             super().__init__(converter=converter)

@@ -8,6 +8,8 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 
+from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.weakly import weakly
 
 
@@ -17,14 +19,14 @@ def pose_from_state(state: np.ndarray) -> RigidTransform:
     Raises:
         ValueError: if the quaternion is zero or not finite.
     """
-    q_WB = state[6:10]
+    p_WB, _, q_WB, _ = QuadrotorState.of(state)
     norm = math.sqrt(q_WB.dot(q_WB))
     if not 1e-9 < norm < math.inf:
         raise ValueError(
             f"the attitude quaternion q_WB = {q_WB.tolist()} has length {norm} and is no rotation; "
             "set entries 6 to 9 of the state to a unit quaternion (w, x, y, z)"
         )
-    return RigidTransform(Quaternion(q_WB / norm), state[0:3])
+    return RigidTransform(Quaternion(q_WB / norm), p_WB)
 
 
 class StateToPose(LeafSystem):
@@ -43,6 +45,9 @@ class StateToPose(LeafSystem):
 
     Evaluating ``pose`` raises ValueError if the quaternion is zero or not finite.
     """
+
+    state_input_port = input_port("state")
+    pose_output_port = output_port("pose")
 
     def __init__(self):
         super().__init__()

@@ -9,10 +9,12 @@ from pydrake.common import MemoryFile
 from pydrake.common.value import Value
 from pydrake.geometry import InMemoryMesh, Mesh, Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from splatpilot.systems.gltf import add_primitive, data_uri
+from splatpilot.systems.ports import input_port
+from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.visualization.flipbook import page_path, show_page
 
 
@@ -29,6 +31,8 @@ class CameraVisualizer(LeafSystem):
     Takes an image every `period` seconds and shows every `stride`-th. The picture is a child of the
     vehicle's Meshcat path, so it moves with the vehicle at X_BC and needs no pose of its own.
     """
+
+    color_image_input_port = input_port("color_image")
 
     def __init__(
         self,
@@ -66,6 +70,16 @@ class CameraVisualizer(LeafSystem):
         meshcat.SetTransform(path, X_BC)
         edges = np.stack([np.zeros((4, 3)), self._p_CCorners], axis=1).reshape(8, 3)
         meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder, camera: SplatCamera, meshcat: Meshcat, period: float = 1 / 15
+    ) -> "CameraVisualizer":
+        """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
+        visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
+        builder.AddNamedSystem("camera_visualizer", visualizer)
+        builder.Connect(camera.color_image_output_port(), visualizer.color_image_input_port())
+        return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()

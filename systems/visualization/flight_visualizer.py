@@ -3,9 +3,11 @@
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
 
-from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size
+from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
+from splatpilot.systems.ports import input_port
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.systems.visualization.flipbook import page_path, show_page
 
@@ -25,6 +27,9 @@ class FlightVisualizer(LeafSystem):
     is expected at `<path>/vehicle` (see `draw_vehicle`); hypotheses run from green (cheapest) to
     red (dearest).
     """
+
+    state_input_port = input_port("state")
+    hypotheses_input_port = input_port("hypotheses")
 
     def __init__(
         self,
@@ -54,11 +59,28 @@ class FlightVisualizer(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember_position)
 
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder,
+        state_port: OutputPort,
+        meshcat: Meshcat,
+        hypotheses_port: OutputPort | None = None,
+    ) -> "FlightVisualizer":
+        """Adds a visualizer, named `flight_visualizer`, of a state and perhaps of hypotheses."""
+        count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
+        visualizer = FlightVisualizer(meshcat, count)
+        builder.AddNamedSystem("flight_visualizer", visualizer)
+        builder.Connect(state_port, visualizer.state_input_port())
+        if hypotheses_port is not None:
+            builder.Connect(hypotheses_port, visualizer.hypotheses_input_port())
+        return visualizer
+
     def _evaluated(self, port: str, context: Context) -> np.ndarray:
         return np.asarray(self.GetInputPort(port).Eval(context))
 
     def _remember_position(self, context: Context, discrete_state) -> EventStatus:
-        discrete_state.set_value(self._evaluated("state", context)[:3])
+        state = self._evaluated("state", context)
+        discrete_state.set_value(QuadrotorState.of(state).p_WB)
         return EventStatus.Succeeded()
 
     def _publish(self, context: Context) -> EventStatus:

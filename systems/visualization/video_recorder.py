@@ -7,11 +7,13 @@ from typing import cast
 import cv2
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
 from tqdm import tqdm
 
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.ports import input_port
+from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 class VideoRecorder(LeafSystem):
@@ -30,6 +32,9 @@ class VideoRecorder(LeafSystem):
     recorder it writes outside the Context: one recorder is for one simulation at a time.
     """
 
+    color_image_input_port = input_port("color_image")
+    depth_image_16u_input_port = input_port("depth_image_16u")
+
     def __init__(self, width: int, height: int, fps: float):
         """
         Args:
@@ -46,6 +51,16 @@ class VideoRecorder(LeafSystem):
         self.DeclareAbstractInputPort("depth_image_16u", Value(ImageDepth16U(width, height)))
         self.DeclareInitializationPublishEvent(self._clear)
         self.DeclarePeriodicPublishEvent(1 / fps, 0.0, self._record)
+
+    @staticmethod
+    def AddToBuilder(builder: DiagramBuilder, camera: SplatCamera, fps: float) -> "VideoRecorder":
+        """Adds a recorder, named `video`, of the images of a camera."""
+        info = camera.camera_info()
+        recorder = VideoRecorder(info.width(), info.height(), fps)
+        builder.AddNamedSystem("video", recorder)
+        builder.Connect(camera.color_image_output_port(), recorder.color_image_input_port())
+        builder.Connect(camera.depth_image_16u_output_port(), recorder.depth_image_16u_input_port())
+        return recorder
 
     def _clear(self, context: Context) -> EventStatus:
         self._file.seek(0)

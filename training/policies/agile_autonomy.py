@@ -33,14 +33,22 @@ from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.agile_pilot import LOOKAHEAD, AgilePilot, reaching
-from splatpilot.training.policies.courses import CourseSelection, training_fields, validation_fields
-from splatpilot.training.policies.evaluation import FlightConditions, fly_courses, look
-from splatpilot.training.policies.fields import STARTS, Fields
+from splatpilot.training.policies.agile_autonomy_agent import (
+    LOOKAHEAD,
+    AgileAutonomyAgent,
+    reaching_acceleration,
+)
+from splatpilot.training.policies.evaluation import FlightConditions, evaluate_agent, render_depth
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, ObservationNoise
 from splatpilot.training.policies.train import Schedule
+from splatpilot.training.policies.training_worlds import (
+    WorldSelection,
+    training_worlds,
+    validation_worlds,
+)
 from splatpilot.training.policies.vehicles import BodyRate
+from splatpilot.training.policies.world_batch import STARTS, WorldBatch
 
 EPSILON = 0.05
 """Part of an expert's pull on the hypotheses that are not the closest to it."""
@@ -49,7 +57,7 @@ _WORSE = 1.5  # [s] of cost by which an expert's trajectory may be worse than it
 
 
 @dataclass
-class AgileTraining:
+class AgileAutonomyTraining:
     """A training run."""
 
     # Seed of everything random, 0 to 999.
@@ -59,7 +67,7 @@ class AgileTraining:
     schedule: Schedule = field(
         default_factory=lambda: Schedule(updates=14_000, validate_every=1000, checkpoint_every=1000)
     )
-    courses: CourseSelection = field(default_factory=CourseSelection)
+    worlds: WorldSelection = field(default_factory=WorldSelection)
     # [-] Rounds of data: in the first the expert flies, then the student more and more.
     rounds: int = 8
     # [-] Updates between rounds.
@@ -83,7 +91,7 @@ class AgileTraining:
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         self.schedule.validate()
-        self.courses.validate()
+        self.worlds.validate()
         for name in ("rounds", "round_updates", "environments", "steps", "ask_every", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
@@ -91,40 +99,40 @@ class AgileTraining:
             raise ValueError(f"speeds is {self.speeds}; give one or more of 0.1 to 10 m/s")
 
 
-class AgileTrainee:
-    """See `splatpilot.training.policies.train.Trainee`."""
+class AgileAutonomyTrainer:
+    """See `splatpilot.training.policies.train.Trainer`."""
 
     policy = "agile_autonomy"
 
-    def __init__(self, config: AgileTraining) -> None:
+    def __init__(self, config: AgileAutonomyTraining) -> None:
         self._config = config
         self.spec = AGILE_NETWORK
         self.network = TrajectoryModule(self.spec).to(config.device)
-        self._pilot = AgilePilot(self.network, config.device)
+        self._agent = AgileAutonomyAgent(self.network, config.device)
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
-        self._fields = training_fields(config.courses, config.seed, config.device)
-        self._validation = validation_fields(config.courses, config.device)
+        self._worlds = training_worlds(config.worlds, config.seed, config.device)
+        self._validation = validation_worlds(config.worlds, config.device)
         self._lattices = [TrajectoryLattice(LatticeConfig(speed=s)) for s in config.speeds]
         self._data: dict[str, Tensor] = {}
 
-    def begin(self, update: int) -> None:
+    def begin_update(self, update: int) -> None:
         config = self._config
         number, within = divmod(update, config.round_updates)
         if within == 0 and number < config.rounds:
             student = number / config.rounds  # part of the vehicles that the student flies
-            new = self._collected(student, first_world=number * config.environments)
+            new = self._collect(student, first_world=number * config.environments)
             if self._data:
                 new = {name: torch.cat([self._data[name], new[name]]) for name in new}
             self._data = new
 
-    def lesson(self) -> dict[str, Tensor]:
+    def losses(self) -> dict[str, Tensor]:
         config, data = self._config, self._data
         chosen = torch.randint(
             len(data["state"]), (config.batch,), generator=self._generator, device=config.device
         )
         sample = {name: values[chosen] for name, values in data.items()}
         spec = self.spec
-        depth = config.noise.disturbed(sample["depth"].float(), self._generator)
+        depth = config.noise.disturb(sample["depth"].float(), self._generator)
         image = (1.0 / depth.clamp(NEAREST, FARTHEST)).reshape(
             -1, spec.image_height, spec.image_width
         )
@@ -141,16 +149,16 @@ class AgileTrainee:
             "cost": config.cost_weight * (costs - target).square().sum(1).mean(),
         }
 
-    def measured(self) -> dict[str, float]:
+    def evaluate(self) -> dict[str, float]:
         config = self._config
-        return fly_courses(self._pilot, self._validation, config.validation, config.noise).measures(
-            config.courses.kinds
-        )
+        return evaluate_agent(
+            self._agent, self._validation, config.validation, config.noise
+        ).measures(config.worlds.kinds)
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {"data": self._data, "generator": self._generator.get_state()}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         self._data = state["data"]
         self._generator.set_state(state["generator"])
 
@@ -160,29 +168,29 @@ class AgileTrainee:
         N, M = waypoints_B.shape[:2]
         points = waypoints_B.flatten(1, 2) @ sample["R_WB"].mT + sample["p_WB"][:, None]
         world = sample["world"].repeat_interleave(points.shape[1])
-        clearance = self._fields.distance(points.flatten(0, 1), world) - VEHICLE_RADIUS
+        clearance = self._worlds.distance(points.flatten(0, 1), world) - VEHICLE_RADIUS
         return collision_cost(clearance).reshape(N, M, -1).mean(2)
 
     @torch.no_grad()
-    def _collected(self, student: float, first_world: int) -> dict[str, Tensor]:
+    def _collect(self, student: float, first_world: int) -> dict[str, Tensor]:
         """Observations, and what the expert would do, while both fly."""
-        config, fields = self._config, self._fields
+        config, worlds = self._config, self._worlds
         N, device = config.environments, config.device
-        world = (first_world + torch.arange(N, device=device)) % len(fields)
-        primitives, p_WG = fields.primitives.of(world), fields.p_WG[world]
+        world = (first_world + torch.arange(N, device=device)) % len(worlds)
+        primitives, p_WG = worlds.primitives.select(world), worlds.p_WG[world]
         which = torch.randint(len(config.speeds), (N,), generator=self._generator, device=device)
         speed = torch.tensor(config.speeds, device=device)[which]
         control = FlatnessControllerConfig()
-        vehicle, by_student = self._started(fields, world, student)
+        vehicle, by_student = self._start(worlds, world, student)
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
         for step in range(config.steps):
             distances, _ = primitives.near(vehicle.p)
             ended = (distances.amin(1) < VEHICLE_RADIUS) | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
-            inside = (vehicle.p > fields.lower_W[world]) & (vehicle.p < fields.upper_W[world])
+            inside = (vehicle.p > worlds.lower_W[world]) & (vehicle.p < worlds.upper_W[world])
             ended |= ~inside.all(1)
             if ended.any():
-                fresh, flown = self._started(fields, world, student)
+                fresh, flown = self._start(worlds, world, student)
                 vehicle = BodyRate(
                     *(
                         torch.where(ended[:, None], a, b)
@@ -192,7 +200,7 @@ class AgileTrainee:
                 by_student = torch.where(ended, flown, by_student)
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
                 distances, _ = primitives.near(vehicle.p)
-            depth, R_WB = look(vehicle, primitives, self._pilot.grid, distances)
+            depth, R_WB = render_depth(vehicle, primitives, self._agent.grid, distances)
             seen = Observation(depth, vehicle, R_WB, p_WG, speed)
             asked = step % config.ask_every == 0
             if asked:
@@ -200,7 +208,7 @@ class AgileTrainee:
                 best = experts[:, 0] @ R_WB.mT + vehicle.p[:, None]
                 hold = best[:, -1:].expand(-1, config.ask_every, -1)
                 tracked = torch.where(valid[:, None, None], torch.cat([best, hold], 1), tracked)
-                _, state = self._pilot.observe(seen)
+                _, state = self._agent.observe(seen)
                 worse = costs - costs[:, :1]
                 sample = {
                     "depth": depth.half(),
@@ -216,18 +224,20 @@ class AgileTrainee:
             along = LOOKAHEAD + (step % config.ask_every) * 2.0 / 3.0
             i, part = int(along), along - int(along)
             p_WR = (1.0 - part) * tracked[:, i] + part * tracked[:, i + 1]
-            noisy = seen._replace(depth=config.noise.disturbed(depth, self._generator))
-            of_student, _, _ = self._pilot.decide(noisy, self._pilot.initial_memory(N))
-            a_cmd = torch.where(by_student[:, None], of_student, reaching(p_WR, vehicle))
+            noisy = seen._replace(depth=config.noise.disturb(depth, self._generator))
+            of_student, _, _ = self._agent.decide(noisy, self._agent.initial_memory(N))
+            a_cmd = torch.where(
+                by_student[:, None], of_student, reaching_acceleration(p_WR, vehicle)
+            )
             vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE, control)
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
-    def _started(self, fields: Fields, world: Tensor, student: float) -> tuple[BodyRate, Tensor]:
+    def _start(self, worlds: WorldBatch, world: Tensor, student: float) -> tuple[BodyRate, Tensor]:
         """Vehicles at rest anywhere in their worlds, and which of them the student flies."""
         N, device = len(world), world.device
         draws = torch.rand(N, 3, generator=self._generator, device=device)
-        p = fields.starts_W[world, (draws[:, 0] * STARTS).long().clamp(max=STARTS - 1)]
-        way = fields.way(p, world)
+        p = worlds.starts_W[world, (draws[:, 0] * STARTS).long().clamp(max=STARTS - 1)]
+        way = worlds.way(p, world)
         yaw = torch.atan2(way[:, 1], way[:, 0]) + 1.5 * (draws[:, 1] - 0.5)
         return BodyRate.hovering(p, yaw), draws[:, 2] < student
 
@@ -240,7 +250,7 @@ class AgileTrainee:
         valid = torch.zeros(N, dtype=torch.bool)
         experts, costs = torch.zeros(N, 3, NUM_WAYPOINTS, 3), torch.zeros(N, 3)
         for n, state in enumerate(vehicle.state.double().cpu().numpy()):
-            esdf, toa = self._fields.maps[int(world[n])]
+            esdf, toa = self._worlds.maps[int(world[n])]
             try:
                 best = plan(0.0, state, esdf, toa, self._lattices[int(which[n])])
             except ValueError:  # no way leads on from here

@@ -31,11 +31,11 @@ from splatpilot.systems.policies.depthnav_inference import (
 )
 from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
 from splatpilot.training.policies import observation
-from splatpilot.training.policies.flight_trainee import FlightTraining
+from splatpilot.training.policies.differentiable_rollout import RolloutConfig, Transition
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import Observation
 from splatpilot.training.policies.ray_casting import PinholeGrid
-from splatpilot.training.policies.through_dynamics import FlightSchool, Moment
+from splatpilot.training.policies.rollout_trainer import RolloutTraining
 from splatpilot.training.policies.train import Schedule
 
 
@@ -58,19 +58,19 @@ class DepthNavLoss:
 
 
 @dataclass
-class DepthNavTraining(FlightTraining):
+class DepthNavTraining(RolloutTraining):
     """A training run."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=4000, validate_every=500))
-    school: FlightSchool = field(
-        default_factory=lambda: FlightSchool(environments=32, steps=40, averaging=0.5)
+    rollout: RolloutConfig = field(
+        default_factory=lambda: RolloutConfig(environments=32, steps=40, averaging=0.5)
     )
     empty: float = 0.05
     loss: DepthNavLoss = field(default_factory=DepthNavLoss)
 
 
 class DepthNavLearner:
-    """See `splatpilot.training.policies.through_dynamics.Learner`."""
+    """See `splatpilot.training.policies.differentiable_rollout.Learner`."""
 
     rate = RATE
 
@@ -99,12 +99,12 @@ class DepthNavLearner:
         R_WS = observation.heading_frame(start_yaw)
         image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
         v_target = observation.target_velocity(vehicle.p, seen.p_WG, speed)
-        q_SB = quaternion_of(R_WS.mT @ seen.R_WB)
+        q_SB = quaternion_from_rotation(R_WS.mT @ seen.R_WB)
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)
         output, hidden = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
         )
-        a_S = observation.limited_acceleration(output[:, :3], self._limits)
+        a_S = observation.limit_acceleration(output[:, :3], self._limits)
         to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
         heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
         return (
@@ -113,28 +113,28 @@ class DepthNavLearner:
             torch.cat([hidden, start_yaw[:, None]], 1),
         )
 
-    def losses(self, moment: Moment) -> dict[str, Tensor]:
+    def losses(self, transition: Transition) -> dict[str, Tensor]:
         weights = self._loss
-        d, approach = moment.clearance[:, 0], moment.approach[:, 0].clamp(min=0.0)
+        d, approach = transition.clearance[:, 0], transition.approach[:, 0].clamp(min=0.0)
         collision = approach * (1.0 - d).clamp(min=0.0).square()
         collision = collision + 2.5 * torch.nn.functional.softplus(-6.0 * d)
         velocity = torch.nn.functional.smooth_l1_loss(
-            moment.v_mean, moment.v_target, reduction="none"
+            transition.v_mean, transition.v_target, reduction="none"
         )
-        assert moment.heading is not None
-        way = torch.atan2(moment.v_target[:, 1], moment.v_target[:, 0])
+        assert transition.heading is not None
+        way = torch.atan2(transition.v_target[:, 1], transition.v_target[:, 0])
         terms = {
             "velocity": velocity.sum(1),
             "collision": collision,
-            "acceleration": moment.a.square().sum(1),
-            "jerk": moment.jerk.square().sum(1),
-            "rate": moment.jerk[:, :2].square().sum(1) / GRAVITY**2,
-            "yaw": 1.0 - torch.cos(moment.heading - way),
+            "acceleration": transition.a.square().sum(1),
+            "jerk": transition.jerk.square().sum(1),
+            "rate": transition.jerk[:, :2].square().sum(1) / GRAVITY**2,
+            "yaw": 1.0 - torch.cos(transition.heading - way),
         }
         return {name: getattr(weights, name) * term.mean() for name, term in terms.items()}
 
 
-def quaternion_of(R: Tensor) -> Tensor:
+def quaternion_from_rotation(R: Tensor) -> Tensor:
     """The quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable.
 
     Of the four ways to take square roots, each row takes the one whose root is largest.

@@ -30,11 +30,11 @@ from splatpilot.systems.policies.diffaero_inference import (
     RATE,
 )
 from splatpilot.training.policies import observation
-from splatpilot.training.policies.flight_trainee import FlightTraining
+from splatpilot.training.policies.differentiable_rollout import Transition
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import Observation
 from splatpilot.training.policies.ray_casting import PinholeGrid
-from splatpilot.training.policies.through_dynamics import Moment
+from splatpilot.training.policies.rollout_trainer import RolloutTraining
 from splatpilot.training.policies.train import Schedule
 
 
@@ -57,7 +57,7 @@ class DiffAeroLoss:
 
 
 @dataclass
-class DiffAeroTraining(FlightTraining):
+class DiffAeroTraining(RolloutTraining):
     """A training run."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=8000, validate_every=500))
@@ -65,7 +65,7 @@ class DiffAeroTraining(FlightTraining):
 
 
 class DiffAeroLearner:
-    """See `splatpilot.training.policies.through_dynamics.Learner`."""
+    """See `splatpilot.training.policies.differentiable_rollout.Learner`."""
 
     rate = RATE
 
@@ -87,22 +87,22 @@ class DiffAeroLearner:
         output, memory = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory
         )
-        a_H = observation.limited_acceleration(output, self._limits)
+        a_H = observation.limit_acceleration(output, self._limits)
         return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
 
-    def losses(self, moment: Moment) -> dict[str, Tensor]:
+    def losses(self, transition: Transition) -> dict[str, Tensor]:
         weights = self._loss
-        d = moment.clearance - weights.margin
-        approach = moment.approach.clamp(min=0.0)
+        d = transition.clearance - weights.margin
+        approach = transition.approach.clamp(min=0.0)
         clearance = (approach * (1.0 - d).clamp(min=0.0).square()).sum(1).mean()
         contact = (approach * torch.nn.functional.softplus(-32.0 * d) / 4.0).sum(1).mean()
         velocity = torch.nn.functional.smooth_l1_loss(
-            moment.v_mean, moment.v_target, reduction="none"
+            transition.v_mean, transition.v_target, reduction="none"
         )
         return {
             "velocity": weights.velocity * velocity.sum(1).mean(),
             "clearance": weights.clearance * clearance,
             "contact": weights.contact * contact,
-            "acceleration": weights.acceleration * moment.a.square().sum(1).mean(),
-            "jerk": weights.jerk * moment.jerk.square().sum(1).mean(),
+            "acceleration": weights.acceleration * transition.a.square().sum(1).mean(),
+            "jerk": weights.jerk * transition.jerk.square().sum(1).mean(),
         }

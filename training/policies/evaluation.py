@@ -1,4 +1,4 @@
-"""Flights of a policy along courses, many at once: how it does without being trained."""
+"""Flights of a policy through worlds, many at once: how well it does."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -8,17 +8,17 @@ from torch import Tensor
 
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.fields import Fields
 from splatpilot.training.policies.observation import Observation, ObservationNoise
 from splatpilot.training.policies.primitives import Primitives
 from splatpilot.training.policies.ray_casting import PinholeGrid
 from splatpilot.training.policies.vehicles import BodyRate, PointMass, Vehicle
+from splatpilot.training.policies.world_batch import WorldBatch
 
 CAMERA_AHEAD = 0.1
 """[m], of the camera before the vehicle's centre, along body x."""
 
 
-class Pilot(Protocol):
+class Agent(Protocol):
     """What observes through a camera and decides, for N vehicles at once."""
 
     rate: float  # [Hz]
@@ -33,7 +33,7 @@ class Pilot(Protocol):
         ...
 
 
-def look(
+def render_depth(
     vehicle: Vehicle, primitives: Primitives, grid: PinholeGrid, distances: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Depth (N, R) [m] from the vehicles' cameras, and their attitudes R_WB (N, 3, 3)."""
@@ -88,40 +88,40 @@ class FlightConditions:
 
 
 @torch.no_grad()
-def fly_courses(
-    pilot: Pilot,
-    fields: Fields,
+def evaluate_agent(
+    agent: Agent,
+    worlds: WorldBatch,
     conditions: FlightConditions,
     noise: ObservationNoise | None = None,
     seed: int = 0,
 ) -> Outcomes:
-    """Flies every course once from its start, at rest, level and facing the goal."""
-    device = fields.p_WS.device
+    """Flies every world once from its start, at rest, level and facing the goal."""
+    device = worlds.p_WS.device
     generator = torch.Generator(device).manual_seed(seed)
-    count = len(fields)
-    p_WG, to_goal = fields.p_WG, fields.p_WG - fields.p_WS
+    count = len(worlds)
+    p_WG, to_goal = worlds.p_WG, worlds.p_WG - worlds.p_WS
     yaw = torch.atan2(to_goal[:, 1], to_goal[:, 0])
     zero = torch.zeros_like(p_WG)
     if conditions.body_rate:
-        vehicle: Vehicle = BodyRate.hovering(fields.p_WS, yaw)
+        vehicle: Vehicle = BodyRate.hovering(worlds.p_WS, yaw)
     else:
         lag = torch.full((count, 1), conditions.lag, device=device)
-        vehicle = PointMass(fields.p_WS, zero, zero, yaw, lag)
-    memory, control = pilot.initial_memory(count), FlatnessControllerConfig()
+        vehicle = PointMass(worlds.p_WS, zero, zero, yaw, lag)
+    memory, control = agent.initial_memory(count), FlatnessControllerConfig()
     speed = torch.full((count,), conditions.speed, device=device)
 
     reached, collided, left = (torch.zeros(count, dtype=torch.bool, device=device) for _ in "rcl")
     clearance = torch.full((count,), torch.inf, device=device)
     path, time = torch.zeros(count, device=device), torch.zeros(count, device=device)
     flying = torch.arange(count, device=device)
-    primitives = fields.primitives.of(flying)
+    primitives = worlds.primitives.select(flying)
     limit = conditions.patience * to_goal.norm(dim=1) / conditions.speed
-    dt = 1.0 / pilot.rate
+    dt = 1.0 / agent.rate
     while len(flying):
         distances, _ = primitives.near(vehicle.p)
         here = distances.amin(1) - VEHICLE_RADIUS
         clearance[flying] = torch.minimum(clearance[flying], here)
-        inside = (vehicle.p > fields.lower_W[flying]) & (vehicle.p < fields.upper_W[flying])
+        inside = (vehicle.p > worlds.lower_W[flying]) & (vehicle.p < worlds.upper_W[flying])
         collided[flying] = here < 0.0
         left[flying] = ~inside.all(1) & ~collided[flying]
         done = (vehicle.p - p_WG[flying]).norm(dim=1) < conditions.goal_radius
@@ -131,13 +131,13 @@ def fly_courses(
             keep = (~ended).nonzero()[:, 0]
             flying, memory, distances = flying[keep], memory[keep], distances[keep]
             vehicle = type(vehicle)(*(x[keep] for x in vehicle))
-            primitives = fields.primitives.of(flying)
+            primitives = worlds.primitives.select(flying)
             continue
-        depth, R_WB = look(vehicle, primitives, pilot.grid, distances)
+        depth, R_WB = render_depth(vehicle, primitives, agent.grid, distances)
         if noise is not None:
-            depth = noise.disturbed(depth, generator)
+            depth = noise.disturb(depth, generator)
         seen = Observation(depth, vehicle, R_WB, p_WG[flying], speed[flying])
-        a_cmd, heading, memory = pilot.decide(seen, memory)
+        a_cmd, heading, memory = agent.decide(seen, memory)
         before = vehicle.p
         vehicle = vehicle.step(a_cmd, dt, control, heading)
         path[flying] += (vehicle.p - before).norm(dim=1)

@@ -22,7 +22,7 @@ class ExpertConfig:
     """Who flies, how fast, and how often is asked."""
 
     # A policy of the benchmark: `planner`, which knows the way, or one that flies by depth.
-    pilot: str = "planner"
+    policy: str = "planner"
     # [m/s]
     speed: float = 2.0
     # [s] Between two labelled states.
@@ -32,7 +32,7 @@ class ExpertConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        policy_named(self.pilot, self.speed)
+        policy_named(self.policy, self.speed)
         if not 0.02 <= self.period <= 10.0:
             raise ValueError(f"period is {self.period} s; it must be 0.02 to 10")
         LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses).validate()
@@ -97,14 +97,14 @@ def expert_rollout(scenario: Scenario, world: World, config: ExpertConfig) -> Ex
         ValueError: on a config out of range, or a scenario that cannot be flown.
     """
     config.validate()
-    scenario = replace(scenario, policy=policy_named(config.pilot, config.speed))
+    scenario = replace(scenario, policy=policy_named(config.policy, config.speed))
     scenario.validate()
     labeller = Labeller(world.esdf, goal_of(scenario, world), config, scenario.vehicle)
     flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
     if flight.outcome is not Outcome.GOAL or not np.nanmin(flight.clearances) > 0.0:
         return None
-    moments = np.arange(0.0, flight.times[-1], config.period)
-    rows = np.searchsorted(flight.times, moments - 1e-9)
+    times = np.arange(0.0, flight.times[-1], config.period)
+    rows = np.searchsorted(flight.times, times - 1e-9)
     labels = [labeller.label(float(flight.times[row]), flight.states[row]) for row in rows]
     return ExpertRollout(
         flight,

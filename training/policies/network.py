@@ -45,7 +45,7 @@ class TrainableNetwork(nn.Module):
 
 class TrajectoryModule(nn.Module):
     """The network of a `TrajectoryNetworkSpec`, with the names of weights that
-    `systems.policies.agile_policy.TrajectoryNetwork` takes."""
+    `systems.policies.agile_autonomy_inference.TrajectoryNetwork` takes."""
 
     def __init__(self, spec: TrajectoryNetworkSpec) -> None:
         super().__init__()

@@ -10,7 +10,7 @@ from splatpilot.training.policies.vehicles import Vehicle
 
 
 class Observation(NamedTuple):
-    """What N vehicles know at one moment."""
+    """What N vehicles know at one transition."""
 
     depth: Tensor  # (N, R) [m], planar, inf beyond
     vehicle: Vehicle
@@ -30,7 +30,7 @@ class ObservationNoise:
     # [-] Part of the pixels that read nothing, which is as far as can be seen.
     dropout: float = 0.01
 
-    def disturbed(self, depth: Tensor, generator: torch.Generator) -> Tensor:
+    def disturb(self, depth: Tensor, generator: torch.Generator) -> Tensor:
         """Planar depth (N, R) [m] as a worse camera measures it."""
         normal = torch.empty_like(depth).normal_(generator=generator)
         depth = depth * (1.0 + self.scale * normal)
@@ -41,17 +41,20 @@ class ObservationNoise:
 
 
 def inverse_depth(depth: Tensor, nearest: float, farthest: float) -> Tensor:
+    """Planar depth (...,) [m] as 3 / z - 0.6, z within [nearest, farthest]."""
     return 3.0 / depth.clamp(nearest, farthest) - 0.6
 
 
 def target_velocity(p: Tensor, p_WG: Tensor, speed: Tensor, slowing_time: float = 1.0) -> Tensor:
+    """The velocities (N, 3) [m/s] from p (N, 3) straight to p_WG (N, 3) [m], at `speed` (N,) [m/s]
+    until `slowing_time` [s] before it."""
     to_goal = p_WG - p
     distance = to_goal.square().sum(1, keepdim=True).clamp(min=1e-6).sqrt()
     return to_goal / (distance / speed[:, None]).clamp(min=slowing_time)
 
 
 def heading_frame(yaw: Tensor) -> Tensor:
-    """R_WH (N, 3, 3)."""
+    """R_WH (N, 3, 3) of vehicles that head for `yaw` (N,) [rad]: about z alone."""
     cos, sin = torch.cos(yaw), torch.sin(yaw)
     zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
     return torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], 1).reshape(-1, 3, 3)
@@ -64,5 +67,6 @@ def heading_observation(seen: Observation, R_WH: Tensor) -> Tensor:
     return (rows @ R_WH).flatten(1)
 
 
-def limited_acceleration(output: Tensor, limits: Tensor) -> Tensor:
+def limit_acceleration(output: Tensor, limits: Tensor) -> Tensor:
+    """Outputs (N, 3) of a network as accelerations [m/s^2] within +-limits (3,), smoothly."""
     return limits * torch.tanh(output / limits)

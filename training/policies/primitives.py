@@ -71,7 +71,7 @@ class Primitives:
         """All there is, kind by kind."""
         return [self.spheres, self.cylinders, self.boxes, self.planes]
 
-    def of(self, world: Tensor) -> "Primitives":
+    def select(self, world: Tensor) -> "Primitives":
         """The shapes of the worlds numbered `world` (N,)."""
         chosen = object.__new__(Primitives)
         chosen.spheres, chosen.cylinders, chosen.boxes, chosen.planes = (
@@ -80,7 +80,7 @@ class Primitives:
         chosen._has = self._has[world]
         return chosen
 
-    def removed(self) -> "Primitives":
+    def without_obstacles(self) -> "Primitives":
         """As many worlds with nothing but their planes, the ground."""
         empty = object.__new__(Primitives)
         empty.spheres, empty.cylinders, empty.boxes = (

@@ -50,13 +50,18 @@ def _footprint(away: Tensor, forward: Tensor, half_pixel: float) -> Tensor:
     return half_pixel * planar.square() / away.square().sum(1).sqrt().clamp(min=1e-3)
 
 
-# Casts take cameras at p (N, 3) [m] with axes R (N, 3, 3), rays (N, 3, R) of depth 1 in W, shapes
-# (N, P, M) as `Primitives` has them, and half the width of a pixel at depth 1; they return depth
-# (N, R) [m], from MISS on where nothing is hit. They work on arrays (N, M, R), a ray's step from
-# one number to the next: that is fastest on CPUs.
-
-
 def cast_spheres(p: Tensor, R: Tensor, rays: Tensor, spheres: Tensor, half_pixel: float) -> Tensor:
+    """Depth (N, R) [m] along rays to spheres, at least `MISS` where none is hit.
+
+    As all casts it works on arrays (N, M, R), a ray's step from one number to the next: that is
+    fastest on CPUs.
+
+    Args:
+        p, R: (N, 3) [m] and (N, 3, 3), the cameras.
+        rays: (N, 3, R), in W and of depth 1.
+        spheres: (N, 4, M): centre and radius [m].
+        half_pixel: half the width of a pixel at depth 1.
+    """
     m = p[:, :, None] - spheres[:, :3]  # (N, 3, M)
     extra = _footprint(-m, R[:, :, 2], half_pixel)
     c = m.square().sum(1) - (spheres[:, 3] + extra).square()  # (N, M)
@@ -71,6 +76,8 @@ def cast_spheres(p: Tensor, R: Tensor, rays: Tensor, spheres: Tensor, half_pixel
 def cast_cylinders(
     p: Tensor, R: Tensor, rays: Tensor, cylinders: Tensor, half_pixel: float
 ) -> Tensor:
+    """Depth (N, R) [m] to cylinders (N, 8, M): centre [m], axis, half length and radius [m]; see
+    `cast_spheres`."""
     axis, half, radius = cylinders[:, 3:6], cylinders[:, 6], cylinders[:, 7]
     m = p[:, :, None] - cylinders[:, :3]
     along = (m * axis).sum(1)  # (N, M)
@@ -94,6 +101,8 @@ def cast_cylinders(
 
 
 def cast_boxes(p: Tensor, R: Tensor, rays: Tensor, boxes: Tensor, half_pixel: float) -> Tensor:
+    """Depth (N, R) [m] to boxes (N, 15, M): centre [m], rotation (world by own axes) row by row and
+    half sizes [m]; see `cast_spheres`."""
     N, _, M = boxes.shape
     rotation = boxes[:, 3:12].reshape(N, 3, 3, M)
     m = p[:, :, None] - boxes[:, :3]
@@ -113,6 +122,8 @@ def cast_boxes(p: Tensor, R: Tensor, rays: Tensor, boxes: Tensor, half_pixel: fl
 
 
 def cast_planes(p: Tensor, R: Tensor, rays: Tensor, planes: Tensor, half_pixel: float) -> Tensor:
+    """Depth (N, R) [m] to half spaces (N, 4, M): outward normal and offset [m]; infinite where
+    none is hit; see `cast_spheres`."""
     normal = planes[:, :3]
     height = (p[:, :, None] * normal).sum(1) - planes[:, 3]  # (N, M)
     tilt = torch.bmm(normal.mT, R[:, :, :2]).abs().sum(2)  # a pixel's corner looks further down

@@ -1,34 +1,54 @@
-"""All policies that can be trained, by their names in the benchmark."""
+"""All policies that can be trained, by their names."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
-from splatpilot.training.policies.agile_autonomy import AgileTrainee, AgileTraining
+from splatpilot.systems.registry import Registry
+from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
 from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
-from splatpilot.training.policies.flight_trainee import FlightTrainee
-from splatpilot.training.policies.train import Trainee
+from splatpilot.training.policies.rollout_trainer import RolloutTrainer
+from splatpilot.training.policies.train import Trainer
 
 
-class Recipe(NamedTuple):
+@dataclass(frozen=True)
+class TrainerKind:
     """How a policy is trained."""
 
     config: type
-    """Its configuration, a dataclass."""
-    make: Callable[[Any], Trainee]
-    """What that configuration makes."""
+    """The type of its configurations, a dataclass with what `TrainingConfig` has."""
+    make: Callable[[Any], Trainer]
+    """From a configuration to its trainer."""
 
 
-def _diffaero(config: DiffAeroTraining) -> Trainee:
-    return FlightTrainee("diffaero", DiffAeroLearner(config.loss, config.device), config)
+TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerKind)
+"""All trainers, by the names of their policies."""
 
 
-def _depthnav(config: DepthNavTraining) -> Trainee:
-    return FlightTrainee("depthnav", DepthNavLearner(config.loss, config.device), config)
+def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) -> None:
+    """
+    Makes a trainer known, so that `splatpilot train` can name it.
+
+    Args:
+        name: of the policy.
+        config: the type of its configurations, see `splatpilot.training.policies.train`.
+        make: from a configuration to a `Trainer`.
+
+    Raises:
+        ValueError: if another trainer has the name.
+    """
+    TRAINERS.add(name, TrainerKind(config, make))
 
 
-RECIPES = {
-    "diffaero": Recipe(DiffAeroTraining, _diffaero),
-    "depthnav": Recipe(DepthNavTraining, _depthnav),
-    "agile_autonomy": Recipe(AgileTraining, AgileTrainee),
-}
+register_trainer(
+    "diffaero",
+    DiffAeroTraining,
+    lambda config: RolloutTrainer("diffaero", DiffAeroLearner(config.loss, config.device), config),
+)
+register_trainer(
+    "depthnav",
+    DepthNavTraining,
+    lambda config: RolloutTrainer("depthnav", DepthNavLearner(config.loss, config.device), config),
+)
+register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)

@@ -26,7 +26,7 @@ class RunFolder:
     """Of the source this runs from, with `-dirty` if it was changed; or unknown."""
 
     @classmethod
-    def claimed(cls, path: Path, config: Any) -> Self:
+    def claim(cls, path: Path, config: Any) -> Self:
         """Makes `path` the folder of a run of `config`, which it may be already.
 
         Raises:
@@ -82,9 +82,9 @@ class RunFolder:
 
 Made by `splatpilot train {policy} --out DIR --config CONFIG` with the configuration below at
 revision {self.revision} of the source, in {minutes:.1f} minutes of one core; {summary["updates"]}
-updates, of which the weights after {best["update"]} did best on held-out courses.
+updates, of which the weights after {best["update"]} did best on held-out worlds.
 
-| on held-out courses, simulated as in training | |
+| on held-out worlds, simulated as in training | |
 |---|---|
 {measures}
 

@@ -1,7 +1,8 @@
 """Training runs: any policy, resumable, with all that was done written beside the weights."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -10,8 +11,8 @@ import torch
 from tqdm import tqdm
 
 from splatpilot.systems.files import written_atomically
+from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
-from splatpilot.training.policies.through_dynamics import NotFiniteError
 
 
 @dataclass
@@ -20,7 +21,7 @@ class Schedule:
 
     # [-] Steps of the optimiser.
     updates: int = 1400
-    # [-] Updates between two measurements of the success on held-out courses; the weights of the
+    # [-] Updates between two measurements of the success on held-out worlds; the weights of the
     # best are kept.
     validate_every: int = 200
     # [-] Updates between two checkpoints that training goes on from when it was interrupted.
@@ -61,7 +62,7 @@ class TrainingConfig(Protocol):
     def validate(self) -> None: ...
 
 
-class Trainee(Protocol):
+class Trainer(Protocol):
     """A policy in training, whatever it learns from."""
 
     policy: str
@@ -70,24 +71,24 @@ class Trainee(Protocol):
     @property
     def network(self) -> torch.nn.Module: ...
 
-    def begin(self, update: int) -> None:
+    def begin_update(self, update: int) -> None:
         """Called before each update with its number."""
         ...
 
-    def lesson(self) -> dict[str, torch.Tensor]:
+    def losses(self) -> dict[str, torch.Tensor]:
         """The terms of the loss, differentiable by the network's weights."""
         ...
 
-    def measured(self) -> dict[str, float]:
-        """Success and more on held-out courses; `success` chooses among checkpoints."""
+    def evaluate(self) -> dict[str, float]:
+        """Success and more on held-out worlds; `success` chooses among checkpoints."""
         ...
 
-    def state(self) -> dict[str, Any]:
-        """Everything but weights that the next lesson depends on."""
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but weights that the next losses depend on."""
         ...
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """The inverse of `state`."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """The inverse of `state_dict`."""
         ...
 
 
@@ -102,13 +103,30 @@ class _Progress:
     curves: list[dict[str, float]] = field(default_factory=list)
 
 
+class NotFiniteError(ValueError):
+    """A term of the loss, or the gradient, became infinite or not a number."""
+
+
+@contextmanager
+def _single_thread() -> Iterator[None]:
+    """Lets torch use one thread: sums of several would depend on their number."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_single_thread()
 def run[Config: TrainingConfig](
-    *, config: Config, out: Path, make: Callable[[Config], Trainee]
+    *, config: Config, out: Path, make: Callable[[Config], Trainer]
 ) -> dict[str, Any]:
     """
-    Trains a policy, from where an interrupted run of the same configuration in `out` stopped.
+    Trains a policy on one thread, from where an interrupted run of the same configuration in `out`
+    stopped.
 
-    Leaves in `out`: `POLICY.npz`, the weights that did best on held-out courses, for
+    Leaves in `out`: `POLICY.npz`, the weights that did best on held-out worlds, for
     `PolicyCheckpoint`; `config.yaml`; `curves.csv`, the terms of the loss and the success over the
     updates; `POLICY.md`, a model card; `summary.json`; `checkpoint.pt`, to go on from.
 
@@ -116,7 +134,7 @@ def run[Config: TrainingConfig](
         config: with its seed it decides the result: on a CPU the same weights, bit for bit,
             however often the run was interrupted.
         out: folder.
-        make: builds what is trained from its configuration.
+        make: the trainer of that configuration.
 
     Returns:
         What `summary.json` says.
@@ -128,22 +146,20 @@ def run[Config: TrainingConfig](
         OSError: if `out` cannot be written.
     """
     config.validate()
-    folder = RunFolder.claimed(out, config)
+    folder = RunFolder.claim(out, config)
     schedule = config.schedule
-    torch.set_num_threads(1)  # Sums of several threads would depend on their number.
     started = time.process_time()
     torch.manual_seed(config.seed)
-    trainee = make(config)
-    network = trainee.network
+    trainer = make(config)
+    network = trainer.network
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
     )
     progress = _Progress()
     checkpoint = out / "checkpoint.pt"
     if checkpoint.exists():
-        progress = _resumed(checkpoint, trainee, optimizer)
+        progress = _resume(checkpoint, trainer, optimizer)
     spent_before = progress.cpu_seconds
-    writer = _tensorboard(out) if schedule.tensorboard else None
 
     def save() -> None:
         progress.cpu_seconds = spent_before + time.process_time() - started
@@ -153,23 +169,23 @@ def run[Config: TrainingConfig](
                     "progress": vars(progress),
                     "network": network.state_dict(),
                     "optimizer": optimizer.state_dict(),
-                    "trainee": trainee.state(),
+                    "trainer": trainer.state_dict(),
                 },
                 path,
             )
         folder.write_curves(progress.curves)
 
     bar = tqdm(
-        total=schedule.updates, initial=progress.update, desc=trainee.policy, unit="update",
+        total=schedule.updates, initial=progress.update, desc=trainer.policy, unit="update",
         disable=None,
     )  # fmt: skip
-    with bar:
+    with event_log(str(out) if schedule.tensorboard else "") as log, bar:
         while progress.update < schedule.updates:
             for group in optimizer.param_groups:
                 group["lr"] = schedule.learning_rate * schedule.factor(progress.update)
-            trainee.begin(progress.update)
+            trainer.begin_update(progress.update)
             try:
-                terms = descend(trainee.lesson, network, optimizer, schedule.clip)
+                terms = step_optimizer(trainer.losses, network, optimizer, schedule.clip)
             except NotFiniteError as error:
                 raise ValueError(
                     f"training stopped at update {progress.update}: {error}; the best weights so "
@@ -182,21 +198,19 @@ def run[Config: TrainingConfig](
                 means[name] = value if name not in means else 0.98 * means[name] + 0.02 * value
             due = progress.update % schedule.validate_every == 0
             if due or progress.update == schedule.updates:
-                measured = trainee.measured()
+                measured = trainer.evaluate()
                 row = {"update": float(progress.update), **means, **measured}
                 progress.curves.append(row)
                 bar.set_postfix(success=f"{measured['success']:.2f}")
-                if writer is not None:
-                    for name, value in row.items():
-                        writer.add_scalar(name, value, progress.update)
+                log(progress.update, row)
                 if measured["success"] >= progress.best.get("success", -1.0):
                     progress.best = {"update": progress.update, **measured}
-                    folder.write_weights(trainee.policy, trainee.spec, network, progress.best)
+                    folder.write_weights(trainer.policy, trainer.spec, network, progress.best)
             if due or progress.update % schedule.checkpoint_every == 0:
                 save()
     save()
     summary = {
-        "policy": trainee.policy,
+        "policy": trainer.policy,
         "seed": config.seed,
         "updates": progress.update,
         "cpu_minutes": round(progress.cpu_seconds / 60.0, 2),
@@ -204,25 +218,25 @@ def run[Config: TrainingConfig](
     }
     folder.write_summary(summary)
     print(
-        f"{trainee.policy}: success {progress.best['success']:.0%} on held-out courses after "
+        f"{trainer.policy}: success {progress.best['success']:.0%} on held-out worlds after "
         f"{progress.best['update']} of {progress.update} updates, "
-        f"{progress.cpu_seconds / 60.0:.1f} CPU minutes; weights in {out / trainee.policy}.npz"
+        f"{progress.cpu_seconds / 60.0:.1f} CPU minutes; weights in {out / trainer.policy}.npz"
     )
     return summary
 
 
-def descend(
-    lesson: Callable[[], dict[str, torch.Tensor]],
+def step_optimizer(
+    losses: Callable[[], dict[str, torch.Tensor]],
     network: torch.nn.Module,
     optimizer: torch.optim.Optimizer,
     clip: float,
 ) -> dict[str, float]:
-    """One step down the sum of the terms that `lesson` returns; their values.
+    """One step down the sum of the terms that `losses` returns; their values.
 
     Raises:
         NotFiniteError: naming the term, or the gradient; the weights are then as before.
     """
-    terms = lesson()
+    terms = losses()
     for name, term in terms.items():
         if not torch.isfinite(term):
             raise NotFiniteError(f"the term {name!r} of the loss became {term.item()}")
@@ -235,26 +249,15 @@ def descend(
     return {name: float(term.detach()) for name, term in terms.items()}
 
 
-def _resumed(path: Path, trainee: Trainee, optimizer: torch.optim.Optimizer) -> _Progress:
+def _resume(path: Path, trainer: Trainer, optimizer: torch.optim.Optimizer) -> _Progress:
     try:
         saved = torch.load(path, weights_only=True)
-        trainee.network.load_state_dict(saved["network"])
+        trainer.network.load_state_dict(saved["network"])
         optimizer.load_state_dict(saved["optimizer"])
-        trainee.restore(saved["trainee"])
+        trainer.load_state_dict(saved["trainer"])
         return _Progress(**saved["progress"])
     except Exception as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(
             f"{path} is no checkpoint to go on from ({reason}); delete it to begin anew"
         ) from None
-
-
-def _tensorboard(out: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise ValueError(
-            "schedule.tensorboard is true, but tensorboard is not installed: pip install "
-            "tensorboard"
-        ) from None
-    return SummaryWriter(str(out))

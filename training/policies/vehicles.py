@@ -14,6 +14,7 @@ from torch import Tensor
 
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, rk4_step
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 _SUBSTEP = 0.02  # [s], at most, of integration and control
 
@@ -58,13 +59,15 @@ class PointMass(NamedTuple):
             yaw = self.yaw + dt * yaw_rate(self.yaw, v, control, heading)
         return PointMass(p, v, a_cmd + decay * behind, yaw, self.lag)
 
-    def decayed(self, factor: float) -> "PointMass":
+    def decay_gradient(self, factor: float) -> "PointMass":
         """The same state, its gradient multiplied by `factor` on the way back."""
         return self._replace(
-            p=_decayed(self.p, factor), v=_decayed(self.v, factor), a=_decayed(self.a, factor)
+            p=_decay_gradient(self.p, factor),
+            v=_decay_gradient(self.v, factor),
+            a=_decay_gradient(self.a, factor),
         )
 
-    def detached(self) -> "PointMass":
+    def detach(self) -> "PointMass":
         return PointMass(*(x.detach() for x in self))
 
 
@@ -77,17 +80,18 @@ class BodyRate(NamedTuple):
     @classmethod
     def hovering(cls, p_WB: Tensor, yaw: Tensor) -> "BodyRate":
         state = torch.zeros(len(p_WB), 13, device=p_WB.device)
-        state[:, :3] = p_WB
-        state[:, 6], state[:, 9] = torch.cos(yaw / 2), torch.sin(yaw / 2)
+        parts = QuadrotorState.of(state)
+        parts.p_WB[:] = p_WB
+        parts.q_WB[:, 0], parts.q_WB[:, 3] = torch.cos(yaw / 2), torch.sin(yaw / 2)
         return cls(state, torch.zeros_like(p_WB))
 
     @property
     def p(self) -> Tensor:
-        return self.state[:, 0:3]
+        return QuadrotorState.of(self.state).p_WB
 
     @property
     def v(self) -> Tensor:
-        return self.state[:, 3:6]
+        return QuadrotorState.of(self.state).v_WB
 
     @property
     def yaw(self) -> Tensor:
@@ -96,7 +100,7 @@ class BodyRate(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3)."""
-        return rotation_of(self.state[:, 6:10])
+        return rotation_matrix(QuadrotorState.of(self.state).q_WB)
 
     def step(
         self,
@@ -113,7 +117,8 @@ class BodyRate(NamedTuple):
             before = state
             command = flatness_command(state, a_cmd, control, params, heading)
             state = rk4_step(state, command, params, dt / count)
-        return BodyRate(state, (state[:, 3:6] - before[:, 3:6]) * (count / dt))
+        change = QuadrotorState.of(state).v_WB - QuadrotorState.of(before).v_WB
+        return BodyRate(state, change * (count / dt))
 
 
 Vehicle = PointMass | BodyRate
@@ -127,7 +132,7 @@ def flatness_command(
     heading: Tensor | None = None,
 ) -> Tensor:
     """Thrust and body rates (N, 4), the law of `FlatnessController` for accelerations (N, 3)."""
-    v = state[:, 3:6]
+    _, v, q_WB, _ = QuadrotorState.of(state)
     f = a_WB + params.drag * v
     f = f + _up(f, params.gravity)
     lift = f[:, 2:].clamp(min=control.min_thrust)
@@ -137,7 +142,7 @@ def flatness_command(
     f = torch.cat([level, lift], 1)
     f = f * (control.max_thrust / f.norm(dim=1, keepdim=True)).clamp(max=1.0)
 
-    R_WB = rotation_of(state[:, 6:10])
+    R_WB = rotation_matrix(q_WB)
     heading, pull = heading_and_pull(v, control, heading)
     R_BD = R_WB.mT @ attitude_from_thrust(f, heading)
     # First the shortest turn of the body's z axis, about n in its x-y plane, then yaw.
@@ -188,7 +193,7 @@ def attitude_from_thrust(f: Tensor, yaw: Tensor) -> Tensor:
     return torch.stack([x, torch.linalg.cross(z, x), z], 2)
 
 
-def rotation_of(q: Tensor) -> Tensor:
+def rotation_matrix(q: Tensor) -> Tensor:
     """The rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any length."""
     w, x, y, z = torch.nn.functional.normalize(q, dim=1).unbind(1)
     rows = [
@@ -203,5 +208,5 @@ def _up(like: Tensor, size: float) -> Tensor:
     return torch.tensor([0.0, 0.0, size], device=like.device)
 
 
-def _decayed(x: Tensor, factor: float) -> Tensor:
+def _decay_gradient(x: Tensor, factor: float) -> Tensor:
     return x.detach() + factor * (x - x.detach())

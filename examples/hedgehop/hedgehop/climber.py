@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from hedgehop.rangefinder import RangefinderConfig
-from splatpilot import register_policy
+from splatpilot import QuadrotorState, register_policy
 
 
 def _rangefinders() -> dict[str, RangefinderConfig]:
@@ -92,8 +92,9 @@ class Climber(LeafSystem):
         state, p_WG, ahead, below = (
             self.get_input_port(index).Eval(context) for index in range(self.num_input_ports())
         )
-        v_wanted = decide(state[:3], p_WG, float(ahead[0]), float(below[0]), self._config)
-        discrete_state.set_value(2.0 * (v_wanted - state[3:6]))
+        p_WB, v_WB, _, _ = QuadrotorState.of(state)
+        v_wanted = decide(p_WB, p_WG, float(ahead[0]), float(below[0]), self._config)
+        discrete_state.set_value(2.0 * (v_wanted - v_WB))
 
 
 register_policy(ClimberConfig, lambda config, world, vehicle: Climber(config))

@@ -15,7 +15,7 @@ from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAuton
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.observation import pooled_depth
+from splatpilot.systems.policies.observation import pool_depth
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -131,7 +131,7 @@ def test_near_ties_continue_the_last_plan(files):
 
     def followed(costs) -> int:
         new = Hypotheses(0.1, X_WB, np.stack([left, right, far]), np.array(costs))
-        return agile_policy._continued(new, last).best
+        return agile_policy._prefer_continuation(new, last).best
 
     assert followed([0.100, 0.101, 0.9]) == 1
     assert followed([0.100, 0.900, 0.9]) == 0
@@ -169,4 +169,4 @@ def test_pooling_keeps_the_nearest():
     """Each coarse pixel is the least of its block; 0, too near, stays."""
     depth = np.full((4, 6), 9.0)
     depth[1, 1], depth[3, 5], depth[0, 4] = 2.0, 0.0, np.inf
-    np.testing.assert_array_equal(pooled_depth(depth, 2, 3), [[2.0, 9.0, 9.0], [9.0, 9.0, 0.0]])
+    np.testing.assert_array_equal(pool_depth(depth, 2, 3), [[2.0, 9.0, 9.0], [9.0, 9.0, 0.0]])

@@ -15,6 +15,7 @@ from splatpilot.systems.policies.reactive_planner import (
     nearest_points,
     responses,
 )
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, final_velocities
 from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
@@ -102,6 +103,15 @@ def test_fan_is_about_the_goal_and_ends_with_rest():
     np.testing.assert_array_equal(v[-1], np.zeros(3))
 
 
+def test_angles_mean_what_they_mean_to_the_planner():
+    """The same max_yaw and max_pitch [rad] give both policies the same fan of directions."""
+    angles = {"max_yaw": 0.7, "max_pitch": 0.2, "num_yaws": 5, "num_pitches": 3}
+    v = candidate_velocities(np.array([1.0, 0.0, 0.0]), ReactiveConfig(**angles))
+    lattice = final_velocities(LatticeConfig(**angles))
+    np.testing.assert_allclose(v, CONFIG.speed * lattice, atol=1e-12)
+    assert np.arctan2(v[:, 1], v[:, 0]).max() == pytest.approx(0.7)
+
+
 def decide(depth: np.ndarray) -> np.ndarray:
     policy = Reactive()
     context = policy.CreateDefaultContext()
@@ -158,6 +168,8 @@ def test_remembers_what_it_no_longer_sees():
         ("columns", 15),
         ("memory", 0),
         ("speed_fractions", [1.5]),
+        ("max_yaw", 100.0),
+        ("max_pitch", 25.0),
         ("contact_weight", -1.0),
         ("camera", OnboardCamera(width=0)),
     ],

@@ -70,6 +70,11 @@ def test_output_ports_are_those_of_rgbd_sensor():
         ours = camera.GetOutputPort(theirs.get_name())
         assert ours.get_data_type() == theirs.get_data_type()
         assert type(ours.Allocate()) is type(theirs.Allocate())
+    methods = [name for name in dir(sensor) if name.endswith("_output_port") and name[:3] != "get"]
+    assert len(methods) == sensor.num_output_ports()
+    for name in methods:
+        assert getattr(camera, name)().get_name() == getattr(sensor, name)().get_name()
+    assert camera.body_pose_input_port().get_name() == "body_pose"
 
 
 def test_wall_is_seen_at_its_distance_and_in_its_colour():

@@ -22,7 +22,7 @@ def world():
 
 def test_rollout_reaches_a_drawn_goal_and_labels_lead_on(world):
     """Between ends drawn from the distance field the expert arrives with room to spare, and the
-    best label of every moment keeps clear."""
+    best label of every state keeps clear."""
     p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed=2)
     scenario = Scenario(world=WORLD, start=p_WS.tolist(), goal=p_WG.tolist(), start_radius=0.0)
     rollout = expert_rollout(scenario, world, ExpertConfig(period=0.4))
@@ -41,7 +41,7 @@ def test_rollout_reaches_a_drawn_goal_and_labels_lead_on(world):
 
 
 def test_flights_that_fail_are_no_rollouts(world):
-    """A flight that does not arrive in time is None; a pilot nobody knows is an error."""
+    """A flight that does not arrive in time is None; a policy nobody knows is an error."""
     assert expert_rollout(Scenario(world=WORLD, timeout=1.0), world, ExpertConfig()) is None
     with pytest.raises(ValueError, match="no policy 'nobody'"):
-        expert_rollout(Scenario(world=WORLD), world, ExpertConfig(pilot="nobody"))
+        expert_rollout(Scenario(world=WORLD), world, ExpertConfig(policy="nobody"))

@@ -10,8 +10,12 @@ from splatpilot.systems.policies import depthnav_inference as depthnav_policy
 from splatpilot.systems.policies import diffaero_inference as diffaero_policy
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
-from splatpilot.training.policies.agile_pilot import AgilePilot
-from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavLoss, quaternion_of
+from splatpilot.training.policies.agile_autonomy_agent import AgileAutonomyAgent
+from splatpilot.training.policies.depthnav import (
+    DepthNavLearner,
+    DepthNavLoss,
+    quaternion_from_rotation,
+)
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, ObservationNoise
@@ -86,13 +90,13 @@ def test_trajectories_that_fly_are_those_trained():
     """Waypoints and costs of the numpy network are torch's, from the same observation."""
     torch.manual_seed(2)
     module = TrajectoryModule(agile_policy.AGILE_NETWORK)
-    pilot = AgilePilot(module)
+    agent = AgileAutonomyAgent(module)
     network = agile_policy.TrajectoryNetwork(agile_policy.AGILE_NETWORK, weights_of(module))
     body = vehicle()
     state = body.state[0].double().numpy()
     depth = np.random.default_rng(0).uniform(0.0, 25.0, (24, 32)).astype(np.float32)
     with torch.no_grad():
-        waypoints, costs = pilot.hypotheses(observed(depth, body))
+        waypoints, costs = agent.hypotheses(observed(depth, body))
     found = agile_policy.plan(network, 1.0, depth, pose(state), state, P_WG, 2.0, None)
     assert found.waypoints_B.shape == (3, NUM_WAYPOINTS, 3)
     np.testing.assert_allclose(found.waypoints_B, waypoints[0].numpy(), atol=1e-4)
@@ -107,7 +111,7 @@ def test_quaternions_of_rotations():
         q = rpy.ToQuaternion().wxyz()
         q = q if q[0] >= 0 else -q
         R = torch.tensor(rpy.ToRotationMatrix().matrix(), dtype=torch.float32)[None]
-        found = quaternion_of(R)[0].numpy()
+        found = quaternion_from_rotation(R)[0].numpy()
         assert min(np.abs(found - q).max(), np.abs(found + q).max()) < 1e-5
         assert found[0] >= -1e-6
 
@@ -116,8 +120,8 @@ def test_noise_is_what_was_asked_for():
     """Scale and dropout have their sizes, and the same generator gives the same noise."""
     noise = ObservationNoise(scale=0.05, offset=0.0, dropout=0.1)
     depth = torch.full((400, 100), 4.0)
-    noisy = noise.disturbed(depth, torch.Generator().manual_seed(0))
-    again = noise.disturbed(depth, torch.Generator().manual_seed(0))
+    noisy = noise.disturb(depth, torch.Generator().manual_seed(0))
+    again = noise.disturb(depth, torch.Generator().manual_seed(0))
     torch.testing.assert_close(noisy, again, rtol=0, atol=0)
     seen = torch.isfinite(noisy)
     assert float((~seen).float().mean()) == pytest.approx(0.1, abs=0.01)

@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
-from splatpilot.systems.policies.observation import pooled_depth
+from splatpilot.systems.policies.observation import pool_depth
 from splatpilot.training.policies.primitives import Primitives
 from splatpilot.training.policies.ray_casting import PinholeGrid
 
@@ -94,7 +94,7 @@ def test_wide_pixels_see_what_the_pooled_image_of_a_finer_camera_sees():
     coarse = primitives.depth(p, R, PinholeGrid.of(16, 9, 90.0), distances).reshape(9, 16).numpy()
     fine_grid = PinholeGrid.of(160, 90, 90.0)._replace(half_pixel=0.0)
     fine = primitives.depth(p, R, fine_grid, distances).reshape(90, 160).numpy()
-    pooled = pooled_depth(fine, 9, 16)
+    pooled = pool_depth(fine, 9, 16)
     near = pooled < 7.0
     assert near[:, 6:9].sum() >= 9  # the trunk is thinner than a pixel and seen in every row
     np.testing.assert_array_equal(np.isfinite(coarse), np.isfinite(pooled))
@@ -122,4 +122,7 @@ def test_level_camera_beside_an_upright_trunk_gives_numbers():
     R = torch.tensor(R_BC, dtype=torch.float32)[None]
     depth = primitives.depth(p, R, PinholeGrid.of(17, 9, 90.0), primitives.near(p)[0])
     assert not depth.isnan().any()
-    assert float(depth.min()) == pytest.approx(4.7, abs=0.3)
+    middle = depth.reshape(9, 17)[4]
+    assert float(middle[8]) == pytest.approx(4.7, abs=1e-5)  # straight ahead, the trunk
+    assert float(middle[6]) == pytest.approx(7.5, abs=1e-5)  # y = 4 / 17 z, the box's face
+    assert float(depth.min()) == pytest.approx(4.7, abs=1e-5)

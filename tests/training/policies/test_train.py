@@ -3,10 +3,12 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,29 +16,34 @@ import numpy as np
 import pytest
 import torch
 
+from splatpilot.diagrams.policies import policy_named
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies import policy_checkpoint
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.seeds import TRAINING_SEEDS
-from splatpilot.training.policies import courses
+from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
-from splatpilot.training.policies.evaluation import FlightConditions, fly_courses
+from splatpilot.training.policies.evaluation import evaluate_agent
 from splatpilot.training.policies.network import TrainableNetwork
-from splatpilot.training.policies.registry import RECIPES
+from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.train import Schedule, run
 
-TINY = [
-    "courses.kinds=[P10]",
-    "courses.count=1",
-    "courses.held_out=1",
-    "courses.voxel_size=0.5",
-    "school.environments=4",
-    "school.steps=4",
+SMALL = [
+    "worlds.kinds=[P10]",
+    "worlds.count=1",
+    "worlds.held_out=1",
+    "worlds.voxel_size=0.5",
     "schedule.updates=6",
     "schedule.validate_every=3",
     "schedule.checkpoint_every=2",
     "validation.patience=0.3",
 ]
+TINY = [*SMALL, "rollout.environments=4", "rollout.steps=4"]
+OF_POLICY = {
+    "depthnav": ["rollout.environments=4", "rollout.steps=4", "empty=0.5"],
+    "agile_autonomy": ["rounds=2", "round_updates=3", "environments=4", "steps=16", "batch=8"],
+}
 
 
 def tiny(*more: str) -> DiffAeroTraining:
@@ -57,7 +64,7 @@ def assert_same(a: Path, b: Path) -> None:
 def finished(tmp_path_factory) -> Path:
     """The folder of a tiny run that was not disturbed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    run(config=tiny(), out=out, make=RECIPES["diffaero"].make)
+    run(config=tiny(), out=out, make=TRAINERS.find("diffaero").make)
     return out
 
 
@@ -85,28 +92,101 @@ def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
         time.sleep(0.002)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    run(config=tiny(), out=tmp_path, make=RECIPES["diffaero"].make)
+    run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     assert_same(tmp_path, finished)
     rows = (tmp_path / "curves.csv").read_text()
     assert rows == (finished / "curves.csv").read_text()
 
 
+@pytest.mark.parametrize("policy", ["depthnav", "agile_autonomy"])
+def test_interrupted_training_ends_as_whole(policy, tmp_path):
+    """A run of each kind of trainer that was interrupted between two checkpoints ends with the same
+    weights, which its policy flies by."""
+    trainer_kind = TRAINERS.find(policy)
+    config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
+
+    def make_interrupted(config):
+        trainer = trainer_kind.make(config)
+        begin_update = trainer.begin_update
+
+        def interrupt(update: int) -> None:
+            if update == 5:
+                raise KeyboardInterrupt
+            begin_update(update)
+
+        trainer.begin_update = interrupt
+        return trainer
+
+    run(config=config, out=tmp_path / "whole", make=trainer_kind.make)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "again", make=make_interrupted)
+    run(config=config, out=tmp_path / "again", make=trainer_kind.make)
+    assert_same(tmp_path / "again", tmp_path / "whole")
+    assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
+
+
+@pytest.mark.parametrize("policy", TRAINERS.registered())
+def test_model_cards_hold_configurations_that_train(policy, tmp_path):
+    """What a shipped card says the weights were made with is a configuration of `train`."""
+    card = (Path(policy_checkpoint.__file__).parent / "weights" / f"{policy}.md").read_text()
+    config = tmp_path / "config.yaml"
+    config.write_text(re.search("```yaml\n(.*?)```", card, re.DOTALL)[1])
+    load_config(TRAINERS.find(policy).config(), config).validate()
+
+
+def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
+    """A run takes one thread and gives back what was set, when it fails too."""
+    threads, used = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(ValueError, match="update 5"):
+            run(
+                config=FragileTraining(),
+                out=tmp_path,
+                make=lambda config: used.append(torch.get_num_threads()) or FragileTrainer(config),
+            )
+        assert (used, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch):
+    """Curves go to TensorBoard too where asked for, and its log is closed, by a failure too."""
+    rows, is_open = [], []
+
+    @contextmanager
+    def event_log(folder):
+        assert folder == str(tmp_path)
+        is_open.append(True)
+        try:
+            yield lambda update, row: rows.append((update, row["success"]))
+        finally:
+            is_open.pop()
+
+    monkeypatch.setattr(train, "event_log", event_log)
+    config = FragileTraining()
+    config.schedule.tensorboard = True
+    with pytest.raises(ValueError, match="update 5"):
+        run(config=config, out=tmp_path, make=FragileTrainer)
+    assert (rows, is_open) == ([(2, 0.5), (4, 0.5)], [])
+
+
 def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
     """A folder of another run, and a checkpoint that is none, are named with the remedy."""
     with pytest.raises(ValueError, match="another configuration"):
-        run(config=tiny("seed=1"), out=finished, make=RECIPES["diffaero"].make)
+        run(config=tiny("seed=1"), out=finished, make=TRAINERS.find("diffaero").make)
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="delete it to begin anew"):
-        run(config=tiny(), out=tmp_path, make=RECIPES["diffaero"].make)
+        run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"schedule\.updates is 0"):
-        run(config=tiny("schedule.updates=0"), out=tmp_path, make=RECIPES["diffaero"].make)
-    with pytest.raises(ValueError, match=r"courses\.kinds is \['P99'\]"):
-        run(config=tiny("courses.kinds=[P99]"), out=tmp_path, make=RECIPES["diffaero"].make)
+        run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
+    with pytest.raises(ValueError, match=r"worlds\.kinds is \['P99'\]"):
+        run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
 @dataclass
 class FragileTraining:
-    """Of a trainee whose loss breaks."""
+    """Of a trainer whose loss breaks."""
 
     seed: int = 0
     device: str = "cpu"
@@ -118,7 +198,7 @@ class FragileTraining:
         self.schedule.validate()
 
 
-class FragileTrainee:
+class FragileTrainer:
     """Its term `second` is not a number from the fifth update on."""
 
     policy, spec = "diffaero", DIFFAERO_NETWORK
@@ -127,27 +207,27 @@ class FragileTrainee:
         self.network = TrainableNetwork(self.spec)
         self._update = 0
 
-    def begin(self, update: int) -> None:
+    def begin_update(self, update: int) -> None:
         self._update = update
 
-    def lesson(self) -> dict[str, torch.Tensor]:
+    def losses(self) -> dict[str, torch.Tensor]:
         size = self.network.head.weight.square().sum()
         return {"first": size, "second": size * (torch.nan if self._update >= 5 else 1.0)}
 
-    def measured(self) -> dict[str, float]:
+    def evaluate(self) -> dict[str, float]:
         return {"success": 0.5}
 
-    def state(self) -> dict:
+    def state_dict(self) -> dict:
         return {}
 
-    def restore(self, state: dict) -> None:
+    def load_state_dict(self, state: dict) -> None:
         pass
 
 
 def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp_path):
     """The error names the term; the last good weights and checkpoint stay and are finite."""
     with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
-        run(config=FragileTraining(), out=tmp_path, make=FragileTrainee)
+        run(config=FragileTraining(), out=tmp_path, make=FragileTrainer)
     checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
     assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
     assert checkpoint.provenance["best"]["update"] == 4
@@ -158,38 +238,40 @@ def test_training_seeds_are_not_the_benchmarks(monkeypatch):
     """Every world of training and validation is of a seed the benchmark leaves to training, and
     training, its other seeds and validation share none."""
     asked: list[int] = []
-    monkeypatch.setattr(courses, "make_course", lambda kind, seed: asked.append(seed))
-    monkeypatch.setattr(courses, "Fields", lambda *_: None)
-    selection = courses.CourseSelection(count=1000, held_out=1000)
+    monkeypatch.setattr(
+        training_worlds, "make_training_world", lambda kind, seed: asked.append(seed)
+    )
+    monkeypatch.setattr(training_worlds, "WorldBatch", lambda *_: None)
+    selection = training_worlds.WorldSelection(count=1000, held_out=1000)
     for seed in (0, 1, 999):
-        courses.training_fields(selection, seed)
-    courses.validation_fields(selection)
+        training_worlds.training_worlds(selection, seed)
+    training_worlds.validation_worlds(selection)
     assert len(asked) == len(set(asked)) == 4000
     assert min(asked) >= TRAINING_SEEDS
     with pytest.raises(ValueError, match="seed is 1000"):
-        courses.training_fields(selection, 1000)
+        training_worlds.training_worlds(selection, 1000)
 
 
 def test_miniature_learns_to_fly(tmp_path):
-    """Some seconds of training reach goals among sparse poles that an untrained policy never
-    reaches."""
+    """Some seconds of training reach goals among sparse poles that the untrained policy, flown as
+    the trained one is, never reaches."""
     overrides = [
-        "courses.kinds=[P01]",
-        "courses.count=3",
-        "courses.held_out=8",
-        "courses.voxel_size=0.5",
-        "school.environments=24",
-        "school.steps=24",
+        "worlds.kinds=[P01]",
+        "worlds.count=3",
+        "worlds.held_out=8",
+        "worlds.voxel_size=0.5",
+        "rollout.environments=24",
+        "rollout.steps=24",
         "schedule.updates=70",
         "schedule.validate_every=70",
         "schedule.learning_rate=0.002",
         "validation.patience=4",
     ]
     config = load_config(DiffAeroTraining(), overrides=overrides)
-    held_out = courses.validation_fields(config.courses)
+    held_out = training_worlds.validation_worlds(config.worlds)
     torch.manual_seed(0)
     untrained = DiffAeroLearner(config.loss)
-    before = fly_courses(untrained, held_out, FlightConditions(patience=1.0)).measures()
-    summary = run(config=config, out=tmp_path, make=RECIPES["diffaero"].make)
-    assert before["success"] == 0.0
+    before = evaluate_agent(untrained, held_out, config.validation, config.rollout.noise)
+    summary = run(config=config, out=tmp_path, make=TRAINERS.find("diffaero").make)
+    assert before.measures()["success"] == 0.0
     assert summary["best"]["success"] >= 0.5

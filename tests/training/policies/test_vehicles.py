@@ -19,7 +19,7 @@ from splatpilot.training.policies.vehicles import (
     PointMass,
     attitude_from_thrust,
     flatness_command,
-    rotation_of,
+    rotation_matrix,
 )
 
 CONTROL = FlatnessControllerConfig()
@@ -47,11 +47,11 @@ def test_point_mass_solves_its_equation_exactly():
 
 
 def test_gradient_decay_scales_gradients_alone():
-    """`decayed` leaves the state as it is and multiplies its gradient."""
+    """`decay_gradient` leaves the state as it is and multiplies its gradient."""
     a = torch.ones(1, 3, requires_grad=True)
     zero = torch.zeros(1, 3)
     vehicle = PointMass(zero, zero, a, torch.zeros(1), torch.full((1, 1), 0.1))
-    faded = vehicle.decayed(0.3)
+    faded = vehicle.decay_gradient(0.3)
     torch.testing.assert_close(faded.a, a)
     faded.a.sum().backward()
     torch.testing.assert_close(a.grad, torch.full((1, 3), 0.3))
@@ -133,7 +133,7 @@ def test_body_rate_vehicle_flies_as_plant_and_controller_do():
     np.testing.assert_allclose(vehicle.p[0], expected[:3], atol=0.05)
     np.testing.assert_allclose(vehicle.v[0], expected[3:6], atol=0.05)
     R_WB = pose_from_state(vehicle.state[0].double().numpy()).rotation().matrix()
-    np.testing.assert_allclose(rotation_of(vehicle.state[:, 6:10])[0], R_WB, atol=1e-5)
+    np.testing.assert_allclose(rotation_matrix(vehicle.state[:, 6:10])[0], R_WB, atol=1e-5)
 
 
 def test_gradients_flow_through_the_body_rate_vehicle():

@@ -1,4 +1,4 @@
-"""Learning to fly by descending a loss through the dynamics of many vehicles in flight."""
+"""Rollouts of many vehicles whose loss is differentiated through the dynamics of flight."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -8,47 +8,45 @@ from torch import Tensor
 
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.evaluation import Pilot, look
-from splatpilot.training.policies.fields import STARTS, Fields
+from splatpilot.training.policies.evaluation import Agent, render_depth
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import Observation, ObservationNoise
 from splatpilot.training.policies.vehicles import PointMass
+from splatpilot.training.policies.world_batch import STARTS, WorldBatch
 
 NEAREST = 4
-"""Obstacles that the loss looks at, the nearest ones of each moment."""
+"""Obstacles that the loss looks at, the nearest ones at each step."""
 
 
-class Moment(NamedTuple):
+class Transition(NamedTuple):
     """What a loss is made of: N vehicles after one step, everything in W and with gradients."""
 
-    v: Tensor  # (N, 3) [m/s], v_WB
-    v_mean: Tensor  # (N, 3) [m/s], its moving average
+    v_mean: Tensor  # (N, 3) [m/s], moving average of v_WB
     v_target: Tensor  # (N, 3) [m/s], along the way to the goal
     a: Tensor  # (N, 3) [m/s^2]
     jerk: Tensor  # (N, 3) [m/s^3]
     clearance: Tensor  # (N, 4) [m], beyond the vehicle's radius, of the nearest obstacles
     approach: Tensor  # (N, 4) [m/s], velocity towards them
-    yaw: Tensor  # (N,) [rad]
     heading: Tensor | None  # (N,) [rad], asked for
 
 
-class Learner(Pilot, Protocol):
-    """A pilot that learns: its network, and what it wants."""
+class Learner(Agent, Protocol):
+    """An agent that learns: its network, and what it wants."""
 
     network: TrainableNetwork
 
-    def losses(self, moment: Moment) -> dict[str, Tensor]:
+    def losses(self, transition: Transition) -> dict[str, Tensor]:
         """The weighted terms of the loss, by name, each a mean over the vehicles."""
         ...
 
 
 @dataclass
-class FlightSchool:
+class RolloutConfig:
     """How vehicles fly while they learn."""
 
     # [-] Vehicles in flight at once.
     environments: int = 64
-    # [-] Steps of the policy that the loss is descended through at once.
+    # [-] Steps of the policy that the loss is differentiated through at once.
     steps: int = 32
     # [m/s] Range that each vehicle's wanted speed is drawn from.
     speed: list[float] = field(default_factory=lambda: [1.5, 3.0])
@@ -66,24 +64,24 @@ class FlightSchool:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("environments", "steps"):
             if getattr(self, name) < 1:
-                raise ValueError(f"school.{name} is {getattr(self, name)}; it must be at least 1")
+                raise ValueError(f"rollout.{name} is {getattr(self, name)}; it must be at least 1")
         for name in ("speed", "lag"):
             limits = getattr(self, name)
             if len(limits) != 2 or not 0.0 < limits[0] <= limits[1] < float("inf"):
                 raise ValueError(
-                    f"school.{name} is {limits}; it must be two positive numbers, the lesser first"
+                    f"rollout.{name} is {limits}; it must be two positive numbers, the lesser first"
                 )
         if not 0.0 <= self.gradient_decay <= 1.0:
             raise ValueError(
-                f"school.gradient_decay is {self.gradient_decay}; it must be between 0 and 1"
+                f"rollout.gradient_decay is {self.gradient_decay}; it must be between 0 and 1"
             )
         for name in ("averaging", "longest"):
             if not 0.0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"school.{name} is {getattr(self, name)} s; it must be positive")
+                raise ValueError(f"rollout.{name} is {getattr(self, name)} s; it must be positive")
 
 
-class Flying(NamedTuple):
-    """The flights that go on from one update to the next."""
+class Episodes(NamedTuple):
+    """The flights of N vehicles, which go on from one update to the next."""
 
     vehicle: PointMass
     world: Tensor  # (N,), numbers of the worlds flown in
@@ -93,53 +91,53 @@ class Flying(NamedTuple):
     age: Tensor  # (N,) [s]
 
 
-class NotFiniteError(ValueError):
-    """A term of the loss, or the gradient, became infinite or not a number."""
-
-
-class School:
-    """Flights in `fields` from which `learner` learns; each is in a world drawn anew."""
+class DifferentiableRollout:
+    """Episodes of flight in `worlds`, each in a world drawn anew, from which `learner` learns."""
 
     def __init__(
-        self, learner: Learner, fields: Fields, config: FlightSchool, generator: torch.Generator
+        self,
+        learner: Learner,
+        worlds: WorldBatch,
+        config: RolloutConfig,
+        generator: torch.Generator,
     ) -> None:
-        self.learner, self.fields, self.config = learner, fields, config
+        self.learner, self.worlds, self.config = learner, worlds, config
         self.generator = generator
         self._control = FlatnessControllerConfig()
-        self.flying = self._fresh()
+        self.episodes = self._new_episodes()
 
-    def state(self) -> dict[str, Any]:
-        """Everything that the next lesson depends on but the learner."""
-        flying = [*self.flying.vehicle, *self.flying[1:]]
-        return {"flying": flying, "generator": self.generator.get_state()}
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next losses depend on but the learner."""
+        episodes = [*self.episodes.vehicle, *self.episodes[1:]]
+        return {"episodes": episodes, "generator": self.generator.get_state()}
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """The inverse of `state`."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """The inverse of `state_dict`."""
         count = len(PointMass._fields)
-        self.flying = Flying(PointMass(*state["flying"][:count]), *state["flying"][count:])
+        self.episodes = Episodes(PointMass(*state["episodes"][:count]), *state["episodes"][count:])
         self.generator.set_state(state["generator"])
 
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(*size, generator=self.generator, device=self.generator.device)
 
-    def _fresh(self) -> Flying:
-        """New flights, anywhere in any world, in flight towards about where the way leads."""
+    def _new_episodes(self) -> Episodes:
+        """New episodes, anywhere in any world, in flight towards about where the way leads."""
         config, N = self.config, self.config.environments
 
         def between(limits: list[float], *size: int) -> Tensor:
             return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
 
-        def drawn(count: int) -> Tensor:
+        def draw(count: int) -> Tensor:
             return (self._uniform(N) * count).long().clamp(max=count - 1)
 
-        world = drawn(len(self.fields))
-        p = self.fields.starts_W[world, drawn(STARTS)]
+        world = draw(len(self.worlds))
+        p = self.worlds.starts_W[world, draw(STARTS)]
         speed = between(config.speed, N)
-        way = self.fields.way(p, world)
+        way = self.worlds.way(p, world)
         v = way * (speed * self._uniform(N))[:, None] + 0.3 * (self._uniform(N, 3) - 0.5)
         yaw = torch.atan2(way[:, 1], way[:, 0]) + 1.0 * (self._uniform(N) - 0.5)
         lag = between(config.lag, N, 1)
-        return Flying(
+        return Episodes(
             PointMass(p, v, torch.zeros_like(p), yaw, lag),
             world,
             v,
@@ -148,66 +146,64 @@ class School:
             self._uniform(N) * config.longest,
         )
 
-    def _renewed(self, flying: Flying) -> Flying:
-        """Flights that have ended begin anew."""
-        fields, world, p = self.fields, flying.world, flying.vehicle.p
-        clearance = fields.primitives.of(world).near(p)[0].amin(1) - VEHICLE_RADIUS
-        inside = (p > fields.lower_W[world]) & (p < fields.upper_W[world])
+    def _restart_ended(self, episodes: Episodes) -> Episodes:
+        """Episodes that have ended begin anew."""
+        worlds, world, p = self.worlds, episodes.world, episodes.vehicle.p
+        clearance = worlds.primitives.select(world).near(p)[0].amin(1) - VEHICLE_RADIUS
+        inside = (p > worlds.lower_W[world]) & (p < worlds.upper_W[world])
         ended = (
             (clearance < 0.0)
             | ~inside.all(1)
-            | ((p - fields.p_WG[world]).norm(dim=1) < 0.5)
-            | (flying.age > self.config.longest)
+            | ((p - worlds.p_WG[world]).norm(dim=1) < 0.5)
+            | (episodes.age > self.config.longest)
         )
-        fresh = self._fresh()
+        fresh = self._new_episodes()
         fresh = fresh._replace(age=torch.zeros_like(fresh.age))
 
-        def chosen(new: Tensor, old: Tensor) -> Tensor:
+        def choose(new: Tensor, old: Tensor) -> Tensor:
             return torch.where(ended.reshape(-1, *[1] * (old.dim() - 1)), new, old)
 
-        vehicle = PointMass(*map(chosen, fresh.vehicle, flying.vehicle))
-        return Flying(vehicle, *map(chosen, fresh[1:], flying[1:]))
+        vehicle = PointMass(*map(choose, fresh.vehicle, episodes.vehicle))
+        return Episodes(vehicle, *map(choose, fresh[1:], episodes[1:]))
 
-    def lesson(self) -> dict[str, Tensor]:
+    def losses(self) -> dict[str, Tensor]:
         """Flies on for `steps` and returns the mean of each term of the loss, differentiable."""
-        config, learner, fields = self.config, self.learner, self.fields
+        config, learner, worlds = self.config, self.learner, self.worlds
         dt = 1.0 / learner.rate
         keep = config.gradient_decay**dt
         forget = 1.0 - torch.exp(torch.tensor(-dt / config.averaging))
         with torch.no_grad():
-            vehicle, world, v_mean, memory, speed, age = self._renewed(self.flying)
-        primitives, p_WG = fields.primitives.of(world), fields.p_WG[world]
+            vehicle, world, v_mean, memory, speed, age = self._restart_ended(self.episodes)
+        primitives, p_WG = worlds.primitives.select(world), worlds.p_WG[world]
         totals: dict[str, Tensor] = {}
         distances, normals = primitives.near(vehicle.p)
         for _ in range(config.steps):
-            depth, R_WB = look(vehicle, primitives, learner.grid, distances)
-            depth = config.noise.disturbed(depth, self.generator)
+            depth, R_WB = render_depth(vehicle, primitives, learner.grid, distances)
+            depth = config.noise.disturb(depth, self.generator)
             seen = Observation(depth, vehicle, R_WB, p_WG, speed)
             a_cmd, heading, memory = learner.decide(seen, memory)
             before = vehicle
-            vehicle = vehicle.decayed(keep).step(a_cmd, dt, self._control, heading)
+            vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, self._control, heading)
             v_mean = v_mean + forget * (vehicle.v - v_mean)
             distances, normals = primitives.near(vehicle.p)
-            clearance, approach = _obstacles(vehicle, distances, normals)
+            clearance, approach = _nearest_obstacles(vehicle, distances, normals)
             with torch.no_grad():
                 to_goal = (p_WG - vehicle.p).norm(dim=1)
-                way = fields.way(vehicle.p, world)
+                way = worlds.way(vehicle.p, world)
                 v_target = way * torch.minimum(speed, to_goal)[:, None]
-            moment = Moment(
-                vehicle.v,
+            transition = Transition(
                 v_mean,
                 v_target,
                 vehicle.a,
                 (vehicle.a - before.a) / dt,
                 clearance,
                 approach,
-                vehicle.yaw,
                 heading,
             )
-            for name, term in learner.losses(moment).items():
+            for name, term in learner.losses(transition).items():
                 totals[name] = totals.get(name, 0.0) + term / config.steps
-        self.flying = Flying(
-            vehicle.detached(),
+        self.episodes = Episodes(
+            vehicle.detach(),
             world,
             v_mean.detach(),
             memory.detach(),
@@ -217,7 +213,9 @@ class School:
         return totals
 
 
-def _obstacles(vehicle: PointMass, distances: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+def _nearest_obstacles(
+    vehicle: PointMass, distances: Tensor, normals: Tensor
+) -> tuple[Tensor, Tensor]:
     """Clearance (N, 4) [m] and velocity of approach (N, 4) [m/s] of the nearest obstacles.
 
     Args:

@@ -26,7 +26,7 @@ _NEAR_GOAL = 1.0  # [m], within which the way is straight
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class TrainingWorld:
     """One world: its shapes and volume, and where to fly."""
 
     shapes: Sequence[Shape]
@@ -36,11 +36,11 @@ class Course:
     p_WG: np.ndarray  # (3,) [m] goal
 
 
-class Fields:
-    """W courses as tensors: shapes, volumes, starts, goals, and the way to each goal.
+class WorldBatch:
+    """W worlds as tensors: shapes, volumes, starts, goals, and the way to each goal.
 
     Args:
-      courses: the worlds.
+      worlds: W of them.
       voxel_size: [m] of the grids of the time of arrival; None for none of them, which evaluation
         does not need.
       device: where the tensors live.
@@ -48,7 +48,7 @@ class Fields:
 
     def __init__(
         self,
-        courses: Sequence[Course],
+        worlds: Sequence[TrainingWorld],
         voxel_size: float | None,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -56,21 +56,21 @@ class Fields:
             return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
 
         self.lower_W, self.upper_W = (
-            tensor([getattr(c, name) for c in courses]) for name in ("lower_W", "upper_W")
+            tensor([getattr(world, name) for world in worlds]) for name in ("lower_W", "upper_W")
         )
         self.p_WS, self.p_WG = (
-            tensor([getattr(c, name) for c in courses]) for name in ("p_WS", "p_WG")
+            tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
         self.primitives = Primitives(
-            [c.shapes for c in courses],
-            np.array([c.lower_W for c in courses]),
-            np.array([c.upper_W for c in courses]),
+            [world.shapes for world in worlds],
+            np.array([world.lower_W for world in worlds]),
+            np.array([world.upper_W for world in worlds]),
             device,
         )
         self._voxel_size = voxel_size
         self._times = None
         if voxel_size is not None:
-            grids = [_arrival(course, voxel_size, seed) for seed, course in enumerate(courses)]
+            grids = [_march(world, voxel_size, seed) for seed, world in enumerate(worlds)]
             self.maps = [(grid.esdf, grid.toa) for grid in grids]
             shapes = np.array([grid.toa.times.shape for grid in grids])
             sizes = shapes.prod(1)
@@ -85,10 +85,10 @@ class Fields:
     def __len__(self) -> int:
         return len(self.p_WG)
 
-    def emptied(self) -> "Fields":
+    def without_obstacles(self) -> "WorldBatch":
         """The same volumes, starts and goals without shapes, and straight ways."""
         empty = copy(self)
-        empty.primitives = self.primitives.removed()
+        empty.primitives = self.primitives.without_obstacles()
         empty._times = None
         return empty
 
@@ -101,7 +101,7 @@ class Fields:
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
             return torch.nn.functional.normalize(to_goal, dim=1)
-        _, *slopes = self._interpolated(self._times, p_WQ, world)
+        _, *slopes = self._interpolate(self._times, p_WQ, world)
         near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
         downhill = torch.where(near, to_goal, -torch.stack(slopes, 1))
         return torch.nn.functional.normalize(downhill, dim=1)
@@ -109,9 +109,9 @@ class Fields:
     def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Signed distance (N,) [m] at p_WQ (N, 3) [m] in `world` (N,), from the grid: the bounds of
         the volume count as surfaces, and it costs the same however many shapes there are."""
-        return self._interpolated(self._distances, p_WQ, world)[0]
+        return self._interpolate(self._distances, p_WQ, world)[0]
 
-    def _interpolated(self, grid: Tensor, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, ...]:
+    def _interpolate(self, grid: Tensor, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, ...]:
         """Value and slopes (N,) each of a grid, by voxels, at p_WQ (N, 3)."""
         assert self._voxel_size is not None
         shape = self._shape[world]
@@ -137,15 +137,15 @@ class _Arrival(NamedTuple):
     starts_W: np.ndarray  # (STARTS, 3) [m]
 
 
-def _arrival(course: Course, voxel_size: float, seed: int) -> _Arrival:
-    """The time of arrival at the goal of a course, and free places from which it can be reached."""
-    field = AnalyticDistanceField(course.shapes, course.lower_W, course.upper_W)
+def _march(world: TrainingWorld, voxel_size: float, seed: int) -> _Arrival:
+    """The time of arrival at the goal of a world, and free places from which it can be reached."""
+    field = AnalyticDistanceField(world.shapes, world.lower_W, world.upper_W)
     esdf = esdf_from_distance_field(field, voxel_size).conservative()
-    toa = time_of_arrival(esdf, course.p_WG)
+    toa = time_of_arrival(esdf, world.p_WG)
     roomy = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
     cells = np.argwhere(roomy)
     if len(cells) == 0:
-        raise ValueError("no place in the course has room to start from; make it less dense")
+        raise ValueError("no place in the world has room to start from; make it less dense")
     rng = np.random.default_rng(seed)
     starts = cells[rng.integers(len(cells), size=STARTS)] + 0.5
-    return _Arrival(esdf, toa, course.lower_W + voxel_size * starts)
+    return _Arrival(esdf, toa, world.lower_W + voxel_size * starts)

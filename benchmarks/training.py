@@ -1,6 +1,6 @@
 """How fast policies learn and fly: steps per second of one core, and what a tick costs in flight.
 
-    OMP_NUM_THREADS=1 python benchmarks/flight_school.py
+    OMP_NUM_THREADS=1 python benchmarks/training.py
 
 Times are processor time, the least of a few repeats.
 """
@@ -15,11 +15,11 @@ from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, dec
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.policies.courses import CourseSelection, training_fields
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from splatpilot.training.policies.evaluation import look
-from splatpilot.training.policies.through_dynamics import FlightSchool, School
-from splatpilot.training.policies.train import descend
+from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.evaluation import render_depth
+from splatpilot.training.policies.train import step_optimizer
+from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
 
 
 def seconds(run: Callable[[], object], repeats: int) -> float:
@@ -36,26 +36,28 @@ def main() -> None:
     torch.set_num_threads(1)
     print(f"{'worlds':<12}{'learning':>12}{'flying':>12}{'rendering':>12}{'its part':>10}")
     for kinds in (["P02", "P03"], ["P06", "P09"], ["P04", "P05"]):
-        selection = CourseSelection(kinds=kinds, count=16, voxel_size=0.4)
-        fields = training_fields(selection, seed=0)
+        selection = WorldSelection(kinds=kinds, count=16, voxel_size=0.4)
+        worlds = training_worlds(selection, seed=0)
         learner = DiffAeroLearner(DiffAeroLoss())
-        school = School(learner, fields, FlightSchool(), torch.Generator().manual_seed(0))
+        rollout = DifferentiableRollout(
+            learner, worlds, RolloutConfig(), torch.Generator().manual_seed(0)
+        )
         optimizer = torch.optim.AdamW(learner.network.parameters())
-        steps = school.config.environments * school.config.steps
+        steps = rollout.config.environments * rollout.config.steps
 
-        def learn(school=school, learner=learner, optimizer=optimizer) -> None:
-            descend(school.lesson, learner.network, optimizer, 1.0)
+        def learn(rollout=rollout, learner=learner, optimizer=optimizer) -> None:
+            step_optimizer(rollout.losses, learner.network, optimizer, 1.0)
 
-        def render(school=school, learner=learner, fields=fields) -> None:
-            primitives = fields.primitives.of(school.flying.world)
-            distances, _ = primitives.near(school.flying.vehicle.p)
-            look(school.flying.vehicle, primitives, learner.grid, distances)
+        def render(rollout=rollout, learner=learner, worlds=worlds) -> None:
+            primitives = worlds.primitives.select(rollout.episodes.world)
+            distances, _ = primitives.near(rollout.episodes.vehicle.p)
+            render_depth(rollout.episodes.vehicle, primitives, learner.grid, distances)
 
         learn()
         learning = seconds(learn, 4)
         with torch.no_grad():
-            flying = seconds(school.lesson, 4)
-        rendering = seconds(render, 20) * school.config.steps
+            flying = seconds(rollout.losses, 4)
+        rendering = seconds(render, 20) * rollout.config.steps
         row = "".join(f"{steps / s:>10.0f}/s" for s in (learning, flying, rendering))
         print(f"{'+'.join(kinds):<12}{row}{rendering / learning:>10.0%}")
 

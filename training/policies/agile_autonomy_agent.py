@@ -11,6 +11,7 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
     RATE,
 )
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, target_velocity
 from splatpilot.training.policies.ray_casting import PinholeGrid
@@ -20,7 +21,7 @@ LOOKAHEAD = 3
 """The waypoint that is tracked: at 0.4 s, as the controller's lookahead."""
 
 
-class AgilePilot:
+class AgileAutonomyAgent:
     """Flies by the cheapest hypothesis, as `HypothesisSelector` and `FlatnessController` do."""
 
     rate = RATE
@@ -38,7 +39,11 @@ class AgilePilot:
         """Images (N, 24, 32) and states (N, 18)."""
         spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.R_WB
         image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
-        rates = vehicle.state[:, 10:13] if isinstance(vehicle, BodyRate) else 0.0 * vehicle.v
+        rates = (
+            QuadrotorState.of(vehicle.state).w_WB_B
+            if isinstance(vehicle, BodyRate)
+            else 0.0 * vehicle.v
+        )
         v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
         rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
         state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
@@ -55,10 +60,10 @@ class AgilePilot:
         waypoints, costs = self.hypotheses(seen)
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
         p_WR = seen.vehicle.p + (seen.R_WB @ best[:, LOOKAHEAD, :, None])[:, :, 0]
-        return reaching(p_WR, seen.vehicle), None, memory
+        return reaching_acceleration(p_WR, seen.vehicle), None, memory
 
 
-def reaching(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
     """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
     T = FlatnessControllerConfig.lookahead
     return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2

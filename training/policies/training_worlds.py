@@ -1,4 +1,4 @@
-"""The courses that policies train in: of the benchmark's kinds, of seeds that it never uses."""
+"""The worlds that policies train in: of the benchmark's kinds, of seeds that it never uses."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_fil
 from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
-from splatpilot.training.policies.fields import Course, Fields
+from splatpilot.training.policies.world_batch import TrainingWorld, WorldBatch
 
 PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
 """The scenarios whose worlds are made from seeds."""
@@ -19,7 +19,7 @@ ROUNDABOUT = ("P06", "P07", "P08", "P09", "P10", "P12")
 
 
 @dataclass
-class CourseSelection:
+class WorldSelection:
     """Which worlds, and how many."""
 
     # Scenarios whose worlds are trained in, in turn; naming one twice doubles its part.
@@ -35,40 +35,40 @@ class CourseSelection:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         unknown = [kind for kind in self.kinds if kind not in PROCEDURAL]
         if unknown or not self.kinds:
-            raise ValueError(f"courses.kinds is {self.kinds}; choose from {', '.join(PROCEDURAL)}")
+            raise ValueError(f"worlds.kinds is {self.kinds}; choose from {', '.join(PROCEDURAL)}")
         for name in ("count", "held_out"):
             value = getattr(self, name)
             if not 1 <= value <= SEEDS_PER_RUN:
-                raise ValueError(f"courses.{name} is {value}; it must be 1 to {SEEDS_PER_RUN}")
+                raise ValueError(f"worlds.{name} is {value}; it must be 1 to {SEEDS_PER_RUN}")
         if not 0.05 <= self.voxel_size <= 0.5:
-            raise ValueError(f"courses.voxel_size is {self.voxel_size} m; it must be 0.05 to 0.5")
+            raise ValueError(f"worlds.voxel_size is {self.voxel_size} m; it must be 0.05 to 0.5")
 
 
-def make_course(kind: str, seed: int) -> Course:
+def make_training_world(kind: str, seed: int) -> TrainingWorld:
     """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
     world = load_config(Scenario(), scenario_file(kind)).world
     plan = make_blueprint(world, seed)
     shapes = [solid.shape for solid in plan.solids]
-    return Course(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
+    return TrainingWorld(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
 
 
-def training_fields(
-    selection: CourseSelection, seed: int, device: torch.device | str = "cpu"
-) -> Fields:
+def training_worlds(
+    selection: WorldSelection, seed: int, device: torch.device | str = "cpu"
+) -> WorldBatch:
     """The worlds that a training run of `seed` learns in; those of different seeds differ.
 
     Raises:
         ValueError: if the seed is not 0 to 999.
     """
-    courses = _courses(selection, selection.count, first_training_seed(seed))
-    return Fields(courses, selection.voxel_size, device)
+    worlds = _make_worlds(selection, selection.count, first_training_seed(seed))
+    return WorldBatch(worlds, selection.voxel_size, device)
 
 
-def validation_fields(selection: CourseSelection, device: torch.device | str = "cpu") -> Fields:
+def validation_worlds(selection: WorldSelection, device: torch.device | str = "cpu") -> WorldBatch:
     """The held-out worlds, the same for every run."""
-    return Fields(_courses(selection, selection.held_out, VALIDATION_SEEDS), None, device)
+    return WorldBatch(_make_worlds(selection, selection.held_out, VALIDATION_SEEDS), None, device)
 
 
-def _courses(selection: CourseSelection, count: int, first: int) -> list[Course]:
+def _make_worlds(selection: WorldSelection, count: int, first: int) -> list[TrainingWorld]:
     kinds = selection.kinds
-    return [make_course(kinds[i % len(kinds)], first + i) for i in range(count)]
+    return [make_training_world(kinds[i % len(kinds)], first + i) for i in range(count)]

@@ -1,0 +1,25 @@
+"""Ports by methods, as Drake's own systems have them: `camera.color_image_output_port()`."""
+
+from collections.abc import Callable
+
+from pydrake.systems.framework import InputPort, OutputPort, System
+
+
+def input_port(name: str) -> Callable[[System], InputPort]:
+    """A method, for the body of a system's class, that returns its input port of that name."""
+
+    def port(self: System) -> InputPort:
+        return self.GetInputPort(name)
+
+    port.__doc__ = f"The input port `{name}`."
+    return port
+
+
+def output_port(name: str) -> Callable[[System], OutputPort]:
+    """A method, for the body of a system's class, that returns its output port of that name."""
+
+    def port(self: System) -> OutputPort:
+        return self.GetOutputPort(name)
+
+    port.__doc__ = f"The output port `{name}`."
+    return port

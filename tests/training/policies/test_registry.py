@@ -1,0 +1,93 @@
+"""Trainers by name, of our own and of other packages."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from splatpilot.analysis.cli import main
+
+PACKAGE = '''
+from dataclasses import dataclass, field
+
+import torch
+
+from splatpilot import register_trainer
+from splatpilot.training.policies.train import Schedule
+
+
+@dataclass(frozen=True)
+class Spec:
+    size: int = 2
+
+
+@dataclass
+class MeanTraining:
+    seed: int = 0
+    device: str = "cpu"
+    target: float = 3.0
+    schedule: Schedule = field(
+        default_factory=lambda: Schedule(updates=200, learning_rate=0.1, weight_decay=0.0)
+    )
+
+    def validate(self) -> None:
+        self.schedule.validate()
+
+
+class MeanTrainer:
+    """Learns a number."""
+
+    policy, spec = "mean", Spec()
+
+    def __init__(self, config):
+        self.network, self._target = torch.nn.Linear(1, 1, bias=False), config.target
+
+    def begin_update(self, update):
+        pass
+
+    def losses(self):
+        return {"distance": (self.network.weight - self._target).square().sum()}
+
+    def evaluate(self):
+        return {"success": float((self.network.weight - self._target).abs().item() < 0.1)}
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+register_trainer("mean", MeanTraining, MeanTrainer)
+'''
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_path, monkeypatch):
+    """Its name, once it is installed, and its module:attribute train it, with fields of its own
+    configuration; weights lie where those of our own policies do."""
+    name = "mean_package" if installed else "mean_module"
+    (tmp_path / f"{name}.py").write_text(PACKAGE.replace("mean", name).replace("Mean", name))
+    if installed:
+        about = tmp_path / f"{name}-1.0.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        point = f"[splatpilot.trainers]\n{name} = {name}:{name}Training\n"
+        (about / "entry_points.txt").write_text(point)
+    monkeypatch.syspath_prepend(tmp_path)
+    out = tmp_path / "out"
+    trainer = name if installed else f"{name}:{name}Training"
+    assert main(["train", trainer, "--out", str(out), "--set", "target=-2"]) == 0
+    with np.load(out / f"{name}.npz") as weights:
+        assert weights["weight"].item() == pytest.approx(-2.0, abs=0.1)
+    assert "target: -2" in (out / "config.yaml").read_text()
+    sys.modules.pop(name)
+
+
+def test_what_nobody_trains_is_refused_with_what_there_is(tmp_path, capsys):
+    """A name without a trainer is an error that lists those there are, before anything is made."""
+    assert main(["train", "planner", "--out", str(tmp_path / "out")]) == 1
+    message = capsys.readouterr().err
+    assert "no trainer 'planner'" in message
+    assert all(name in message for name in ("diffaero", "depthnav", "agile_autonomy"))
+    assert not (tmp_path / "out").exists()
