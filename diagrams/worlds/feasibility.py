@@ -8,6 +8,7 @@ from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
@@ -24,7 +25,8 @@ def drawn(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Bluepr
     """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
 
     Raises:
-        ValueError: for a negative seed, or if none of `TRIES` instances is feasible.
+        ValueError: for a negative seed.
+        InfeasibleFlightError: if none of `TRIES` instances is feasible.
     """
     if seed < 0:
         raise ValueError(f"seed = {seed} must be 0 or more")
@@ -34,7 +36,7 @@ def drawn(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Bluepr
         name = blueprint.name
         if is_feasible(blueprint):
             return blueprint
-    raise ValueError(
+    raise InfeasibleFlightError(
         f"{name}: none of {TRIES} instances drawn from seed {seed} leaves a vehicle of radius "
         f"{VEHICLE_RADIUS} m a way from start to goal; use fewer or smaller obstacles, or more room"
     )
