@@ -174,7 +174,7 @@ def view_obstacle(field: DistanceField, path: NDArray) -> float:
         for ray in rays if angle > middles[-1] else [*rays, ahead]:
             way = march(field, points[:-1], ray, 0.0, SENSING_RANGE)
             ends = points[:-1] + way[:, None] * ray
-            solid = (way < SENSING_RANGE) & inside(field, ends)
+            solid = (way < SENSING_RANGE) & inside(field, ends) & (field.distance(ends) < 0.02)
             nearest = np.minimum(nearest, np.where(solid, np.maximum(way, 0.05), np.inf))
         total += weight * SENSING_RANGE / nearest
     return float(total.mean())

@@ -73,7 +73,8 @@ def march(
     field: DistanceField, p_W: NDArray, way: NDArray, radius: float, longest: float
 ) -> NDArray:
     """How far (N,) [m] a ball of `radius` flies from p_W (N, 3) along the unit vectors `way` (N, 3)
-    until it touches a surface or leaves the bounds, at most `longest`, by sphere tracing."""
+    until it touches a surface or its centre leaves the bounds, at most `longest`, by sphere
+    tracing."""
     flown, going = np.zeros(len(p_W)), np.arange(len(p_W))
     for _ in range(200):
         p = p_W[going] + flown[going, None] * way[going]
@@ -83,7 +84,10 @@ def march(
         going = going[flown[going] < longest]
         if not len(going):
             break
-    return flown
+    bounds_W = np.where(way > 0, field.upper_W, field.lower_W)
+    ahead = np.where(way == 0, 1.0, way)
+    to_bounds = np.where(way == 0, np.inf, (bounds_W - p_W) / ahead).min(axis=1)
+    return np.minimum(flown, to_bounds)
 
 
 def path_length(path: NDArray) -> float:

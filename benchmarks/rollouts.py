@@ -19,7 +19,6 @@ from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import dump_config
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -45,14 +44,14 @@ def time_policies(repeats: int = 3) -> None:
         print(f"{name:<34}{max(wall):>12.1f}{max(cpu):>12.1f}")
 
 
-def time_workers(flights: int) -> None:
+def time_workers(count: int) -> None:
     """Prints rollouts per minute of one and two worker processes, after they have started."""
-    specs = [RolloutSpec("forest", "reactive", 2.0, seed) for seed in range(flights)]
-    scenarios = {"forest": dump_config(Scenario())}
+    specs = [RolloutSpec("forest", "reactive", 2.0, seed) for seed in range(count)]
+    flights = [(spec, Scenario(seed=spec.seed, policy=policy_named("reactive"))) for spec in specs]
     rates = {}
     for jobs in (1, 2):
         started, ends = time.perf_counter(), []
-        for _ in fly_all(specs, scenarios, jobs):
+        for _ in fly_all(flights, jobs):
             ends.append(time.perf_counter())
         # From the first end on: processes take seconds to start.
         rates[jobs] = 60.0 * (len(ends) - jobs) / (ends[-1] - ends[jobs - 1])

@@ -16,6 +16,7 @@ from splatpilot.diagrams.flight_diagram import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
@@ -78,8 +79,8 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
     the start.
 
     Raises:
-        ValueError: if the start or the goal is outside known space, or nearer to a surface than the
-            vehicle's radius.
+        InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
+            surface than the vehicle's radius.
     """
     p_WG = goal_of(scenario, world)
     p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
@@ -231,18 +232,18 @@ def _is_free(world: World, p_WQ: np.ndarray) -> bool:
 
 
 def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
-    """Raises ValueError unless the vehicle fits at p_WQ (3,) [m]."""
+    """Raises InfeasibleFlightError unless the vehicle fits at p_WQ (3,) [m]."""
     field = world.distance_field
     sample = field.query(p_WQ)
     where = f"{what} {np.round(p_WQ, 3).tolist()}"
     if sample.state >= FieldState.UNKNOWN:
         known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
-        raise ValueError(
+        raise InfeasibleFlightError(
             f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
             f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
         )
     if sample.distance <= VEHICLE_RADIUS:
-        raise ValueError(
+        raise InfeasibleFlightError(
             f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
             f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more room"
         )

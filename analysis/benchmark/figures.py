@@ -7,7 +7,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from splatpilot.analysis.benchmark.tables import PAPER, PAPER_FLIGHTS
+from splatpilot.analysis.benchmark.tables import PAPER_FLIGHTS, PaperRow
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -27,7 +27,9 @@ def policy_color(policy: str, policies: list[str]) -> str:
     return _COLORS[policies.index(policy) % len(_COLORS)]
 
 
-def draw_success_against_speed(table: list[dict[str, Any]], policies: list[str]) -> Figure:
+def draw_success_against_speed(
+    table: list[dict[str, Any]], policies: list[str], paper: dict[str, PaperRow]
+) -> Figure:
     """Fig. 5: success rate with its 95 % interval against mean flight velocity, a line for each
     policy through its nominal speeds; the paper's points beside those of the same policies."""
     figure, axes = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
@@ -50,11 +52,17 @@ def draw_success_against_speed(table: list[dict[str, Any]], policies: list[str])
             capsize=3,
             label=policy,
         )
-        if policy in PAPER:
-            paper = PAPER[policy]
-            rate = 100 * paper.successes / PAPER_FLIGHTS
-            label = f"{paper.method} (paper)"
-            axes.plot(paper.mean_speed_m_s, rate, marker, mfc="none", mec=color, ms=10, label=label)
+        if policy in paper:
+            theirs = paper[policy]
+            axes.plot(
+                theirs.mean_speed_m_s,
+                100 * theirs.successes / PAPER_FLIGHTS,
+                marker,
+                mfc="none",
+                mec=color,
+                ms=10,
+                label=f"{theirs.method} (paper)",
+            )
     axes.set(xlabel="mean flight velocity [m/s]", ylabel="success rate [%]", ylim=(-3, 103))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatpilot.analysis.benchmark.rollout import ERROR, digest, study_world
-from splatpilot.analysis.benchmark.study import RolloutSpec, scenario_of
+from splatpilot.analysis.benchmark.rollout import digest, study_world
+from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.study_inputs import kept_flights
 from splatpilot.diagrams.flight import Flight, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.fly import film_flight, open_meshcat
@@ -47,9 +48,9 @@ def run(
     folder = StudyFolder(study)
     spec = find_flight(folder, id)
     row, recorded = folder.read(spec)
-    if row["outcome"] == ERROR:
-        raise ValueError(f"{id} ended in an error and cannot be compared: {row['error']}")
-    scenario = scenario_of(spec, folder.scenario(spec.scenario), folder.weights())
+    if not recorded:
+        raise ValueError(f"{id} could not be flown and cannot be compared: {row['reason']}")
+    _, scenario = next(kept_flights(folder, [spec]))
     world = study_world(scenario)
     out = out or study / "replays" / id
     if meshcat or video:

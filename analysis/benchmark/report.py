@@ -11,14 +11,15 @@ from splatpilot.analysis.benchmark.figures import (
     draw_trajectories,
     save_png,
 )
-from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, scenario_of
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.study_inputs import kept_flights
 from splatpilot.analysis.benchmark.tables import (
-    PAPER,
     PAPER_FLIGHTS,
+    PaperRow,
     compare,
     mean_of,
-    policy_table,
+    paper_rows,
     select,
     success_summary,
 )
@@ -35,6 +36,7 @@ def write_report(
     config: StudyConfig,
     rows: list[dict[str, Any]],
     timings: list[dict[str, Any]],
+    table: list[dict[str, Any]],
     absent: dict[str, str],
     damaged: list[str],
 ) -> None:
@@ -45,17 +47,18 @@ def write_report(
         folder, config: the study.
         rows: of its flights.
         timings: of the same flights.
+        table: `policy_table` of them.
         absent: the scenarios that were not flown, and why.
         damaged: files that were flown again in this run.
     """
-    table = policy_table(rows, config, len(absent))
-    figure = draw_success_against_speed(table, config.policy_names)
+    paper = paper_rows(config)
+    figure = draw_success_against_speed(table, config.policy_names, paper)
     success_png = save_png(figure, folder.path / "success_against_speed.png")
     sections = [
         f"<h1>Navigation benchmark</h1><p>{_scope(config, rows)}</p>",
         _warnings(config, rows, absent, damaged),
         "<h2>Policies</h2>" + _policies(table) + _timing(config, rows, timings),
-        "<h2>Beside the paper's Table I</h2>" + _paper(table, config),
+        "<h2>Beside the paper's Table I</h2>" + _paper(table, paper) if paper else "",
         "<h2>Success against speed</h2>"
         + html_page.image(success_png, "Success rate against velocity"),
         "<h2>Trajectories through one field</h2>" + _trajectories(folder, config, rows),
@@ -100,16 +103,16 @@ def _warnings(
     ]
     lines += [f"{escape(problem)}; the flight was flown again" for problem in damaged]
     lines += [
-        f"{escape(row['id'])} ended in an error and counts as a failure: {escape(row['error'])}"
+        f"{escape(row['id'])} could not be flown and counts as a failure: {escape(row['reason'])}"
         for row in rows
-        if "error" in row
+        if "reason" in row
     ]
     return "".join(f'<p class="warn">{line}</p>' for line in lines)
 
 
 def _policies(table: list[dict[str, Any]]) -> str:
     header = ["policy", "speed [m/s]", "flights", "success", "collision", "timeout", "left volume"]
-    header += ["error", "not run", "scenarios passed", "min. clearance [m]"]
+    header += ["infeasible", "not run", "scenarios passed", "min. clearance [m]"]
     header += ["velocity [m/s]", "path excess"]
     header += ["jerk [m/s³]", "smoothness"]
     rows = [
@@ -118,7 +121,7 @@ def _policies(table: list[dict[str, Any]]) -> str:
             f"{row['speed']:g}",
             str(row["flights"]),
             _rate(row),
-            *(str(row[name]) for name in ("collision", "timeout", "left_volume", "error")),
+            *(str(row[name]) for name in ("collision", "timeout", "left_volume", "infeasible")),
             str(row["not_run"]),
             _passed(row),
             html_page.number(row["min_clearance_m"], "+.2f"),
@@ -144,7 +147,7 @@ def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[
     return "<p>Mean times, of this machine and its load:</p>" + html_page.table(header, lines)
 
 
-def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
+def _paper(table: list[dict[str, Any]], paper: dict[str, PaperRow]) -> str:
     header = ["policy", "method in the paper", "success, paper", "success, here"]
     header += [
         "scenarios passed",
@@ -154,22 +157,16 @@ def _paper(table: list[dict[str, Any]], config: StudyConfig) -> str:
         "here [m/s]",
     ]
     rows = []
-    for policy, paper in PAPER.items():
-        there = f"{paper.successes}/{PAPER_FLIGHTS} ({paper.successes / PAPER_FLIGHTS:.0%})"
-        clearance, speed = f"{paper.min_clearance_m:+.2f}", f"{paper.mean_speed_m_s:.2f}"
-        flown = [row for row in table if row["policy"] == policy]
-        if not flown:
-            rows.append([policy, paper.method, there, "–", "–", clearance, "–", speed, "–"])
-        for row in flown:
-            ours = [html_page.number(row[name], form) for name, form in _COMPARED]
-            name = f"{policy} at {row['speed']:g} m/s"
-            here = [_rate(row), _passed(row)]
-            rows.append([name, paper.method, there, *here, clearance, ours[0], speed, ours[1]])
     for row in table:
-        if row["policy"] not in PAPER:
-            ours = [html_page.number(row[name], form) for name, form in _COMPARED]
-            name = f"{escape(row['policy'])} at {row['speed']:g} m/s"
-            rows.append([name, "–", "–", _rate(row), _passed(row), "–", ours[0], "–", ours[1]])
+        if row["policy"] not in paper:
+            continue
+        theirs = paper[row["policy"]]
+        name = f"{row['policy']} at {row['speed']:g} m/s"
+        there = f"{theirs.successes}/{PAPER_FLIGHTS} ({theirs.successes / PAPER_FLIGHTS:.0%})"
+        cells = [name, theirs.method, there, _rate(row), _passed(row)]
+        for measure, form in _COMPARED:
+            cells += [f"{getattr(theirs, measure):{form}}", html_page.number(row[measure], form)]
+        rows.append(cells)
     note = (
         '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
         "the scenarios here are others of the same kinds, passed where most flights succeed.</p>"
@@ -209,7 +206,7 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[dict[str,
     spec = _telling_flight(rows)
     if spec is None:
         return "<p>Nothing was flown.</p>"
-    scenario = scenario_of(spec, folder.scenario(spec.scenario), folder.weights())
+    _, scenario = next(kept_flights(folder, [spec]))
     world = make_world(scenario.world, scenario.seed)
     flights = {}
     for policy in config.policy_names:

@@ -3,10 +3,12 @@
 import functools
 import hashlib
 import io
+import itertools
 import json
 import platform
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,21 +16,23 @@ from pydrake.systems.framework import Diagram
 
 from splatpilot import _native
 from splatpilot.analysis.benchmark.flight_measures import flight_measures, shortest_length
-from splatpilot.analysis.benchmark.study import RolloutSpec, scenario_of
+from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.diagrams.flight import Flight, decision_times, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram, goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import dump_config, parse_config
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, way_lengths
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 ARRAYS = "times", "states", "commands", "clearances"
 """The arrays of `Flight` that a study keeps."""
 
-ERROR = "error"
-"""The outcome of a flight that an exception ended; it counts as a failure, and its row says why."""
+INFEASIBLE = "infeasible"
+"""The outcome of a flight that cannot be flown (`InfeasibleFlightError`); it counts as a failure,
+and its row says why."""
 
 
 class Rollout(NamedTuple):
@@ -43,38 +47,61 @@ class Rollout(NamedTuple):
     """How long it took, and where."""
 
 
-def fly_rollouts(specs: list[RolloutSpec], scenario: str, weights: dict[str, str]) -> list[Rollout]:
-    """Flies some flights of one scenario, given as YAML, in this process.
+class Fault(NamedTuple):
+    """An exception that ended a flight and is no failure of it."""
 
-    Configurations of Drake's own do not pickle, and so scenarios travel between processes as text.
+    id: str
+    """Of the flight."""
+    reason: str
+    """The exception in one line."""
+    traceback: str
+
+
+def fly_rollouts(flights: list[tuple[RolloutSpec, str]]) -> list[Rollout | Fault]:
+    """Flies some flights in this process, each with its scenario as YAML, up to the first fault.
+
+    Configurations of Drake's own do not pickle, and so scenarios travel between processes as text;
+    as does what went wrong, because exceptions of others may not either.
     """
-    parsed = parse_config(Scenario(), scenario, f"scenario {specs[0].scenario}")
-    return [fly_rollout(spec, parsed, weights) for spec in specs]
+    flown: list[Rollout | Fault] = []
+    for spec, text in flights:
+        try:
+            flown.append(fly_rollout(spec, parse_config(Scenario(), text, f"flight {spec.id}")))
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+            return [*flown, Fault(spec.id, reason, traceback.format_exc())]
+    return flown
 
 
-def fly_rollout(
-    spec: RolloutSpec, scenario: Scenario, weights: dict[str, str] | None = None
-) -> Rollout:
-    """Flies one flight of a study: `scenario` with the policy, speed and seed of `spec`; `weights`
-    as for `scenario_of`."""
+def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
+    """
+    Flies one flight of a study.
+
+    Flights fail by their outcome, or because they are infeasible. Nothing else is a failure of a
+    flight: a policy that raises, a scene that has gone or a want of memory says nothing about how
+    the policy flies, and a study that counted them would be wrong without anyone's noticing.
+
+    Args:
+        spec: the flight.
+        scenario: complete with the policy and seed of `spec`.
+    """
     started, cpu_started = time.perf_counter(), time.process_time()
-    flown = scenario_of(spec, scenario, weights)
     timing: dict[str, Any] = {"id": spec.id}
     try:
-        world = study_world(flown)
+        world = study_world(scenario)
         timing["world_s"] = time.perf_counter() - started
-        diagram = BuildFlightDiagram(flown, world, camera=False)
-        flight = fly(diagram, flown, world)
+        diagram = BuildFlightDiagram(scenario, world, camera=False)
+        flight = fly(diagram, scenario, world)
         shortest = shortest_length(
-            _way_lengths(world, flown), QuadrotorState.of(flight.states[0]).p_WB, flown.goal_radius
+            _way_lengths(world, scenario),
+            QuadrotorState.of(flight.states[0]).p_WB,
+            scenario.goal_radius,
         )
         measures = flight_measures(flight, shortest) | {"digest": digest(flight)}
-        timing |= _flight_timing(diagram, flown, flight)
-    except FileNotFoundError:
-        raise  # A scene that has gone is the study's error, not the flight's.
-    except (ValueError, RuntimeError) as error:
+        timing |= _flight_timing(diagram, scenario, flight)
+    except InfeasibleFlightError as error:
         flight = None
-        measures = {"success": False, "outcome": ERROR, "error": str(error)}
+        measures = {"success": False, "outcome": INFEASIBLE, "reason": str(error)}
     timing |= {
         "total_s": time.perf_counter() - started,
         "total_cpu_s": time.process_time() - cpu_started,
@@ -86,7 +113,7 @@ def fly_rollout(
 
 
 def encode(row: dict[str, Any], flight: Flight | None) -> bytes:
-    """The .npz of a flight; of one that an error ended without arrays."""
+    """The .npz of a flight; of one that could not be flown without arrays."""
     arrays = {"row": np.array(json.dumps(row))}
     if flight is not None:
         arrays |= {name: getattr(flight, name).astype(np.float32) for name in ARRAYS}
@@ -101,17 +128,12 @@ def digest(flight: Flight) -> str:
     return hashlib.sha256(b"".join(arrays)).hexdigest()[:16]
 
 
-def chunks(specs: list[RolloutSpec], size: int) -> Iterator[list[RolloutSpec]]:
+def chunks[Payload](
+    flights: Iterable[tuple[RolloutSpec, Payload]], size: int
+) -> Iterator[list[tuple[RolloutSpec, Payload]]]:
     """Neighbours through the same place, at most `size` of them together."""
-    chunk: list[RolloutSpec] = []
-    for spec in specs:
-        place = (spec.scenario, spec.seed)
-        if chunk and (len(chunk) == size or place != (chunk[-1].scenario, chunk[-1].seed)):
-            yield chunk
-            chunk = []
-        chunk.append(spec)
-    if chunk:
-        yield chunk
+    for _, neighbours in itertools.groupby(flights, lambda f: (f[0].scenario, f[0].seed)):
+        yield from map(list, itertools.batched(neighbours, size))
 
 
 def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict[str, float]:

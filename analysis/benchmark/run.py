@@ -1,27 +1,38 @@
 """`splatpilot benchmark`: flies a study, or the rest of one, and reports on it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from splatpilot.analysis.benchmark.provenance import program
 from splatpilot.analysis.benchmark.report import write_report
-from splatpilot.analysis.benchmark.rollout import Rollout
+from splatpilot.analysis.benchmark.rollout import Fault, Rollout
+from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights
 from splatpilot.analysis.benchmark.tables import format_table, policy_table
+from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.analysis.benchmark.workers import fly_all
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
-from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.cores import available_cores
+from splatpilot.systems.provenance import program
+
+Row = dict[str, Any]
+"""The specification and measures of a flight."""
 
 
 def run(
-    *, config: StudyConfig, out: Path, jobs: int | None = None, cluster: str | None = None
-) -> list[dict[str, Any]]:
+    *,
+    config: StudyConfig,
+    out: Path,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    shard: Shard | None = None,
+) -> list[Row]:
     """
     Flies the flights of a study that `out` does not hold yet, each written as it ends, and leaves
     the tables and the report (`splatpilot.analysis.benchmark.study_folder` says which files).
@@ -35,49 +46,85 @@ def run(
         out: the study's folder.
         jobs: worker processes; one for each core by default.
         cluster: address of a dask scheduler to fly on instead.
+        shard: flies this part of the study alone, and leaves its flights to be merged.
 
     Returns:
-        The rows of `table.csv`.
+        The rows of `table.csv`; none of a shard.
 
     Raises:
-        ValueError: for a study that cannot be flown, or another one in `out`.
-        OSError: if `out` cannot be written or the workers fail.
+        ValueError: for a study that cannot be flown, another one in `out`, or a flight that an
+            exception ended which is no failure of it (`InfeasibleFlightError` is one).
+        OSError: if `out` cannot be written, the workers fail, or nothing can be flown because all
+            scenes are absent.
     """
     if jobs is not None and jobs < 1:
         raise ValueError(f"--jobs is {jobs}; it must be at least 1")
     scenarios = config.load_scenarios()
-    absent = absent_scenes(scenarios)
-    folder = StudyFolder(out)
-    flown_by = program()
-    flyable = {name: scenarios[name] for name in scenarios if name not in absent}
-    folder.begin(config, flyable, flown_by)
+    share = config.rollouts() if shard is None else shard.of(config.rollouts())
+    names = {spec.scenario for spec in share}
+    absent = absent_scenes({name: scenarios[name] for name in scenarios if name in names})
+    specs = [spec for spec in share if spec.scenario not in absent]
+    if not specs and shard is None:
+        raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
+    folder, flown_by = StudyFolder(out), program()
+    folder.claim(config, flown_by, shard)
+    flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
+    keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")
+    for file in config.unflown_policies():
+        print(
+            f"The policy that {file} names is not flown, but those of --policies are; add "
+            f"{SCENARIO} to them to fly it."
+        )
 
-    specs = [spec for spec in config.rollouts() if spec.scenario not in absent]
-    missing, damaged = missing_rollouts(folder, specs)
+    rows, damaged = flights_there(folder, specs)
     for problem in damaged:
         print(f"{problem}; this flight is flown again")
-    if missing and len(missing) < len(specs):
+    missing = [spec for spec in specs if spec.id not in rows]
+    if rows and missing:
         _check_program(folder, flown_by)
-        print(f"{len(specs) - len(missing)} of {len(specs)} flights are there already.")
-    kept = {name: dump_config(folder.scenario(name)) for name in flyable}
-    done = [folder.read(spec)[0] for spec in specs if spec not in set(missing)]
-    flights = fly_all(missing, kept, jobs or available_cores(), cluster, folder.weights())
-    _keep(folder, flights, done, len(specs))
+        print(f"{len(rows)} of {len(specs)} flights are there already.")
+    flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
+    with closing(flights):
+        _keep(folder, flights, rows, len(specs))
+    if shard is not None:
+        print(f"Wrote the {len(specs)} flights of shard {shard} in {out}; join all shards with")
+        print("`splatpilot merge OUT SHARD...`")
+        return []
+    return conclude(folder, config, [rows[spec.id] for spec in specs], absent, damaged)
 
-    rows = [folder.read(spec)[0] for spec in specs]
-    timings = [folder.read_timing(spec.id) for spec in specs]
+
+def conclude(
+    folder: StudyFolder,
+    config: StudyConfig,
+    rows: list[Row],
+    absent: dict[str, str],
+    damaged: list[str],
+) -> list[Row]:
+    """
+    Writes and prints the tables of a study, and writes its report.
+
+    Args:
+        folder, config: the study.
+        rows: of all its flights.
+        absent: the scenarios that were not flown, and why.
+        damaged: what was flown again.
+
+    Returns:
+        The rows of `table.csv`.
+    """
+    timings = [folder.read_timing(row["id"]) for row in rows]
     table = policy_table(rows, config, len(absent))
     folder.write_table("rollouts.csv", rows)
     folder.write_table("timings.csv", timings)
     folder.write_table("table.csv", table)
-    write_report(folder, config, rows, timings, absent, damaged)
+    write_report(folder, config, rows, timings, table, absent, damaged)
     print(format_table(table))
     for row in rows:
-        if "error" in row:
-            print(f"{row['id']} ended in an error: {row['error']}")
-    print(f"Wrote rollouts.csv, timings.csv, table.csv and report.html in {out}")
+        if "reason" in row:
+            print(f"{row['id']} could not be flown: {row['reason']}")
+    print(f"Wrote rollouts.csv, timings.csv, table.csv and report.html in {folder.path}")
     return table
 
 
@@ -93,20 +140,20 @@ def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
     return absent
 
 
-def missing_rollouts(
+def flights_there(
     folder: StudyFolder, specs: list[RolloutSpec]
-) -> tuple[list[RolloutSpec], list[str]]:
-    """The flights that are not in the folder, and what is wrong with the files that are."""
-    missing, damaged = [], []
+) -> tuple[dict[str, Row], list[str]]:
+    """The rows by id of the flights that are in the folder, and what is wrong with the files of
+    others."""
+    rows, damaged = {}, []
     for spec in tqdm(specs, "checking", leave=False, disable=None):
         try:
-            folder.read(spec)
+            rows[spec.id] = folder.read(spec)[0]
         except FileNotFoundError:
-            missing.append(spec)
+            continue
         except ValueError as error:
-            missing.append(spec)
             damaged.append(str(error))
-    return missing, damaged
+    return rows, damaged
 
 
 def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
@@ -120,13 +167,24 @@ def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
 
 
 def _keep(
-    folder: StudyFolder, flights: Iterable[Rollout], done: list[dict[str, Any]], total: int
+    folder: StudyFolder, flights: Iterator[Rollout | Fault], rows: dict[str, Row], total: int
 ) -> None:
-    """Writes flights as they end; `done` are the rows of those that were there."""
-    successes = [row["success"] for row in done]
-    with tqdm(total=total, initial=len(successes), desc="flying", unit="flight") as bar:
-        for rollout in flights:
-            folder.write(rollout)
-            successes.append(rollout.row["success"])
-            bar.set_postfix_str(f"{sum(successes) / len(successes):.0%} success", refresh=False)
+    """Writes flights as they end, and adds their rows to those that were there.
+
+    Raises:
+        ValueError: at a fault.
+    """
+    successes = sum(row["success"] for row in rows.values())
+    with tqdm(total=total, initial=len(rows), desc="flying", unit="flight") as bar:
+        for flown in flights:
+            if isinstance(flown, Fault):
+                raise ValueError(
+                    f"flight {flown.id} was ended by an exception that is no failure of a flight, "
+                    f"{flown.reason} (traceback in {folder.write_fault(flown)}); mend it and run "
+                    "the same command again"
+                )
+            folder.write(flown)
+            rows[flown.row["id"]] = flown.row
+            successes += flown.row["success"]
+            bar.set_postfix_str(f"{successes / len(rows):.0%} success", refresh=False)
             bar.update()

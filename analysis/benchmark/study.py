@@ -2,12 +2,14 @@
 again."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES, policy_named
+import yaml
+
+from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.systems.configuration import load_config
@@ -34,7 +36,7 @@ class StudyConfig:
 
     # Names of the benchmark's scenarios, or YAML files of others.
     scenarios: list[str] = field(default_factory=lambda: list(benchmark_scenarios()))
-    # Names of policies, or files of weights (.npz), whose policies are named after the file.
+    # "[LABEL=]POLICY[:FIELD=VALUE...]" each, see `variants.parse_variant`.
     policies: list[str] = field(default_factory=lambda: list(BENCHMARK_POLICIES))
     # [m/s] Nominal speeds.
     speeds: list[float] = field(default_factory=lambda: [2.0])
@@ -44,18 +46,29 @@ class StudyConfig:
     overrides: list[str] = field(default_factory=list)
 
     @property
+    def variants(self) -> list[Variant]:
+        """The policies, read."""
+        return [parse_variant(policy) for policy in self.policies]
+
+    @property
     def policy_names(self) -> list[str]:
-        """The policies by the names that their flights bear."""
-        return [Path(policy).stem for policy in self.policies]
+        """The policies by the labels that their flights bear."""
+        return [variant.label for variant in self.variants]
+
+    @property
+    def flies_own_policies(self) -> bool:
+        """Whether the scenarios' own policies fly."""
+        return any(variant.policy == SCENARIO for variant in self.variants)
 
     def rollouts(self) -> list[RolloutSpec]:
         """All flights; those through the same place stand together."""
+        policies = self.policy_names
         return [
             RolloutSpec(Path(scenario).stem, policy, speed, seed)
             for scenario in self.scenarios
             for seed in range(self.seeds)
             for speed in self.speeds
-            for policy in self.policy_names
+            for policy in policies
         ]
 
     def load_scenarios(self) -> dict[str, Scenario]:
@@ -68,50 +81,98 @@ class StudyConfig:
         """
         if not 1 <= self.seeds <= TRAINING_SEEDS:
             raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
-        names = [Path(scenario).stem for scenario in self.scenarios]
-        given: dict[str, list[Any]]
-        given = {"scenario": names, "policy": self.policy_names, "speed": self.speeds}
-        for what, values in given.items():
-            if not values:
-                raise ValueError(f"the study has no {what}; name at least one")
-            twice = [value for value in values if values.count(value) > 1]
-            if twice:
-                raise ValueError(
-                    f"the {what} {twice[0]} is given twice; give it once, or rename the file"
-                )
-        for override in self.overrides:
-            field = override.partition("=")[0].partition(".")[0]
-            if field in ("policy", "seed"):
-                raise ValueError(
-                    f"the override {override!r} has no place in a study: each of its flights has "
-                    "its own policy, speed and seed; name them with --policies (also files of "
-                    "weights), --speeds and --seeds"
-                )
         for speed in self.speeds:
             if not 0.0 < speed < math.inf:
                 raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
-            for policy in self.policies:
-                policy_named(policy, speed)
+        self._check_names()
+        for override in self.overrides:
+            _check_override(override)
+        for variant in self.variants:
+            for speed in self.speeds if variant.policy != SCENARIO else ():
+                variant.config(speed, None)
         scenarios = {}
-        for name, scenario in zip(names, self.scenarios, strict=True):
-            loaded = load_config(Scenario(), scenario_file(scenario), self.overrides)
+        for scenario in self.scenarios:
+            file, name = scenario_file(scenario), Path(scenario).stem
+            scenarios[name] = load_config(Scenario(), file, self.overrides)
             try:
-                loaded.validate()
+                scenarios[name].validate()
+                self._check_own_policy(file, scenarios[name].policy)
             except ValueError as error:
                 raise ValueError(f"scenario {name}: {error}") from None
-            scenarios[name] = loaded
         return scenarios
 
+    def _check_names(self) -> None:
+        """Raises ValueError unless everything is given, once, and all flights differ in name."""
+        given: dict[str, list[Any]] = {
+            "scenario": [Path(scenario).stem for scenario in self.scenarios],
+            "policy": self.policy_names,
+            "speed": [f"{speed:g}" for speed in self.speeds],
+            "flight": [spec.id for spec in self.rollouts()],
+        }
+        for what, names in given.items():
+            if not names:
+                raise ValueError(f"the study has no {what}; name at least one")
+            seen = set()
+            for name in names:
+                if name in seen:
+                    raise ValueError(
+                        f"the {what} {name} is given twice; give it once, or another name: "
+                        "policies take one as LABEL=POLICY, scenarios that of their file"
+                    )
+                seen.add(name)
 
-def scenario_of(
-    spec: RolloutSpec, scenario: Scenario, weights: Mapping[str, str] | None = None
-) -> Scenario:
-    """The scenario of one flight: with its policy, speed and seed.
+    def _check_own_policy(self, file: Path, policy: Any) -> None:
+        """Raises ValueError if the scenarios' own policies fly and this one's cannot."""
+        own = [variant for variant in self.variants if variant.policy == SCENARIO]
+        if not own:
+            return
+        if not has_own_policy(file):
+            raise ValueError(f"{file} has no `policy`, which --policies {SCENARIO} would fly")
+        speed = getattr(policy, "speed", getattr(getattr(policy, "lattice", None), "speed", None))
+        if speed is not None and self.speeds != [speed]:
+            raise ValueError(
+                f"the policy of {file} flies at {speed:g} m/s, its own speed; give --speeds "
+                f"{speed:g}"
+            )
+        for variant in own:
+            variant.config(self.speeds[0], policy)
 
-    Args:
-        spec: the flight.
-        scenario: without these.
-        weights: files of weights by the names of their policies; others fly as they ship.
-    """
-    policy = (weights or {}).get(spec.policy, spec.policy)
-    return replace(scenario, policy=policy_named(policy, spec.speed), seed=spec.seed)
+    def unflown_policies(self) -> list[Path]:
+        """Files of scenarios with a policy of their own that this study does not fly."""
+        if self.flies_own_policies:
+            return []
+        return [file for file in map(scenario_file, self.scenarios) if has_own_policy(file)]
+
+
+def has_own_policy(file: Path) -> bool:
+    """Whether a scenario file says which policy flies it; False of what is no such file."""
+    try:
+        root = yaml.compose(file.read_text(), yaml.SafeLoader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return False
+    fields = root.value if isinstance(root, yaml.MappingNode) else []
+    return any(name.value == "policy" for name, _ in fields)
+
+
+def default_policies(scenarios: list[str]) -> list[str]:
+    """Who flies where nobody is named: the scenarios' own policies, if all of them have one, or all
+    of ours."""
+    own = all(has_own_policy(scenario_file(scenario)) for scenario in scenarios)
+    return [SCENARIO] if own else list(BENCHMARK_POLICIES)
+
+
+def _check_override(override: str) -> None:
+    """Raises ValueError for what differs between the flights of a study."""
+    field, _, value = override.partition("=")
+    section, _, inner = field.partition(".")
+    if section == "policy":
+        example = f"NAME:{inner}={value}" if inner else "NAME"
+        raise ValueError(
+            f"the override {override!r} has no place in a study, whose flights have their own "
+            f"policies: write it as one of them, --policies {example}"
+        )
+    if section == "seed":
+        raise ValueError(
+            f"the override {override!r} has no place in a study, whose flights have their own "
+            "seeds; say how many with --seeds"
+        )

@@ -1,11 +1,12 @@
 """A study on disk.
 
-    study.yaml       what is flown, and the program that flies it
+    study.yaml       what is flown, and the program that flies it; of a shard, which it is
     scenarios/       the scenarios, every field written out
     scenes/          the reconstructed scenes they fly in
-    weights/         of policies that were given as files
+    weights/         of policies that were given as files, by their labels
     rollouts/        a trajectory and its measures for each flight
     timings/         how long each took, and where: all that differs between two runs of a study
+    errors/          the traceback of a flight that stopped the study
     rollouts.csv, timings.csv, table.csv, report.html
 
 A flight is there when its file in `rollouts/` is; files appear whole.
@@ -22,11 +23,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from splatpilot.analysis.benchmark.rollout import ARRAYS, Rollout
+from splatpilot.analysis.benchmark.rollout import ARRAYS, Fault, Rollout
+from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
-from splatpilot.systems.configuration import dump_config, load_config
+from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 
 FORMAT_VERSION = 1
@@ -38,20 +38,24 @@ class StudyFolder:
 
     path: Path
 
+    def weights(self, label: str) -> Path:
+        """The file that holds the weights of a policy that was given as a file."""
+        return self.path / "weights" / f"{label}.npz"
+
     def trajectory(self, id: str) -> Path:
         """The file that holds a flight."""
         return self.path / "rollouts" / f"{id}.npz"
 
-    def begin(
-        self, config: StudyConfig, scenarios: dict[str, Scenario], program: dict[str, str]
+    def claim(
+        self, config: StudyConfig, program: dict[str, str], shard: Shard | None = None
     ) -> None:
         """
         Makes the folder, or checks that the one there is of the same study.
 
         Args:
             config: what is flown.
-            scenarios: by name, those that can be flown here.
             program: `provenance.program()`.
+            shard: which part of the study is flown here; all of it by default.
 
         Raises:
             ValueError: if another study, or something else, is there.
@@ -62,6 +66,8 @@ class StudyFolder:
             "study": yaml.safe_load(dump_config(config)),
             "program": program,
         }
+        if shard is not None:
+            described["shard"] = str(shard)
         if (self.path / "study.yaml").is_file():
             self._check_same(described)
         elif self.path.is_dir() and any(self.path.iterdir()):
@@ -71,65 +77,25 @@ class StudyFolder:
         require_writable_folder(self.path)
         for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
             (self.path / folder).mkdir(exist_ok=True)
-        for policy in config.policies:
-            if policy.endswith(".npz"):
-                self._keep_weights(Path(policy))
-        for name, scenario in scenarios.items():
-            self._keep_scenario(name, scenario)
+        shutil.rmtree(self.path / "errors", ignore_errors=True)
         if not (self.path / "study.yaml").is_file():
             with written_atomically(self.path / "study.yaml") as path:
                 path.write_text(yaml.safe_dump(described, sort_keys=False))
 
     def _check_same(self, described: dict[str, Any]) -> None:
         there = self._described()
-        if there["study"] == described["study"]:
-            return
         for name, value in described["study"].items():
             if there["study"].get(name) != value:
                 raise ValueError(
                     f"{self.path} holds a study with {name} {there['study'].get(name)}, not "
                     f"{value}; choose another folder with --out, or ask for the same study"
                 )
-
-    def _keep_scenario(self, name: str, scenario: Scenario) -> None:
-        file = self.path / "scenarios" / f"{name}.yaml"
-        if isinstance(scenario.world, SceneSource):
-            self._keep_scene(scenario.world)
-        text = dump_config(scenario)
-        if file.is_file() and file.read_text() != text:
+        parts = [f"shard {d['shard']}" if "shard" in d else "all" for d in (there, described)]
+        if parts[0] != parts[1]:
             raise ValueError(
-                f"{file} differs from the scenario {name} of this program; choose another folder "
-                "with --out, or finish the study with the program that began it"
+                f"{self.path} holds {parts[0]} of this study, not {parts[1]}; choose another "
+                "folder with --out"
             )
-        with written_atomically(file) as path:
-            path.write_text(text)
-
-    def _keep_scene(self, world: SceneSource) -> None:
-        """Copies a scene into the study, and lets `world` name the copy."""
-        scene = find_scene(world)
-        kept = self.path / "scenes" / scene.name
-        if not kept.exists():
-            partial = kept.with_name(f".{kept.name}.partial")
-            if scene.is_dir():
-                shutil.rmtree(partial, ignore_errors=True)
-                shutil.copytree(scene, partial)
-            else:
-                shutil.copyfile(scene, partial)
-            partial.rename(kept)
-        world.path = f"scenes/{kept.name}"
-
-    def _keep_weights(self, file: Path) -> None:
-        kept = self.path / "weights" / file.name
-        if kept.is_file() and kept.read_bytes() != file.read_bytes():
-            raise ValueError(
-                f"{file} has changed since {self.path} was begun; choose another folder with --out"
-            )
-        with written_atomically(kept) as path:
-            shutil.copyfile(file, path)
-
-    def weights(self) -> dict[str, str]:
-        """The files of the policies that were given as files, by name."""
-        return {file.stem: str(file.absolute()) for file in self.path.glob("weights/*.npz")}
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
@@ -159,19 +125,13 @@ class StudyFolder:
         return StudyConfig(**self._described()["study"])
 
     def program(self) -> dict[str, str]:
-        """What `begin` was told of the program."""
+        """What `claim` was told of the program."""
         return self._described()["program"]
 
-    def scenario(self, name: str) -> Scenario:
-        """A scenario as this study flies it, its scene in this folder.
-
-        Raises:
-            FileNotFoundError, ValueError: if it is not there or damaged.
-        """
-        scenario = load_config(Scenario(), self.path / "scenarios" / f"{name}.yaml")
-        if isinstance(scenario.world, SceneSource):
-            scenario.world.path = str((self.path / scenario.world.path).absolute())
-        return scenario
+    def shard(self) -> Shard | None:
+        """Which part of the study is flown here; None for all of it."""
+        text = self._described().get("shard")
+        return None if text is None else Shard.parse(text)
 
     def write(self, rollout: Rollout) -> None:
         """Keeps a flight."""
@@ -181,9 +141,16 @@ class StudyFolder:
         with written_atomically(self.trajectory(id)) as path:
             path.write_bytes(rollout.trajectory)
 
+    def write_fault(self, fault: Fault) -> Path:
+        """Keeps the traceback of a fault; returns its file."""
+        file = self.path / "errors" / f"{fault.id}.txt"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(fault.traceback)
+        return file
+
     def read(self, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """
-        The row and the arrays of a flight; no arrays of one that an error ended.
+        The row and the arrays of a flight; no arrays of one that could not be flown.
 
         Raises:
             FileNotFoundError: if it is not there.

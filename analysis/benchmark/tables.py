@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from splatpilot.analysis.benchmark.rollout import ERROR
+from splatpilot.analysis.benchmark.rollout import INFEASIBLE
 from splatpilot.analysis.benchmark.statistics import PairedComparison, mcnemar, wilson_interval
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.diagrams.flight import Outcome
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
 
 MEASURES = (
     "min_clearance_m",
@@ -33,12 +34,18 @@ PAPER = {
     "diffaero": PaperRow("DiffAero", 16, 0.37, 2.12),
     "depthnav": PaperRow("DepthNav", 14, 0.30, 2.31),
     "agile_autonomy": PaperRow("Agile Autonomy", 5, -0.01, 2.50),
-    "student_depth": PaperRow("Ours, depth", 10, 0.33, 2.28),
-    "student_rgb": PaperRow("Ours, RGB", 5, -0.09, 2.51),
 }
 """The paper's Table I, by the names of our policies."""
 
 PAPER_FLIGHTS = 17
+
+
+def paper_rows(config: StudyConfig) -> dict[str, PaperRow]:
+    """The rows of the paper's table that a study has beside it: of the policies that fly as they
+    ship, in the benchmark's scenarios as they are, all of them."""
+    if config.overrides or set(config.scenarios) != set(benchmark_scenarios()):
+        return {}
+    return {policy: PAPER[policy] for policy in config.policies if policy in PAPER}
 
 
 def select(rows: list[dict[str, Any]], **values: object) -> list[dict[str, Any]]:
@@ -58,7 +65,7 @@ def success_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "wilson_upper": interval.upper,
     } | {
         str(outcome): sum(row["outcome"] == outcome for row in rows)
-        for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, ERROR)
+        for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, INFEASIBLE)
     }
 
 
@@ -110,8 +117,9 @@ def compare(rows: list[dict[str, Any]], first: str, second: str, speed: float) -
 
 def format_table(table: list[dict[str, Any]]) -> str:
     """The table of policies for a terminal."""
+    width = max([16, *(len(row["policy"]) + 2 for row in table)])
     lines = [
-        f"{'policy':<16}{'speed':>6}{'success':>12}{'95 % interval':>16}{'scenarios':>11}"
+        f"{'policy':<{width}}{'speed':>6}{'success':>12}{'95 % interval':>16}{'scenarios':>11}"
         f"{'clearance':>11}{'velocity':>10}{'not run':>9}"
     ]
     for row in table:
@@ -119,7 +127,7 @@ def format_table(table: list[dict[str, Any]]) -> str:
         passed = f"{row['scenarios_passed']}/{row['scenarios']}"
         interval = f"{row['wilson_lower']:.0%} to {row['wilson_upper']:.0%}"
         lines.append(
-            f"{row['policy']:<16}{row['speed']:>6g}{rate:>12}{interval:>16}{passed:>11}"
+            f"{row['policy']:<{width}}{row['speed']:>6g}{rate:>12}{interval:>16}{passed:>11}"
             f"{row['min_clearance_m']:>+9.2f} m{row['mean_speed_m_s']:>6.2f} m/s{row['not_run']:>9}"
         )
     return "\n".join(lines)

@@ -1,10 +1,12 @@
 """Where the flights of a study are flown: worker processes here, or on a cluster."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
-from splatpilot.analysis.benchmark.rollout import Rollout, chunks, fly_rollouts
+from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
 from splatpilot.analysis.benchmark.study import RolloutSpec
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.configuration import dump_config
 
 CONNECT_TIMEOUT = 10.0
 """[s], for a scheduler to answer."""
@@ -12,39 +14,33 @@ CONNECT_TIMEOUT = 10.0
 _CHUNK = 6
 """Most flights through one place handed out together: what of a kill is flown again."""
 
-_Work = tuple[list[RolloutSpec], str, dict[str, str]]
+_Work = Iterator[list[tuple[RolloutSpec, str]]]
 """Arguments of `fly_rollouts`."""
 
 
 def fly_all(
-    specs: list[RolloutSpec],
-    scenarios: dict[str, str],
-    jobs: int,
-    cluster: str | None = None,
-    weights: dict[str, str] | None = None,
-) -> Iterator[Rollout]:
+    flights: Iterable[tuple[RolloutSpec, Scenario]], jobs: int, cluster: str | None = None
+) -> Iterator[Rollout | Fault]:
     """
     Flies rollouts in worker processes and yields them as they end, in any order.
 
     Args:
-        specs: what to fly; neighbours through the same place are flown by the same worker.
-        scenarios: by name, as YAML, without policy, speed and seed.
+        flights: what to fly; neighbours through the same place are flown by the same worker.
         jobs: worker processes on this machine, 1 or more.
         cluster: address of a dask scheduler, whose workers fly instead.
-        weights: files of weights by the names of their policies; others fly as they ship.
 
     Raises:
         OSError: if a worker process dies, or the cluster cannot be reached; all that was yielded
             before is good.
     """
-    work = [(chunk, scenarios[chunk[0].scenario], weights or {}) for chunk in chunks(specs, _CHUNK)]
+    work = chunks(((spec, dump_config(scenario)) for spec, scenario in flights), _CHUNK)
     if cluster is not None:
         yield from _on_cluster(work, cluster)
         return
     yield from _in_processes(work, jobs)
 
 
-def _in_processes(work: list[_Work], jobs: int) -> Iterator[Rollout]:
+def _in_processes(work: _Work, jobs: int) -> Iterator[Rollout | Fault]:
     from joblib import Parallel, delayed
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -53,7 +49,7 @@ def _in_processes(work: list[_Work], jobs: int) -> Iterator[Rollout]:
     parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
     fly = delayed(fly_rollouts)
     try:
-        for rollouts in parallel(fly(*part) for part in work):
+        for rollouts in parallel(map(fly, work)):
             yield from rollouts
     except TerminatedWorkerError as error:
         raise OSError(
@@ -65,7 +61,7 @@ def _in_processes(work: list[_Work], jobs: int) -> Iterator[Rollout]:
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
-def _on_cluster(work: list[_Work], address: str) -> Iterator[Rollout]:
+def _on_cluster(work: _Work, address: str) -> Iterator[Rollout | Fault]:
     try:
         from distributed import Client, as_completed
         from distributed.scheduler import KilledWorker
@@ -82,7 +78,7 @@ def _on_cluster(work: list[_Work], address: str) -> Iterator[Rollout]:
         ) from None
     with client:
         # A chunk whose worker dies is given to another; flights are pure, so that costs only time.
-        futures = client.map(fly_rollouts, *zip(*work, strict=True), pure=False, retries=3)
+        futures = client.map(fly_rollouts, list(work), pure=False, retries=3)
         try:
             for _, rollouts in as_completed(futures, with_results=True):
                 yield from rollouts

@@ -13,6 +13,7 @@ from splatpilot.analysis.commands import (
     fidelity,
     fly,
     measure,
+    merge,
     reconstruct,
     replay,
     tour,
@@ -22,6 +23,7 @@ from splatpilot.analysis.commands import (
 COMMANDS = (
     fly,
     benchmark,
+    merge,
     replay,
     difficulty,
     reconstruct,

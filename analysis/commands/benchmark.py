@@ -27,7 +27,18 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         f"{QUICK_SEEDS} seeds, unless other ones are named",
     )
     benchmark.add_argument(
-        "--policies", type=_names, metavar="A,B.npz", help="names or files of weights; default: all"
+        "--policies",
+        metavar="A,B.npz,C:FIELD=VALUE,...",
+        help="names, files of weights or module:Class, with LABEL= before and fields behind; "
+        "scenario: each scenario's own; default: that, where all have one, or else all",
+    )
+    benchmark.add_argument(
+        "--sweep",
+        action="append",
+        default=[],
+        metavar="A:FIELD=1,2,3",
+        help="a policy with each of these values of a field, and all combinations of the values "
+        "of several (repeatable)",
     )
     benchmark.add_argument(
         "--scenarios", type=_names, metavar="P02,FILE.yaml", help="default: all of the benchmark"
@@ -38,6 +49,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     benchmark.add_argument(
         "--cluster", metavar="ADDRESS", help="fly on the workers of this dask scheduler instead"
     )
+    benchmark.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="fly the I-th of N parts, in a folder of its own; `splatpilot merge` joins them",
+    )
     add_overrides(benchmark, "observation.depth_multiplicative=0.03")
 
 
@@ -47,20 +63,33 @@ def _names(text: str) -> list[str]:
 
 def _benchmark(options: argparse.Namespace) -> None:
     from splatpilot.analysis.benchmark import run as benchmark
-    from splatpilot.analysis.benchmark.study import StudyConfig
+    from splatpilot.analysis.benchmark.shard import Shard
+    from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
+    from splatpilot.analysis.benchmark.variants import split_policies, sweep
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     config = StudyConfig(overrides=options.overrides)
     if options.quick:
         config.scenarios, config.policies = list(QUICK_SCENARIOS), list(QUICK_POLICIES)
         config.seeds = QUICK_SEEDS
-    for name in ("policies", "scenarios", "seeds"):
+    for name in ("scenarios", "seeds"):
         value = getattr(options, name)
         if value is not None:
             setattr(config, name, value)
+    if options.policies is not None or options.sweep:
+        swept = [variant for text in options.sweep for variant in sweep(text)]
+        config.policies = [*split_policies(options.policies or ""), *swept]
+    elif not options.quick:
+        config.policies = default_policies(config.scenarios)
     if options.speeds is not None:
         config.speeds = [_speed(text) for text in options.speeds]
-    benchmark.run(config=config, out=options.out, jobs=options.jobs, cluster=options.cluster)
+    benchmark.run(
+        config=config,
+        out=options.out,
+        jobs=options.jobs,
+        cluster=options.cluster,
+        shard=None if options.shard is None else Shard.parse(options.shard),
+    )
 
 
 def _speed(text: str) -> float:

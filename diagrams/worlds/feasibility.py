@@ -9,6 +9,7 @@ from scipy.ndimage import label
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf_from_distance_field import cubes_of_points
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
@@ -22,7 +23,8 @@ def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -
     """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
 
     Raises:
-        ValueError: for a negative seed, or if none of `TRIES` instances is feasible.
+        ValueError: for a negative seed.
+        InfeasibleFlightError: if none of `TRIES` instances is feasible.
     """
     if seed < 0:
         raise ValueError(f"seed = {seed} must be 0 or more")
@@ -32,7 +34,7 @@ def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -
         name = blueprint.name
         if is_feasible(blueprint):
             return blueprint
-    raise ValueError(
+    raise InfeasibleFlightError(
         f"{name}: none of {TRIES} instances drawn from seed {seed} leaves a vehicle of radius "
         f"{VEHICLE_RADIUS} m a way from start to goal; use fewer or smaller obstacles, or more room"
     )

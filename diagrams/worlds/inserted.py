@@ -20,6 +20,7 @@ from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanc
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import Box, Capsule, Shape, Sphere
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 GAP = 1.3 * 2 * VEHICLE_RADIUS
@@ -56,7 +57,8 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
     such a way are dropped, and redrawn from the seed; start and goal too, if they are drawn.
 
     Raises:
-        FileNotFoundError, ValueError: see `read_scene_world`; or if no draw leaves such a way.
+        FileNotFoundError, ValueError: see `read_scene_world`.
+        InfeasibleFlightError: if no draw leaves such a way.
     """
     config.validate()
     scene = read_scene_world(config, seed)
@@ -73,7 +75,7 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         esdf = _compose(world.esdf, solids)
         if _leaves_way(esdf, world.p_WS, world.p_WG, config.gap):
             return _with(world, solids, esdf, seed)
-    raise ValueError(
+    raise InfeasibleFlightError(
         f"{config.path}: none of {TRIES} draws of {config.least} to {config.most} solids leaves a "
         f"way of {config.gap:.2f} m width from start to goal; use a smaller gap or fewer solids"
     )

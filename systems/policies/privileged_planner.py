@@ -9,6 +9,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
@@ -72,8 +73,8 @@ def plan(
         params: the vehicle's; drag and gravity tell its acceleration from its attitude.
 
     Raises:
-        ValueError: if the state is not finite or its quaternion zero, or if no way leads from the
-            free space around p_WB to the goal.
+        ValueError: if the state is not finite or its quaternion zero.
+        InfeasibleFlightError: if no way leads from the free space around p_WB to the goal.
     """
     state = np.asarray(state, dtype=float)
     if state.shape != (13,) or not np.isfinite(state).all():
@@ -98,7 +99,7 @@ def _check_way_exists(p_WB: np.ndarray, field: Esdf, toa: TimeOfArrival) -> None
     # a point a whole voxel clear of contact, in a voxel no way leads from, is cut off.
     clearance = float(field.distance(p_WB)) - VEHICLE_RADIUS
     if clearance > field.voxel_size:
-        raise ValueError(
+        raise InfeasibleFlightError(
             f"No way leads from p_WB = {np.round(p_WB, 2).tolist()} m, clearance "
             f"{clearance:.2f} m, to the goal p_WG = {np.round(toa.p_WG, 2).tolist()} m: every "
             f"passage is unknown or narrower than the vehicle, {2.0 * VEHICLE_RADIUS:.2f} m, and "
@@ -130,9 +131,10 @@ class PrivilegedPlanner(LeafSystem):
     Context's cache.
 
     Raises:
-        ValueError: from the constructor on a config out of range; from an update if the goal is
-            outside the known volume, too close to an obstacle or cut off from the vehicle, or if
-            the state is not finite.
+        ValueError: from the constructor on a config out of range; from an update if the state is
+            not finite.
+        InfeasibleFlightError: from an update if the goal is outside the known volume, too close to
+            an obstacle or cut off from the vehicle.
     """
 
     state_input_port = input_port("state")

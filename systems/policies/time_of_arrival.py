@@ -24,6 +24,7 @@ from splatpilot.systems.collision.trilinear import (
     trilinear,
     trilinear_with_gradient,
 )
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 OPEN_CLEARANCE = 0.6
@@ -139,7 +140,7 @@ def way_lengths(field: Esdf, p_WG: np.ndarray) -> TimeOfArrival:
     the times of arrival at 1 m/s, however near the obstacles.
 
     Raises:
-        ValueError: see `time_of_arrival`.
+        ValueError, InfeasibleFlightError: see `time_of_arrival`.
     """
     return time_of_arrival(field, p_WG, slowness=np.ones_like)
 
@@ -159,8 +160,9 @@ def time_of_arrival(
         slowness: S(d) [s/m].
 
     Raises:
-        ValueError: if the field is not conservative, or the goal not finite, outside the field's
-            box, or at less clearance than `margin`.
+        ValueError: if the field is not conservative, or the goal not finite.
+        InfeasibleFlightError: if the goal is outside the field's box, or at less clearance than
+            `margin`.
     """
     if not field.occupied_outside:
         raise ValueError(
@@ -173,11 +175,13 @@ def time_of_arrival(
     where = f"The goal p_WG = {_text(p_WG)} m"
     box = f"from {_text(field.lower_W)} to {_text(field.upper_W)} m"
     if np.any(p_WG < field.lower_W) or np.any(p_WG > field.upper_W):
-        raise ValueError(f"{where} lies outside the known volume {box}; choose a goal inside it.")
+        raise InfeasibleFlightError(
+            f"{where} lies outside the known volume {box}; choose a goal inside it."
+        )
     goal_distance = field.distance(p_WG)
     clearance = float(goal_distance) - VEHICLE_RADIUS
     if clearance < margin:
-        raise ValueError(
+        raise InfeasibleFlightError(
             f"{where} has a clearance of {clearance:.2f} m beyond the vehicle's radius of "
             f"{VEHICLE_RADIUS} m, but needs at least {margin:.2f} m: it is inside or too close to "
             f"an obstacle, unknown space or the boundary of the known volume {box}; choose a goal "

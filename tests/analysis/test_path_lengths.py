@@ -22,9 +22,15 @@ def test_no_way_is_an_error():
 
 
 def test_march_stops_at_walls_and_bounds():
-    """A ball stops at its radius before a wall; a point at the bounds; nothing flies on longer."""
+    """A ball stops at its radius before a wall; its centre at the bounds, whichever are met first;
+    nothing flies on longer.
+    """
     x = np.array([[1.0, 0.0, 0.0]])
     start = np.array([[1.0, 0.0, 2.0]])
     assert march(CLOSED, start, x, R, 99.0) == pytest.approx([4.9 - R], abs=0.011)
-    assert march(CLOSED, start, -x, 0.0, 99.0) == pytest.approx([1.0], abs=6.0)
+    assert march(CLOSED, start, -x, 0.0, 99.0) == pytest.approx([1.0], rel=1e-12)
+    assert march(CLOSED, start, -x, R, 99.0) == pytest.approx([1.0], rel=1e-12)
+    slanted = np.array([[-0.6, 0.8, 0.0], [0.0, 0.6, 0.8], [0.0, 0.0, -1.0]])
+    lengths = march(CLOSED, start.repeat(3, axis=0), slanted, 0.0, 99.0)
+    assert lengths == pytest.approx([1.0 / 0.6, 2.0 / 0.8, 2.0], rel=1e-12)
     assert march(CLOSED, start, x, R, 2.0) == [2.0]

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +12,7 @@ import torch
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.provenance import revision
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class RunFolder:
     config: str
     """The run's configuration, as YAML."""
     revision: str
-    """Of the source this runs from, with `-dirty` if it was changed; or unknown."""
+    """Of the program, as `revision()` says."""
 
     @classmethod
     def claim(cls, path: Path, config: Any) -> Self:
@@ -40,7 +40,7 @@ class RunFolder:
                 f"{file} is of a run with another configuration; choose another --out, or the same "
                 "configuration to go on with that run"
             )
-        folder = cls(path, text, _git_revision())
+        folder = cls(path, text, revision())
         folder._write("config.yaml", text)
         return folder
 
@@ -98,12 +98,3 @@ that are not for lack of time; a scenario's name stands before the success in wo
     def _write(self, name: str, text: str) -> None:
         with written_atomically(self.path / name) as path:
             path.write_text(text)
-
-
-def _git_revision() -> str:
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return answer.stdout.strip()

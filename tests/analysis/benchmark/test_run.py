@@ -1,6 +1,5 @@
 """Studies, whole, interrupted and damaged."""
 
-import csv
 import os
 import re
 import shutil
@@ -9,49 +8,18 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark import replay
 from splatpilot.analysis.benchmark import run as benchmark
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.tables import policy_table
 from splatpilot.analysis.cli import main
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 
 
-@pytest.fixture(scope="module")
-def study(tmp_path_factory) -> tuple[StudyConfig, Path]:
-    """A study flown without interruption in this process, and its folder; not to be changed."""
-    folder = tmp_path_factory.mktemp("study")
-    scenario = folder / "short.yaml"
-    scenario.write_text(
-        "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
-        "timeout: 1.5\n"
-    )
-    config = StudyConfig([str(scenario)], ["straight", "planner"], [2.0], seeds=3)
-    benchmark.run(config=config, out=folder / "out", jobs=1)
-    return config, folder / "out"
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """All files that must be the same in two runs of a study."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not re.match(r"timings|report\.html", str(path.relative_to(folder)))
-    }
-
-
-def rows_of(file: Path) -> list[dict[str, str]]:
-    with file.open() as lines:
-        return list(csv.DictReader(lines))
-
-
-def test_study_leaves_what_it_promises(study):
+def test_study_leaves_what_it_promises(study, rows_of):
     """Each flight has a row, a trajectory that agrees with it and a timing; the report holds its
     pictures.
     """
@@ -74,7 +42,7 @@ def test_study_leaves_what_it_promises(study):
     assert not [path for path in out.rglob(".*")]
 
 
-def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_path):
+def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_path, contents):
     """A study with two workers is killed without warning after its first flight; finished by
     another number of workers, all its files but the timings equal the uninterrupted study's.
     """
@@ -106,7 +74,7 @@ def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_pat
         assert (out / "rollouts" / name).stat().st_mtime_ns == when
 
 
-def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys):
+def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys, contents):
     """A truncated trajectory, and one of another flight, are named, flown again and equal what was
     there; nothing else is flown.
     """
@@ -127,7 +95,7 @@ def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys):
     assert "is damaged" in (out / "report.html").read_text()
 
 
-def test_folder_of_another_study_is_refused(study, tmp_path):
+def test_folder_of_another_study_is_refused(study, tmp_path, contents):
     """Another specification, another program and a folder that holds something else are refused,
     and nothing in them changes.
     """
@@ -165,67 +133,55 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
     assert "R99 was not run" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_flight_that_cannot_start_is_a_failure_with_a_reason(short_scenario, tmp_path, capsys):
-    """An error of one flight ends neither the study nor hides: its row tells it."""
-    config = StudyConfig([str(short_scenario)], ["straight"], [2.0], 1, ["goal=[50, 0, 1.8]"])
-    table = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
-    assert (table[0]["flights"], table[0]["successes"], table[0]["error"]) == (1, 0, 1)
-    assert "is outside the world" in rows_of(tmp_path / "out" / "rollouts.csv")[0]["error"]
-    assert "is outside the world" in capsys.readouterr().out
+def test_nothing_flown_is_no_success(tmp_path, capsys):
+    """A study whose scenes are all absent ends with a message and status 1, without a table."""
+    absent = tmp_path / "R99.yaml"
+    absent.write_text(f"world: !SceneConfig {{path: {tmp_path / 'nowhere'}}}\n")
+    out = tmp_path / "out"
+    words = ["--scenarios", str(absent), "--policies", "straight", "--seeds", "1"]
+    assert main(["benchmark", "--out", str(out), *words]) == 1
+    printed = capsys.readouterr()
+    assert "nothing can be flown" in printed.err and "nowhere" in printed.err
+    assert "nan" not in printed.out and not out.exists()
 
 
-def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
-    """From a copy of the folder elsewhere a flight replays to the last bit, and a record that was
-    changed by a millimetre does not agree.
+def test_each_flight_is_read_once(study, tmp_path, monkeypatch, contents):
+    """A study that is there is reported on with one reading of each flight, and of those in the
+    picture of one field a second.
     """
     config, whole = study
-    copy = tmp_path / "elsewhere"
-    shutil.copytree(whole, copy)
-    spec = config.rollouts()[1]
-    assert main(["replay", str(copy), spec.id, "--meshcat", "--video"]) == 0
-    assert "equals the recorded flight to the last bit" in capsys.readouterr().out
-    assert (copy / "replays" / spec.id / "flight.html").stat().st_size > 1e5
-    assert (copy / "replays" / spec.id / "flight.mp4").stat().st_size > 1e3
+    out = tmp_path / "copy"
+    shutil.copytree(whole, out)
+    read, tables = [], []
+    monkeypatch.setattr(StudyFolder, "read_there", StudyFolder.read, raising=False)
+    monkeypatch.setattr(
+        StudyFolder, "read", lambda self, spec: read.append(spec) or self.read_there(spec)
+    )
+    monkeypatch.setattr(
+        benchmark, "policy_table", lambda *words: tables.append(policy_table(*words)) or tables[-1]
+    )
+    benchmark.run(config=config, out=out, jobs=1)
+    pictured = read[len(config.rollouts()) :]
+    assert read[: len(config.rollouts())] == config.rollouts()
+    assert [spec.policy for spec in pictured] == config.policy_names
+    assert len({(spec.scenario, spec.seed) for spec in pictured}) == 1
+    assert len(tables) == 1
+    assert contents(out) == contents(whole)
 
-    file = StudyFolder(copy).trajectory(spec.id)
-    with np.load(file) as arrays:
-        changed = dict(arrays)
-    changed["states"][-1, 0] += 0.001
-    changed["row"] = np.array(str(changed["row"]).replace('"digest": "', '"digest": "0'))
-    np.savez(file, **changed)
-    result = replay.run(study=copy, id=spec.id)
-    assert not result.exact
-    assert result.deviation == pytest.approx(0.001, rel=0.01)
-    assert "THE REPLAY DIFFERS" in capsys.readouterr().out
 
+def test_study_interrupted_while_it_begins_is_finished(study, tmp_path, monkeypatch, contents):
+    """A kill before the first flight, while scenes are copied, leaves a folder that goes on."""
+    config, whole = study
+    out = tmp_path / "begun"
 
-def test_weights_of_ones_own_fly_in_a_study_that_keeps_them(short_scenario, tmp_path):
-    """A policy given as a file of weights is named after it, flies by them and not by those that
-    ship, replays without the file, and the study is refused when the file changes.
-    """
-    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+    def interrupt(*words):
+        raise KeyboardInterrupt
 
-    def write(thrust: float) -> None:
-        weights = {**shipped.weights, "head.weight": 0.0 * shipped.weights["head.weight"]}
-        weights["head.bias"] = np.array([0.0, 0.0, thrust], np.float32)
-        PolicyCheckpoint("diffaero", shipped.spec, weights, {}).save(tmp_path / "mine.npz")
-
-    write(2.0)
-    policies = ["diffaero", str(tmp_path / "mine.npz")]
-    config = StudyConfig([str(short_scenario)], policies, seeds=1)
-    folder = StudyFolder(tmp_path / "out")
-    benchmark.run(config=config, out=folder.path, jobs=1)
-    rows = rows_of(folder.path / "rollouts.csv")
-    assert [row["policy"] for row in rows] == ["diffaero", "mine"]
-    risen = [folder.read(spec)[1]["states"] for spec in config.rollouts()][1]
-    z, v_z = risen[-1, 2] - risen[0, 2], risen[-1, 5]
-    assert z > 1.0 and v_z > 2.0  # straight up, as these weights say
-
-    write(-2.0)
-    with pytest.raises(ValueError, match=r"mine.npz has changed since"):
-        benchmark.run(config=config, out=folder.path, jobs=1)
-    (tmp_path / "mine.npz").unlink()
-    assert replay.run(study=folder.path, id="short-mine-2-000").exact
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(benchmark, "keep_inputs", interrupt)
+        benchmark.run(config=config, out=out, jobs=1)
+    benchmark.run(config=config, out=out, jobs=1)
+    assert contents(out) == contents(whole)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +211,7 @@ def test_bad_command_is_one_message(study, arguments, message, capsys):
     assert message in error
 
 
-def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(study, tmp_path):
+def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(study, tmp_path, contents):
     """Two worker processes of a dask cluster fly the study; one is killed once both have begun, and
     the files equal those of the study flown here.
     """

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 
 from splatpilot.analysis.benchmark.rollout import chunks
-from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, scenario_of
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, default_policies
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 
 
@@ -23,16 +22,11 @@ def test_rollouts_are_all_combinations(short_scenario):
 def test_chunks_are_flights_through_one_place(short_scenario):
     """All flights are handed out once, in order, never more than the size, nor of two places."""
     config = StudyConfig([str(short_scenario)], ["planner", "straight"], [1.5, 2.0], seeds=3)
-    parts = list(chunks(config.rollouts(), 3))
-    assert [spec for part in parts for spec in part] == config.rollouts()
+    flights = [(spec, spec.id) for spec in config.rollouts()]
+    parts = list(chunks(flights, 3))
+    assert [flight for part in parts for flight in part] == flights
     assert [len(part) for part in parts] == [3, 1] * 3
-    assert all(len({spec.seed for spec in part}) == 1 for part in parts)
-
-
-def test_scenario_of_a_flight_has_its_policy_speed_and_seed():
-    """The rest is the scenario's."""
-    flown = scenario_of(RolloutSpec("a", "planner", 3.0, 5), Scenario(timeout=7.0))
-    assert (flown.policy.lattice.speed, flown.seed, flown.timeout) == (3.0, 5, 7.0)
+    assert all(len({spec.seed for spec, _ in part}) == 1 for part in parts)
 
 
 @pytest.mark.parametrize(
@@ -43,12 +37,18 @@ def test_scenario_of_a_flight_has_its_policy_speed_and_seed():
         ({"scenarios": []}, "the study has no scenario"),
         ({"policies": ["plan"]}, r"there is no policy 'plan'; the policies are planner"),
         ({"policies": ["planner", "planner"]}, "the policy planner is given twice"),
+        ({"policies": ["a=straight", "a=planner"]}, "the policy a is given twice"),
+        ({"policies": ["reactive:margn=0.2"]}, "policy reactive-margn-0.2: .*did you mean margin"),
+        ({"policies": ["straight:rate=-1"]}, "policy straight-rate--1: StraightConfig.rate is -1"),
+        ({"policies": ["scenario"]}, "short.yaml has no `policy`, which --policies scenario would"),
+        ({"speeds": [2.0, 2.0000001]}, "the speed 2 is given twice"),
         ({"speeds": [-1.0]}, "the speed -1 m/s cannot be flown"),
         ({"speeds": [float("nan")]}, "the speed nan m/s cannot be flown"),
         ({"speeds": [50.0], "policies": ["straight"]}, "speed is 50"),
         ({"seeds": 0}, "seeds is 0; it must be 1 to"),
         ({"overrides": ["world.spacing=0.1"]}, "scenario short: .*spacing"),
-        ({"overrides": ["policy.rate=3"]}, "'policy.rate=3' has no place in a study"),
+        ({"overrides": ["policy.rate=3"]}, "write it as one of them, --policies NAME:rate=3"),
+        ({"overrides": ["seed=3"]}, "say how many with --seeds"),
         ({"overrides": ["wrld.spacing=1"]}, "did you mean world"),
     ],
 )
@@ -56,6 +56,43 @@ def test_bad_study_is_named(short_study, changes, message):
     """Unknown scenarios, policies and speeds, and infeasible parameters, are refused by name."""
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         replace(short_study, **changes).load_scenarios()
+
+
+def test_flights_of_one_name_are_refused(short_scenario):
+    """A hyphen may stand in the names of scenarios and policies; two flights of one name, which
+    would be one file, may not be in a study.
+    """
+    other = short_scenario.with_name("short-a.yaml")
+    other.write_text(short_scenario.read_text())
+    config = StudyConfig([str(short_scenario), str(other)], ["a-b=planner", "b=planner"], seeds=1)
+    with pytest.raises(ValueError, match="the flight short-a-b-2-000 is given twice"):
+        config.load_scenarios()
+
+
+OWN = "policy: !ReactiveConfig {speed: 1.5, margin: 0.4}\n"
+
+
+def test_own_policies_fly_where_nobody_is_named(short_scenario):
+    """Files that all have a policy are flown by it, others by all policies; and a policy that is
+    not flown is listed.
+    """
+    own = short_scenario.with_name("own.yaml")
+    own.write_text(short_scenario.read_text() + OWN)
+    assert default_policies([str(own)]) == ["scenario"]
+    assert "reactive" in default_policies([str(own), str(short_scenario)])
+    both = [str(own), str(short_scenario)]
+    assert StudyConfig(both, ["planner"], seeds=1).unflown_policies() == [own]
+    assert StudyConfig([str(own)], ["scenario"], seeds=1).unflown_policies() == []
+
+
+def test_own_policy_flies_at_its_own_speed(short_scenario):
+    """A study whose speed is another one is refused, and says which to give."""
+    short_scenario.write_text(short_scenario.read_text() + OWN)
+    config = StudyConfig([str(short_scenario)], ["scenario"], seeds=1)
+    with pytest.raises(ValueError, match=r"flies at 1.5 m/s, its own speed; give --speeds 1.5"):
+        config.load_scenarios()
+    scenario = replace(config, speeds=[1.5]).load_scenarios()["short"]
+    assert (scenario.policy.speed, scenario.policy.margin) == (1.5, 0.4)
 
 
 def test_all_benchmark_scenarios_load():

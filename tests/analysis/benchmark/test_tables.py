@@ -1,7 +1,13 @@
 """Tables of flights made up by hand."""
 
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.benchmark.tables import format_table, policy_table, scenarios_passed
+from splatpilot.analysis.benchmark.tables import (
+    format_table,
+    paper_rows,
+    policy_table,
+    scenarios_passed,
+)
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
 
 
 def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:
@@ -36,3 +42,17 @@ def test_table_has_a_row_for_each_policy():
     assert [round(row["min_clearance_m"], 6) for row in table] == [0.5, 0.3]
     planner, straight = format_table(table).splitlines()[1:]
     assert "2/2" in planner and "1/1" in planner and "0/1" in straight
+
+
+def test_paper_stands_beside_what_it_is_about():
+    """The paper's rows are shown for its policies as they ship, in the whole benchmark; not for
+    variants of them, in other scenarios or with other parameters.
+    """
+    seventeen = list(benchmark_scenarios())
+    assert len(seventeen) == 17
+    policies = ["planner", "diffaero", "depthnav:camera.width=128"]
+    assert list(paper_rows(StudyConfig(seventeen, policies))) == ["diffaero"]
+    assert paper_rows(StudyConfig(seventeen, ["planner"])) == {}
+    assert paper_rows(StudyConfig(seventeen, ["diffaero=planner"])) == {}
+    assert paper_rows(StudyConfig(seventeen[1:], policies)) == {}
+    assert paper_rows(StudyConfig(seventeen, policies, overrides=["timeout=5"])) == {}

@@ -1,0 +1,125 @@
+"""What the flights of a study depend on, kept in its folder: scenarios, scenes and weights."""
+
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
+from splatpilot.systems.configuration import dump_config, load_config
+from splatpilot.systems.files import written_atomically
+
+
+def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:
+    """
+    Keeps what flights depend on, so that the folder alone gives them again.
+
+    Args:
+        folder: of the study.
+        config: what is flown.
+        scenarios: by name, those that can be flown here.
+
+    Raises:
+        ValueError: if something else is kept there already.
+        OSError: if it cannot be read or written.
+    """
+    for variant in config.variants:
+        if variant.weights is not None:
+            _keep_weights(folder, variant.weights, variant.label)
+    for name, scenario in scenarios.items():
+        if isinstance(scenario.world, SceneSource):
+            world = replace(scenario.world, path=_keep_scene(folder, scenario.world))
+            scenario = replace(scenario, world=world)
+        weights = getattr(scenario.policy, "weights", "")
+        if config.flies_own_policies and weights:
+            kept = _keep_weights(folder, Path(weights), _own(name))
+            scenario = replace(scenario, policy=replace(scenario.policy, weights=kept))
+        _keep_scenario(folder, name, scenario)
+
+
+def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
+    """A scenario as a study flies it, its scene and weights in the study's folder.
+
+    Raises:
+        FileNotFoundError, ValueError: if it is not there or damaged.
+    """
+    scenario = load_config(Scenario(), folder.path / "scenarios" / f"{name}.yaml")
+    if isinstance(scenario.world, SceneSource):
+        scenario.world.path = str((folder.path / scenario.world.path).absolute())
+    weights = folder.weights(_own(name))
+    if weights.is_file():
+        policy = replace(scenario.policy, weights=str(weights.absolute()))  # pyright: ignore
+        scenario = replace(scenario, policy=policy)
+    return scenario
+
+
+def kept_flights(
+    folder: StudyFolder, specs: Iterable[RolloutSpec]
+) -> Iterator[tuple[RolloutSpec, Scenario]]:
+    """
+    Flights with the scenario of each, complete with policy and seed, from the study's folder alone.
+
+    Raises:
+        FileNotFoundError, ValueError: if the folder is damaged.
+    """
+    variants = {}
+    for variant in folder.config().variants:
+        if variant.weights is not None:
+            kept = str(folder.weights(variant.label).absolute())
+            variant = variant._replace(policy=kept)
+        variants[variant.label] = variant
+    scenarios: dict[str, Scenario] = {}
+    for spec in specs:
+        if spec.scenario not in scenarios:
+            scenarios[spec.scenario] = kept_scenario(folder, spec.scenario)
+        scenario = scenarios[spec.scenario]
+        policy = variants[spec.policy].config(spec.speed, scenario.policy)
+        yield spec, replace(scenario, policy=policy, seed=spec.seed)
+
+
+def _keep_scenario(folder: StudyFolder, name: str, scenario: Scenario) -> None:
+    file = folder.path / "scenarios" / f"{name}.yaml"
+    text = dump_config(scenario)
+    if file.is_file() and file.read_text() != text:
+        raise ValueError(
+            f"{file} differs from the scenario {name} of this program; choose another folder with "
+            "--out, or finish the study with the program that began it"
+        )
+    with written_atomically(file) as path:
+        path.write_text(text)
+
+
+def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
+    """Copies a scene into the study; returns where to, in its folder."""
+    scene = find_scene(world)
+    kept = folder.path / "scenes" / scene.name
+    if not kept.exists():
+        partial = kept.with_name(f".{kept.name}.partial")
+        if scene.is_dir():
+            shutil.rmtree(partial, ignore_errors=True)
+            shutil.copytree(scene, partial)
+        else:
+            shutil.copyfile(scene, partial)
+        partial.rename(kept)
+    return str(kept.relative_to(folder.path))
+
+
+def _keep_weights(folder: StudyFolder, file: Path, label: str) -> str:
+    """Copies weights into the study; returns where to, in its folder."""
+    kept = folder.weights(label)
+    if kept.is_file() and kept.read_bytes() != file.read_bytes():
+        raise ValueError(
+            f"{file} has changed since {folder.path} was begun; choose another folder with --out"
+        )
+    kept.parent.mkdir(exist_ok=True)
+    with written_atomically(kept) as path:
+        shutil.copyfile(file, path)
+    return str(kept.relative_to(folder.path))
+
+
+def _own(scenario: str) -> str:
+    """What the weights of a scenario's own policy are kept as; no label is like it."""
+    return f"scenarios/{scenario}"

@@ -1,0 +1,113 @@
+"""Policies of a study: registered ones, files of weights and classes of others, each with some of
+its fields set, and a label that its flights are named by."""
+
+import re
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.systems.configuration import load_config
+
+SCENARIO = "scenario"
+"""The policy that is the scenario's own: what stands in its `policy` block."""
+
+_LABEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
+_FIELD = r"[A-Za-z_][\w.]*="
+_OUTSIDE_BRACKETS = r"(?![^\[{(]*[\]})])"
+
+
+class Variant(NamedTuple):
+    """A policy, and what of its configuration differs from how it ships."""
+
+    label: str
+    """What its flights are named by: good as the name of a file."""
+    policy: str
+    """A registered name, a file of weights (.npz), "module:Class", or `SCENARIO`."""
+    overrides: tuple[str, ...] = ()
+    """"dotted.field=YAML value" each, of the policy's configuration."""
+
+    @property
+    def weights(self) -> Path | None:
+        """The file of weights that it flies by, if it is given as one."""
+        return Path(self.policy) if self.policy.endswith(".npz") else None
+
+    def config(self, speed: float, own: Any) -> Any:
+        """
+        The configuration that flies.
+
+        Args:
+            speed: nominal [m/s].
+            own: the scenario's own policy, flown by `SCENARIO`.
+
+        Raises:
+            FileNotFoundError, ValueError: see `policy_named`; or for unknown fields and values out
+                of range.
+        """
+        config = own if self.policy == SCENARIO else policy_named(self.policy, speed)
+        if not self.overrides:
+            return config
+        try:
+            config = load_config(config, overrides=list(self.overrides))
+            config.validate()
+        except ValueError as error:
+            raise ValueError(f"policy {self.label}: {error}") from None
+        return config
+
+
+def parse_variant(text: str) -> Variant:
+    """
+    Reads `[LABEL=]POLICY[:FIELD=VALUE[:FIELD=VALUE...]]`.
+
+    The label is the name of the policy, of its class or of its file where none is given, followed
+    by the fields that are set: `reactive:margin=0.2` is labelled `reactive-margin-0.2`.
+
+    Raises:
+        ValueError: if the label is none that a file can bear, or a field has another place.
+    """
+    label, _, rest = text.partition("=")
+    if "=" not in text or ":" in label:
+        label, rest = "", text
+    policy, *overrides = re.split(f":(?={_FIELD})", rest)
+    for override in overrides:
+        field = override.partition("=")[0].rpartition(".")[2]
+        remedy = {
+            "speed": "all policies fly at those of --speeds",
+            "weights": "give the file of weights as the policy, LABEL=FILE.npz",
+        }.get(field)
+        if remedy:
+            raise ValueError(f"the policy {text!r} sets {override}; leave it out: {remedy}")
+    if not label:
+        name = Path(policy).stem if policy.endswith(".npz") else policy.rpartition(":")[2]
+        label = "-".join([name, *(override.replace("=", "-", 1) for override in overrides)])
+    if not _LABEL.fullmatch(label):
+        raise ValueError(
+            f"the policy {text!r} would be labelled {label!r}, but labels name files: give it one "
+            "of at most 80 letters, digits and _ . + - in front, LABEL=POLICY"
+        )
+    return Variant(label, policy, tuple(overrides))
+
+
+def split_policies(text: str) -> list[str]:
+    """The policies of a list with commas; those in brackets belong to values."""
+    return [part.strip() for part in re.split("," + _OUTSIDE_BRACKETS, text) if part.strip()]
+
+
+def sweep(text: str) -> Iterator[str]:
+    """
+    The variants of a sweep, `POLICY:FIELD=VALUE,VALUE,...[:FIELD=VALUE,...]`, one for each
+    combination of values.
+
+    Raises:
+        ValueError: if no field is swept.
+    """
+    policy, *fields = re.split(f":(?={_FIELD})", text)
+    if not fields:
+        raise ValueError(f"the sweep {text!r} has no field; write POLICY:FIELD=VALUE,VALUE")
+    choices = []
+    for given in fields:
+        field, _, values = given.partition("=")
+        choices.append([f"{field}={value}" for value in split_policies(values)])
+    for chosen in product(*choices):
+        yield ":".join([policy, *chosen])

@@ -1,0 +1,35 @@
+"""Flights flown again."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from splatpilot.analysis.benchmark import replay
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.cli import main
+
+
+def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
+    """From a copy of the folder elsewhere a flight replays to the last bit, and a record that was
+    changed by a millimetre does not agree.
+    """
+    config, whole = study
+    copy = tmp_path / "elsewhere"
+    shutil.copytree(whole, copy)
+    spec = config.rollouts()[1]
+    assert main(["replay", str(copy), spec.id, "--meshcat", "--video"]) == 0
+    assert "equals the recorded flight to the last bit" in capsys.readouterr().out
+    assert (copy / "replays" / spec.id / "flight.html").stat().st_size > 1e5
+    assert (copy / "replays" / spec.id / "flight.mp4").stat().st_size > 1e3
+
+    file = StudyFolder(copy).trajectory(spec.id)
+    with np.load(file) as arrays:
+        changed = dict(arrays)
+    changed["states"][-1, 0] += 0.001
+    changed["row"] = np.array(str(changed["row"]).replace('"digest": "', '"digest": "0'))
+    np.savez(file, **changed)
+    result = replay.run(study=copy, id=spec.id)
+    assert not result.exact
+    assert result.deviation == pytest.approx(0.001, rel=0.01)
+    assert "THE REPLAY DIFFERS" in capsys.readouterr().out

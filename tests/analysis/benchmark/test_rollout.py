@@ -1,0 +1,82 @@
+"""Flights that fail, and faults that are no failures of flights."""
+
+from dataclasses import replace
+
+import pytest
+
+from splatpilot.analysis.benchmark import replay
+from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark.rollout import Fault
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights
+from splatpilot.analysis.benchmark.workers import fly_all
+from splatpilot.analysis.cli import main
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+
+
+def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys, rows_of):
+    """A goal where no vehicle fits, and one so near the ground that the planner's margin leaves no
+    way to it, end flights and not the study: their rows tell why, and they cannot be replayed.
+    """
+    overrides = ["goal=[6.5, 0, 0.36]"]
+    config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1, overrides)
+    table = benchmark.run(config=config, out=tmp_path / "near", jobs=1)
+    assert [row["infeasible"] for row in table] == [0, 1]
+    assert (table[1]["flights"], table[1]["successes"]) == (1, 0)
+    assert "needs at least" in rows_of(tmp_path / "near" / "rollouts.csv")[1]["reason"]
+
+    config = replace(config, overrides=["goal=[50, 0, 1.8]"])
+    table = benchmark.run(config=config, out=tmp_path / "far", jobs=1)
+    assert [row["infeasible"] for row in table] == [1, 1]
+    assert "short-straight-2-000 could not be flown: goal" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"could not be flown .* is outside the world"):
+        replay.run(study=tmp_path / "far", id="short-straight-2-000")
+
+
+def test_exception_stops_the_study(short_scenario, tmp_path, capsys, rows_of):
+    """An exception is no failed flight: one message names the file of its traceback, no table is
+    written, and once it is mended the study goes on and nothing is left of the error.
+    """
+    out = tmp_path / "out"
+    words = ["benchmark", "--out", str(out), "--scenarios", str(short_scenario), "--seeds", "2"]
+    words += ["--policies", "straight,straight:rate=7", "--jobs", "2"]
+    measures = "splatpilot.analysis.benchmark.rollout.flight_measures"
+
+    def refuse(flight, shortest):
+        raise ZeroDivisionError("of the policy\nwith a second line")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measures, refuse)
+        assert main([*words[:-1], "1"]) == 1
+    error = capsys.readouterr().err
+    file = out / "errors" / "short-straight-2-000.txt"
+    assert "flight short-straight-2-000 was ended by an exception" in error
+    assert f"ZeroDivisionError: of the policy (traceback in {file})" in error
+    assert "in refuse" in file.read_text() and "Traceback" in file.read_text()
+    assert not (out / "rollouts.csv").exists()
+
+    assert main(words) == 0
+    assert not (out / "errors").exists()
+    assert len(rows_of(out / "rollouts.csv")) == 4
+
+
+def test_fault_in_a_worker_process_stops_the_study(short_scenario, tmp_path):
+    """Weights that vanish while the study flies are told by the worker that misses them, and the
+    flights that others have ended are kept.
+    """
+    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+    mine = tmp_path / "mine.npz"
+    PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(mine)
+    config = StudyConfig([str(short_scenario)], ["straight", f"mine={mine}"], seeds=3)
+    folder = StudyFolder(tmp_path / "out")
+    folder.claim(config, {})
+    keep_inputs(folder, config, config.load_scenarios())
+    flights = list(kept_flights(folder, config.rollouts()))
+    folder.weights("mine").unlink()
+    flown = list(fly_all(flights, jobs=2))
+    faults = [fault for fault in flown if isinstance(fault, Fault)]
+    assert {fault.id for fault in faults} == {f"short-mine-2-00{seed}" for seed in range(3)}
+    assert all("FileNotFoundError: there are no weights at" in fault.reason for fault in faults)
+    assert len(flown) == 6

@@ -1,0 +1,87 @@
+"""Which program a result says it comes from: a copy of the module stands for an installation."""
+
+import importlib.metadata
+import importlib.util
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from splatpilot.systems import provenance
+
+VERSION = importlib.metadata.version("splatpilot")
+
+
+def git(folder: Path, *words: str) -> str:
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+    command = ["git", *identity, *words]
+    return subprocess.run(
+        command, cwd=folder, check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+def commit(folder: Path) -> str:
+    git(folder, "add", "--all")
+    git(folder, "commit", "--allow-empty", "--message", "a change")
+    return git(folder, "rev-parse", "HEAD")
+
+
+def installed(package: Path):
+    """The module as it is imported from `package`/systems."""
+    (package / "systems").mkdir(parents=True)
+    file = package / "systems" / "provenance.py"
+    shutil.copyfile(str(provenance.__file__), file)
+    spec = importlib.util.spec_from_file_location("copied_provenance", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def checkout(tmp_path) -> Path:
+    """A git checkout without a commit."""
+    git(tmp_path, "init", "--quiet")
+    return tmp_path
+
+
+def test_checkout_says_its_commit_and_what_was_changed(checkout):
+    """The revision is HEAD; changed source adds a digest of the change, changed prose nothing."""
+    copied = installed(checkout)
+    (checkout / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
+    (checkout / "README.md").write_text("one\n")
+    source = checkout / "systems" / "other.py"
+    source.write_text("x = 1\n")
+    assert copied.revision() == VERSION  # of no commit yet
+    head = commit(checkout)
+    assert copied.revision() == head
+    (checkout / "README.md").write_text("two\n")
+    assert copied.revision() == head
+    source.write_text("x = 2\n")
+    two = copied.revision()
+    source.write_text("x = 3\n")
+    three = copied.revision()
+    assert len({head, two, three}) == 3
+    assert two.startswith(f"{head}+") and three.startswith(f"{head}+")
+
+
+@pytest.mark.parametrize("package", ["lib/site-packages/splatpilot", "third_party/splatpilot", "."])
+def test_checkout_of_something_else_says_nothing(checkout, package):
+    """Installed, copied or unpacked inside the checkout of another project, the program is its
+    version, whatever is committed there.
+    """
+    copied = installed(checkout / package)
+    if package.startswith("third_party"):
+        (checkout / package / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
+    (checkout / "pyproject.toml").write_text('[project]\nname = "theirs"\n')
+    commit(checkout)
+    before = copied.program()
+    (checkout / "theirs.py").write_text("")
+    commit(checkout)
+    assert before["splatpilot"] == VERSION
+    assert copied.program() == before
+
+
+def test_program_without_git_says_its_version(tmp_path):
+    """So it does where nothing is a checkout."""
+    assert installed(tmp_path / "splatpilot").revision() == VERSION
