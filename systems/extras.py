@@ -1,0 +1,28 @@
+"""Packages that only parts of splatpilot need, and the extras of `pip install` that bring them."""
+
+import re
+from importlib import import_module, metadata
+from types import ModuleType
+
+
+def import_extra(module: str, extra: str) -> ModuleType:
+    """Imports a module that the extra brings.
+
+    Raises:
+        ModuleNotFoundError: a package is not installed; the message says which extra brings it.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{error.name} is not installed; pip install 'splatpilot[{extra}]'", name=error.name
+        ) from None
+
+
+def extra_of(package: str) -> str | None:
+    """The extra that brings a package, as `pyproject.toml` has it; None if no extra does."""
+    for requirement in metadata.requires("splatpilot") or []:
+        match = re.fullmatch(r"([\w.-]+).*extra == ['\"](\w+)['\"].*", requirement)
+        if match is not None and match[1] == package:
+            return match[2]
+    return None
