@@ -6,7 +6,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm", "torch"
+_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm"
 
 
 def program() -> dict[str, str]:

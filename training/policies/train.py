@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import torch
 from tqdm import tqdm
 
+from splatpilot.systems.extras import import_extra
 from splatpilot.systems.files import written_atomically
 from splatpilot.training.policies.run_folder import RunFolder
 from splatpilot.training.policies.through_dynamics import NotFiniteError
@@ -143,7 +144,9 @@ def run[Config: TrainingConfig](
     if checkpoint.exists():
         progress = _resumed(checkpoint, trainee, optimizer)
     spent_before = progress.cpu_seconds
-    writer = _tensorboard(out) if schedule.tensorboard else None
+    writer = None
+    if schedule.tensorboard:
+        writer = import_extra("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(out))
 
     def save() -> None:
         progress.cpu_seconds = spent_before + time.process_time() - started
@@ -247,14 +250,3 @@ def _resumed(path: Path, trainee: Trainee, optimizer: torch.optim.Optimizer) -> 
         raise ValueError(
             f"{path} is no checkpoint to go on from ({reason}); delete it to begin anew"
         ) from None
-
-
-def _tensorboard(out: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise ValueError(
-            "schedule.tensorboard is true, but tensorboard is not installed: pip install "
-            "tensorboard"
-        ) from None
-    return SummaryWriter(str(out))
