@@ -8,6 +8,8 @@ import tarfile
 import zipfile
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from splatpilot.diagrams.policies import BENCHMARK_POLICIES
@@ -111,18 +113,24 @@ def test_benchmarks(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "missing", "extra"),
     [
-        (["reconstruct", ".", "--out", "scene"], "reconstruct needs torch"),
-        (["measure", "."], "measure needs torch"),
-        (["ablate", "."], "ablate needs torch"),
-        (["fidelity", "."], "fidelity needs torch"),
-        (["tour", "P13", "--out", "tour"], "tour needs torch"),
-        (["train", "diffaero", "--out", "trained"], "train needs torch"),
+        (["reconstruct", ".", "--out", "scene"], "torch", "train"),
+        (["measure", "."], "torch", "train"),
+        (["ablate", "."], "torch", "train"),
+        (["fidelity", "."], "torch", "train"),
+        (["tour", "P13", "--out", "tour"], "torch", "train"),
+        (["train", "diffaero", "--out", "trained"], "torch", "train"),
+        (["capture", "check", "photographs"], "pycolmap", "photos"),
     ],
 )
-def test_verb_without_its_extra_says_which(run, words, message):
+def test_verb_without_its_extra_says_which(run, tmp_path, words, missing, extra):
     """A verb that needs more than is installed ends with one line that says what to install."""
+    (tmp_path / "photographs").mkdir()
+    for number in range(3):
+        picture = tmp_path / "photographs" / f"{number}.jpg"
+        cv2.imwrite(str(picture), np.zeros((48, 64, 3), np.uint8))
     ended = run("splatpilot", *words)
     assert ended.returncode == 1
-    assert ended.stderr == f"splatpilot: {message}; pip install 'splatpilot[train]'\n"
+    needed = f"{words[0]} needs {missing}; pip install 'splatpilot[{extra}]'"
+    assert ended.stderr == f"splatpilot: {needed}\n"
