@@ -1,4 +1,5 @@
-# `make fly` and `make test` do everything: each makes .venv on first use and again when what is built has changed.
+# `make fly` and `make test` do everything: each makes .venv on first use, or adds to it what it needs, and again when what
+# is built has changed.
 
 PYTHON ?= $(shell for python in python3.12 python3.13 python3 python; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null && echo $$python && break; done)
@@ -7,7 +8,7 @@ SPLATPILOT := .venv/bin/splatpilot
 
 .PHONY: fly test lint sanitize clean
 
-fly: .venv/installed
+fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly
 
 test: lint
@@ -26,9 +27,14 @@ sanitize: .venv/installed
 clean:
 	rm -rf .venv build
 
-.venv/installed: $(BUILT_FROM)
+# What flies, and then what trains, reconstructs and checks too.
+.venv/flying: $(BUILT_FROM)
 	@test -n "$(PYTHON)" || { echo "No Python 3.12 or newer found; install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 	.venv/bin/python -m pip install --quiet uv
-	.venv/bin/uv pip install --python .venv/bin/python --editable '.[dev]'
+	.venv/bin/uv pip install --python .venv/bin/python --editable .
+	touch $@
+
+.venv/installed: .venv/flying
+	.venv/bin/uv pip install --python .venv/bin/python --requirements pyproject.toml --extra dev
 	touch $@

@@ -3,7 +3,9 @@
 import argparse
 import sys
 
+from splatpilot import __version__
 from splatpilot.analysis.commands import COMMANDS
+from splatpilot.systems.extras import missing_extra
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -27,7 +29,8 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="MODULE",
         help="import a module that registers policies, worlds, sensors, ... (repeatable)",
     )
-    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb_name")
     for command in COMMANDS:
         command.add_to(verbs)
     options = parser.parse_args(arguments)
@@ -39,6 +42,12 @@ def main(arguments: list[str] | None = None) -> int:
         options.verb(options)
     except (ValueError, OSError) as error:
         print(f"splatpilot: {error}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        missing = missing_extra(error, options.verb_name)
+        if missing is None:
+            raise
+        print(f"splatpilot: {missing}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("splatpilot: interrupted", file=sys.stderr)

@@ -22,4 +22,12 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("splatpilot")
-    return _load(name)
+    try:
+        return _load(name)
+    except ModuleNotFoundError as error:
+        from splatpilot.systems.extras import missing_extra
+
+        missing = missing_extra(error, f"splatpilot.{name}")
+        if missing is None:
+            raise
+        raise ModuleNotFoundError(missing, name=error.name) from error

@@ -19,10 +19,16 @@ def import_extra(module: str, extra: str) -> ModuleType:
         ) from None
 
 
-def extra_of(package: str) -> str | None:
-    """The extra that brings a package, as `pyproject.toml` has it; None if no extra does."""
+def missing_extra(error: ModuleNotFoundError, needed_by: str) -> str | None:
+    """
+    What to install for something that an import has failed for.
+
+    Returns:
+        A sentence with the extra that brings the missing package, as `pyproject.toml` has it; None
+        if no extra does.
+    """
     for requirement in metadata.requires("splatpilot") or []:
         match = re.fullmatch(r"([\w.-]+).*extra == ['\"](\w+)['\"].*", requirement)
-        if match is not None and match[1] == package:
-            return match[2]
+        if match is not None and match[1] == error.name:
+            return f"{needed_by} needs {error.name}; pip install 'splatpilot[{match[2]}]'"
     return None

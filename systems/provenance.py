@@ -7,7 +7,7 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm", "torch"
+_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm"
 _SOURCE = "*.py", "*.yaml", "*.cpp", "*.hpp"
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from splatpilot.systems.extras import import_extra
+
 
 @contextmanager
 def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
@@ -10,18 +12,13 @@ def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
     folder.
 
     Raises:
-        ValueError: tensorboard is wanted and not installed.
+        ModuleNotFoundError: tensorboard is wanted and not installed.
     """
     if not folder:
         yield lambda step, figures: None
         return
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError(
-            f"tensorboard is {folder!r}, but tensorboard is not installed: pip install tensorboard"
-        ) from error
-    with SummaryWriter(folder) as writer:
+    tensorboard = import_extra("torch.utils.tensorboard", "tensorboard")
+    with tensorboard.SummaryWriter(folder) as writer:
 
         def log(step: int, figures: dict[str, float]) -> None:
             for name, value in figures.items():

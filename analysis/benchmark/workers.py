@@ -7,6 +7,7 @@ from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_ro
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.configuration import dump_config
+from splatpilot.systems.extras import import_extra
 
 CONNECT_TIMEOUT = 10.0
 """[s], for a scheduler to answer."""
@@ -30,6 +31,7 @@ def fly_all(
         cluster: address of a dask scheduler, whose workers fly instead.
 
     Raises:
+        ModuleNotFoundError: a cluster is wanted and dask.distributed is not installed.
         OSError: if a worker process dies, or the cluster cannot be reached; all that was yielded
             before is good.
     """
@@ -62,15 +64,9 @@ def _in_processes(work: _Work, jobs: int) -> Iterator[Rollout | Fault]:
 
 
 def _on_cluster(work: _Work, address: str) -> Iterator[Rollout | Fault]:
+    distributed = import_extra("distributed", "cluster")
     try:
-        from distributed import Client, as_completed
-        from distributed.scheduler import KilledWorker
-    except ImportError:
-        raise OSError(
-            "--cluster needs dask.distributed; pip install 'splatpilot[cluster]'"
-        ) from None
-    try:
-        client = Client(address, timeout=CONNECT_TIMEOUT)
+        client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
     except (OSError, TimeoutError, ValueError) as error:
         raise OSError(
             f"no dask scheduler answers at {address} ({error}); start one with `dask scheduler` "
@@ -80,9 +76,9 @@ def _on_cluster(work: _Work, address: str) -> Iterator[Rollout | Fault]:
         # A chunk whose worker dies is given to another; flights are pure, so that costs only time.
         futures = client.map(fly_rollouts, list(work), pure=False, retries=3)
         try:
-            for _, rollouts in as_completed(futures, with_results=True):
+            for _, rollouts in distributed.as_completed(futures, with_results=True):
                 yield from rollouts
-        except KilledWorker as error:
+        except distributed.KilledWorker as error:
             raise OSError(
                 f"the cluster's workers die of one and the same work ({error}); what was flown is "
                 "kept: give them more memory and run the same command again"

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatpilot import _native
+from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
 from splatpilot.systems.splats.rasterization_autograd import (
     Composite,
@@ -24,7 +25,6 @@ from splatpilot.systems.splats.rasterization_checks import (
     check_render_mode,
     check_shapes,
     check_values,
-    import_gsplat,
     pair_meta,
 )
 from splatpilot.systems.splats.rasterization_unscented import (
@@ -125,7 +125,7 @@ def rasterize(
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it),
             or Ks of an undistorted pinhole requires a gradient.
         NotImplementedError: tensors are on a GPU and the cameras are distorted.
-        ImportError: tensors are on a GPU and gsplat is not installed.
+        ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
     tensors = by_name(*scene, Ks, backgrounds, radial_coeffs, tangential_coeffs)
@@ -142,7 +142,7 @@ def rasterize(
             raise NotImplementedError(
                 "distorted cameras are rendered on the CPU alone; move the tensors with .cpu()"
             )
-        return import_gsplat().rasterization(
+        return import_extra("gsplat", "cuda").rasterization(
             *scene,
             Ks,
             width,

@@ -1,6 +1,5 @@
 """What the rasterisers refuse and how they say so, and what else they share."""
 
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -129,17 +128,6 @@ def check_render_mode(render_mode: str) -> None:
 def check_device(means: Tensor) -> None:
     if means.device.type != "cpu":
         raise ValueError(f"tensors are on {means.device}; move them to 'cpu' or 'cuda'")
-
-
-def import_gsplat() -> ModuleType:
-    try:
-        import gsplat  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            "rendering CUDA tensors needs gsplat, which is not installed: "
-            "pip install 'splatpilot[cuda]', or move the tensors to the CPU"
-        ) from error
-    return gsplat
 
 
 def pair_meta(counts: list[int], width: int, height: int) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpilot import _native
+from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import check_camera, create_renderer
 from splatpilot.systems.splats.depth_normals import depth_to_normals
 from splatpilot.systems.splats.rasterization_autograd import joined
@@ -16,7 +17,6 @@ from splatpilot.systems.splats.rasterization_checks import (
     check_render_mode,
     check_shapes,
     check_values,
-    import_gsplat,
     pair_meta,
 )
 
@@ -86,14 +86,14 @@ def rasterize_surfels(
 
     Raises:
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it).
-        ImportError: tensors are on a GPU and gsplat is not installed.
+        ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
     tensors = by_name(*scene, Ks, backgrounds)
     _check_options(render_mode, depth_mode, distloss, radius_clip)
     check_shapes(tensors, sh_degree)
     if means.device.type == "cuda":
-        return import_gsplat().rasterization_2dgs(
+        return import_extra("gsplat", "cuda").rasterization_2dgs(
             *scene,
             Ks,
             width,

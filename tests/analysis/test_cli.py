@@ -3,6 +3,9 @@
 import dataclasses
 import json
 import os
+import subprocess
+import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -68,6 +71,30 @@ def test_written_scenario_gives_the_same_flight_again(tmp_path):
     assert main(again) == 0
     trajectories = [(folder / "trajectory.npz").read_bytes() for folder in (first, second)]
     assert trajectories[0] == trajectories[1]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["fly", "--help"]])
+def test_help_imports_nothing_heavy(words):
+    """Help and version come at once: no package that takes long to load is imported for them."""
+    script = (
+        "import sys; from splatpilot.analysis.cli import main\n"
+        f"try: main({words})\n"
+        "except SystemExit: print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    printed = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    ).stdout
+    loaded = set(printed.splitlines()[-1].split())
+    assert "splatpilot" in loaded
+    assert not loaded & {"numpy", "pydrake", "scipy", "torch", "matplotlib", "cv2", "yaml", "tqdm"}
+
+
+def test_version(capsys):
+    """`splatpilot --version` prints the installed version."""
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"splatpilot {version('splatpilot')}\n"
 
 
 def fails(arguments: list[str], capsys) -> str:

@@ -1,6 +1,5 @@
 """Tests of the CPU rasteriser against an independent reference and analytic oracles."""
 
-import importlib.util
 import math
 from typing import Any
 
@@ -421,12 +420,3 @@ def test_tensors_on_other_devices_are_refused():
         rasterize(**(scene | {"quats": scene["quats"].to("meta")}), width=8, height=8)
     with pytest.raises(ValueError, match="tensors are on meta"):
         rasterize(**{k: v.to("meta") for k, v in scene.items()}, width=8, height=8)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("gsplat") is not None, reason="gsplat is installed")
-def test_missing_gsplat_says_how_to_install_it():
-    """CUDA tensors without gsplat get the install command."""
-    from splatpilot.systems.splats.rasterization_checks import import_gsplat
-
-    with pytest.raises(ImportError, match=r"pip install 'splatpilot\[cuda\]'"):
-        import_gsplat()

@@ -1,0 +1,136 @@
+"""The package as others get it: a wheel in an environment of its own, outside the checkout."""
+
+import csv
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES
+
+CHECKOUT = Path(__file__).parents[1]
+PACKAGES = "splatpilot", "systems", "diagrams", "training", "analysis"
+MAX_SIZE = 1.2e9
+"""[bytes], of an installation that flies."""
+SHORT = "world: {length: 10, width: 6}\ntimeout: 1\n"
+UV = sys.executable, "-m", "uv", "--quiet"
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory) -> tuple[Path, Path]:
+    """The source distribution of the checkout, and the wheel that is built from it."""
+    out = tmp_path_factory.mktemp("distributions")
+    subprocess.run([*UV, "build", "--out-dir", out, CHECKOUT], check=True)
+    return next(out.glob("*.tar.gz")), next(out.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def environment(distributions, tmp_path_factory) -> Path:
+    """An environment that holds the wheel and none of its extras."""
+    folder = tmp_path_factory.mktemp("environment")
+    python = folder / "bin" / "python"
+    subprocess.run([*UV, "venv", "--clear", "--python", sys.executable, folder], check=True)
+    subprocess.run([*UV, "pip", "install", "--python", python, distributions[1]], check=True)
+    return folder
+
+
+@pytest.fixture
+def run(environment, tmp_path):
+    """Runs a program of the environment in a folder outside the checkout."""
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "SPLATPILOT"))}
+
+    def run(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [environment / "bin" / program, *words],
+            cwd=tmp_path,
+            env=inherited,
+            capture_output=True,
+            text=True,
+        )
+
+    return run
+
+
+def test_distributions_are_complete(distributions):
+    """The wheel holds every file of the packages and the native module, at its import name; the
+    source distribution holds the files as they lie in the checkout.
+    """
+    sdist, wheel = distributions
+    files = {
+        path.relative_to(CHECKOUT).as_posix()
+        for package in PACKAGES
+        for path in (CHECKOUT / package).rglob("*.*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert {"diagrams/scenarios/P02.yaml", "systems/policies/weights/diffaero.npz"} < files
+    in_wheel = {f if f.startswith("splatpilot/") else f"splatpilot/{f}" for f in files}
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    native = {
+        name for name in names if name.startswith("splatpilot/_native.") and name.endswith("so")
+    }
+    assert len(native) == 1
+    assert names - native == in_wheel
+    with tarfile.open(sdist) as archive:
+        assert files < {name.partition("/")[2] for name in archive.getnames()}
+
+
+def test_installation_is_light(environment, run):
+    """What flies needs less than 1.2 GB of disk, and neither torch nor pycolmap."""
+    sizes = {f.stat().st_ino: f.stat().st_size for f in environment.rglob("*") if f.is_file()}
+    print(f"{sum(sizes.values()) / 1e6:.0f} MB")
+    assert sum(sizes.values()) < MAX_SIZE
+    for package in ("torch", "torchvision", "pycolmap"):
+        assert f"No module named '{package}'" in run("python", "-c", f"import {package}").stderr
+
+
+def test_flies(run, tmp_path):
+    """`splatpilot fly` of the installed package leaves a flight."""
+    (tmp_path / "short.yaml").write_text(SHORT)
+    flown = run("splatpilot", "fly", "--scenario", "short.yaml", "--out", "flight")
+    assert flown.returncode == 0, flown.stderr
+    made = {path.name for path in (tmp_path / "flight").iterdir()}
+    assert made >= {"flight.html", "flight.mp4", "trajectory.npz", "summary.json", "scenario.yaml"}
+
+
+def test_benchmarks(run, tmp_path):
+    """Every policy flies in a study of the installed package, which ends in a report."""
+    (tmp_path / "short.yaml").write_text(SHORT)
+    study = run(
+        "splatpilot", "benchmark", "--scenarios", "short.yaml", "--seeds", "1", "--out", "study"
+    )
+    assert study.returncode == 0, study.stderr
+    with (tmp_path / "study" / "rollouts.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sorted(row["policy"] for row in rows) == sorted(BENCHMARK_POLICIES)
+    assert {row["outcome"] for row in rows} == {"timeout"}
+    assert (tmp_path / "study" / "report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "missing", "extra"),
+    [
+        (["reconstruct", ".", "--out", "scene"], "torch", "train"),
+        (["measure", "."], "torch", "train"),
+        (["ablate", "."], "torch", "train"),
+        (["fidelity", "."], "torch", "train"),
+        (["tour", "P13", "--out", "tour"], "torch", "train"),
+        (["train", "diffaero", "--out", "trained"], "torch", "train"),
+        (["capture", "check", "photographs"], "pycolmap", "photos"),
+    ],
+)
+def test_verb_without_its_extra_says_which(run, tmp_path, words, missing, extra):
+    """A verb that needs more than is installed ends with one line that says what to install."""
+    (tmp_path / "photographs").mkdir()
+    for number in range(3):
+        picture = tmp_path / "photographs" / f"{number}.jpg"
+        cv2.imwrite(str(picture), np.zeros((48, 64, 3), np.uint8))
+    ended = run("splatpilot", *words)
+    assert ended.returncode == 1
+    needed = f"{words[0]} needs {missing}; pip install 'splatpilot[{extra}]'"
+    assert ended.stderr == f"splatpilot: {needed}\n"
