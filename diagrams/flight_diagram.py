@@ -104,7 +104,7 @@ def BuildFlightDiagram(
     if policy is None:
         policy = POLICIES.kind_of(scenario.policy).build(scenario.policy, world, scenario.vehicle)
 
-    plant = plant or QuadrotorPlant(scenario.vehicle)
+    plant = cast(System, plant or QuadrotorPlant(scenario.vehicle))
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
 
     builder.AddNamedSystem("plant", plant)

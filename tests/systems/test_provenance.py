@@ -33,6 +33,7 @@ def installed(package: Path):
     file = package / "systems" / "provenance.py"
     shutil.copyfile(str(provenance.__file__), file)
     spec = importlib.util.spec_from_file_location("copied_provenance", file)
+    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
