@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from pydrake.systems.framework import System
 
@@ -31,6 +31,8 @@ class PolicyConfig(Protocol):
     `sensors`, a dictionary of the configurations of others (`diagrams/sensors.py`); and `weights`,
     a file of weights.
     """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def rate(self) -> float:

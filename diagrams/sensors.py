@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from pydrake.systems.framework import System
 
@@ -14,6 +14,8 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 
 class SensorConfig(Protocol):
     """The configuration of a sensor: a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""

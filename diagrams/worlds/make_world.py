@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.worlds.branches import BranchesConfig, branches_blueprint
 from splatpilot.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
@@ -24,6 +24,8 @@ from splatpilot.systems.registry import Registry
 
 class WorldConfig(Protocol):
     """The configuration of a world: a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
