@@ -8,9 +8,9 @@ from splatpilot.diagrams.worlds.solids import textures
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     Surfels,
+    ground_rings,
     merge,
     on_ground,
-    rectangle,
     sphere,
     tube,
 )
@@ -24,16 +24,12 @@ at grazing angles too."""
 
 def floor(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
     """Covers the ground: soil, moss and needles, fine inside the volume, coarser further out."""
-    lower, upper = layout.lower[:2], layout.upper[:2]
+    spacings = 0.18, 0.36, 0.7, 1.2, 2.2
     parts = []
-    inner = 0.0
-    for outer, spacing in ((0.5, 0.18), (4.0, 0.36), (9.0, 0.7), (16.0, 1.2), (28.0, 2.2)):
-        p = rectangle(lower - outer, upper + outer, spacing, rng)
-        p = p[layout.outside(p) >= inner] if inner else p
+    for spacing, p in zip(spacings, ground_rings(layout, spacings, rng), strict=True):
         extent = COVERAGE * spacing * rng.uniform(0.8, 1.25, (len(p), 2))
         angle = rng.uniform(0, np.pi, len(p))
         parts.append(on_ground(p, angle, extent, -SUNK - 0.1 * (spacing - 0.18)))
-        inner = outer
     surfels = Surfels.concatenate(parts)
     albedo, _ = textures.forest_floor(surfels.p[:, :2])
     albedo = albedo * rng.uniform(0.8, 1.2, (len(albedo), 1))

@@ -12,6 +12,7 @@ from splatpilot.diagrams.worlds.solids.illumination import Illumination
 from splatpilot.diagrams.worlds.solids.light import shade
 from splatpilot.diagrams.worlds.solids.materials import MATERIALS
 from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
+from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH
 from splatpilot.systems.collision.shapes import HalfSpace
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -80,7 +81,7 @@ def _tiles(solid: Solid, face: Face, texel: float) -> list[_Tile]:
     """Pieces of a face small enough for a picture; far ground is coarse."""
     size, texel = np.array(face.size), min(texel, 0.5 * MATERIALS[solid.material].spacing)
     if isinstance(solid.shape, HalfSpace):
-        belt = 28.0 - GROUND_BELT
+        belt = GROUND_REACH - GROUND_BELT
         cuts = [np.array([0.0, belt, s - belt, s]) for s in size]
         pieces = [
             (np.array([cuts[0][i], cuts[1][j]]), np.array([cuts[0][i + 1], cuts[1][j + 1]]))

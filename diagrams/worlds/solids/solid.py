@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids.materials import MATERIALS
-from splatpilot.diagrams.worlds.solids.surfaces import perpendicular
+from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, perpendicular
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ class Face:
 def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
     """Cuts the surface of `shape` into faces.
 
-    A half space must be horizontal; its face ends 28 m beyond the plan of [lower, upper] (3,).
+    A half space must be horizontal; its face ends `GROUND_REACH` beyond [lower, upper] (3,).
 
     Raises:
         ValueError: for a half space that is not horizontal.
@@ -97,7 +97,7 @@ def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
                     f"HalfSpace.normal is {shape.normal}; only horizontal ones can be seen"
                 )
             up = float(np.sign(np.asarray(shape.normal)[2]))
-            low, high = np.asarray(lower)[:2] - 28.0, np.asarray(upper)[:2] + 28.0
+            low, high = np.asarray(lower)[:2] - GROUND_REACH, np.asarray(upper)[:2] + GROUND_REACH
             corner = np.array([*low, up * shape.offset])
             x, y = np.eye(3)[0], np.eye(3)[1]
             return [_flat(corner, x, y, np.array([0, 0, up]), high[0] - low[0], high[1] - low[1])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 COVERAGE = 0.62
@@ -17,6 +19,10 @@ four neighbours, 0.71 spacings away, each still covers half of what lies behind 
 
 THICKNESS = 0.002
 """[m], standard deviation of a splat across its surface."""
+
+_RINGS = 0.5, 4.0, 9.0, 16.0, 28.0  # [m], from the volume to the outer edges of rings of ground
+GROUND_REACH = _RINGS[-1]
+"""[m], how far the ground goes on around the volume."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +84,19 @@ def rectangle(
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
     cells = np.stack([i + 0.5 * (j % 2) + 0.25, j + 0.5], axis=-1).reshape(-1, 2)
     return lower + (cells + rng.uniform(-0.22, 0.22, cells.shape)) * (upper - lower) / n
+
+
+def ground_rings(
+    plot: Plot, spacings: Sequence[float], rng: np.random.Generator
+) -> Iterator[NDArray[np.float64]]:
+    """Samples the ground in and around a volume ring by ring: points (N, 2) of each, from the
+    volume to `GROUND_REACH`, at the `spacings` [m] of the five rings."""
+    lower, upper = plot.lower[:2], plot.upper[:2]
+    inner = 0.0
+    for outer, spacing in zip(_RINGS, spacings, strict=True):
+        p = rectangle(lower - outer, upper + outer, spacing, rng)
+        yield p[plot.outside(p) >= inner]
+        inner = outer
 
 
 def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLike) -> Surfels:

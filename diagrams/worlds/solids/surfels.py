@@ -8,7 +8,13 @@ from splatpilot.diagrams.worlds.solids.illumination import Illumination
 from splatpilot.diagrams.worlds.solids.light import shade
 from splatpilot.diagrams.worlds.solids.materials import MATERIALS, Marks
 from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
-from splatpilot.diagrams.worlds.solids.surfaces import COVERAGE, Surfels, rectangle, to_gaussians
+from splatpilot.diagrams.worlds.solids.surfaces import (
+    COVERAGE,
+    GROUND_REACH,
+    Surfels,
+    ground_rings,
+    to_gaussians,
+)
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import HalfSpace
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
@@ -67,7 +73,7 @@ def _patches(
         for marks in () if face.round else material.marks:
             low, high = np.zeros(2), np.array(face.size)
             if is_ground:
-                low, high = np.full(2, 27.5), high - 27.5
+                low, high = np.full(2, GROUND_REACH - 0.5), high - (GROUND_REACH - 0.5)
             uv, extent = _place_marks(marks, low, high, rng)
             p, n, t = face.at(uv)
             raised = Surfels(p + (RAISED - depth / 2) * n, n, t, extent)
@@ -149,16 +155,13 @@ def _ground(
     face: Face, spacing: float, blueprint: Blueprint, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Covers a horizontal plane: finely in the volume, coarsely far out."""
-    lower, upper = blueprint.lower_W[:2], blueprint.upper_W[:2]
-    corner = lower - 28.0
+    corner = blueprint.lower_W[:2] - GROUND_REACH
     uv, extent = [], []
-    inner = 0.0
-    for outer, coarse in ((0.5, 1.0), (4.0, 2.0), (9.0, 4.0), (16.0, 7.0), (28.0, 12.0)):
-        p = rectangle(lower - outer, upper + outer, coarse * spacing, rng)
-        p = p[blueprint.plot.outside(p) >= inner] if inner else p
+    coarser = 1.0, 2.0, 4.0, 7.0, 12.0
+    rings = ground_rings(blueprint.plot, [times * spacing for times in coarser], rng)
+    for times, p in zip(coarser, rings, strict=True):
         uv.append(p - corner)
-        extent.append(COVERAGE * coarse * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
-        inner = outer
+        extent.append(COVERAGE * times * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
     return np.concatenate(uv), np.concatenate(extent)
 
 
