@@ -8,11 +8,7 @@ import torch
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Has torch compute on one thread while the block lasts.
-
-    torch's sums depend on its number of threads, and what little it does beside the renderer, which
-    has threads of its own, gains nothing by more.
-    """
+    """Has torch compute on one thread while the block lasts: its sums depend on their number."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,8 +1,7 @@
 """Training runs: any policy, resumable, with all that was done written beside the weights."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,6 +12,7 @@ from tqdm import tqdm
 from splatpilot.systems.files import written_atomically
 from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
+from splatpilot.training.torch_threads import one_torch_thread
 
 
 @dataclass
@@ -107,18 +107,7 @@ class NotFiniteError(ValueError):
     """A term of the loss, or the gradient, became infinite or not a number."""
 
 
-@contextmanager
-def _single_thread() -> Iterator[None]:
-    """Lets torch use one thread: sums of several would depend on their number."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@_single_thread()
+@one_torch_thread()
 def run[Config: TrainingConfig](
     *, config: Config, out: Path, make: Callable[[Config], Trainer]
 ) -> dict[str, Any]:
