@@ -19,7 +19,7 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
     plan,
 )
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
-from splatpilot.systems.policies.hypotheses import Hypotheses, unplanned
+from splatpilot.systems.policies.hypotheses import Hypotheses, no_plan
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
@@ -81,7 +81,7 @@ class AgileAutonomy(LeafSystem):
         self._depth_port = self.DeclareAbstractInputPort(
             "depth_image_32f", Value(ImageDepth32F(config.camera.width, config.camera.height))
         )
-        self.DeclareStateOutputPort("hypotheses", self.DeclareDiscreteState(unplanned(MODES)))
+        self.DeclareStateOutputPort("hypotheses", self.DeclareDiscreteState(no_plan(MODES)))
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

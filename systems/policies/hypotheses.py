@@ -50,7 +50,7 @@ def num_hypotheses_in(size: int) -> int:
     return count
 
 
-def unplanned(num_hypotheses: int) -> np.ndarray:
+def no_plan(num_hypotheses: int) -> np.ndarray:
     """The vector that stands for "no plan yet": NaN throughout."""
     return np.full(hypotheses_size(num_hypotheses), np.nan)
 

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, Value
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, unplanned
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.ports import input_port, output_port
@@ -163,7 +163,7 @@ class PrivilegedPlanner(LeafSystem):
         self._lattice = TrajectoryLattice(self._config.lattice)
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
-        plans = self.DeclareDiscreteState(unplanned(self._config.lattice.num_hypotheses))
+        plans = self.DeclareDiscreteState(no_plan(self._config.lattice.num_hypotheses))
         self.DeclareStateOutputPort("hypotheses", plans)
         # The march belongs to the start of a simulation, not to its first instant.
         self.DeclareInitializationPublishEvent(self._march)

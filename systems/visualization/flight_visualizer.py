@@ -75,18 +75,18 @@ class FlightVisualizer(LeafSystem):
             builder.Connect(hypotheses_port, visualizer.hypotheses_input_port())
         return visualizer
 
-    def _evaluated(self, port: str, context: Context) -> np.ndarray:
+    def _eval(self, port: str, context: Context) -> np.ndarray:
         return np.asarray(self.GetInputPort(port).Eval(context))
 
     def _remember_position(self, context: Context, discrete_state) -> EventStatus:
-        state = self._evaluated("state", context)
+        state = self._eval("state", context)
         discrete_state.set_value(QuadrotorState.of(state).p_WB)
         return EventStatus.Succeeded()
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
         page = round(time / self._period)
-        X_WB = pose_from_state(self._evaluated("state", context))
+        X_WB = pose_from_state(self._eval("state", context))
         self._meshcat.SetTransform(f"{self._path}/vehicle", X_WB, time)
         self._draw_trail(context, page, time, X_WB)
         if self._num_hypotheses:
@@ -103,9 +103,7 @@ class FlightVisualizer(LeafSystem):
         show_page(self._meshcat, path, page, time, keep=True)
 
     def _draw_fan(self, context: Context, page: int, time: float) -> None:
-        hypotheses = Hypotheses.from_vector(
-            self._evaluated("hypotheses", context), self._num_hypotheses
-        )
+        hypotheses = Hypotheses.from_vector(self._eval("hypotheses", context), self._num_hypotheses)
         path = f"{self._path}/hypotheses"
         if hypotheses is not None:
             start = hypotheses.X_WB.translation()

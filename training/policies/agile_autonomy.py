@@ -41,7 +41,7 @@ from splatpilot.training.policies.agile_autonomy_agent import (
 from splatpilot.training.policies.evaluation import FlightConditions, evaluate_agent, render_depth
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, ObservationNoise
-from splatpilot.training.policies.train import Schedule
+from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import (
     WorldSelection,
     training_worlds,
@@ -100,7 +100,7 @@ class AgileAutonomyTraining:
 
 
 class AgileAutonomyTrainer:
-    """See `splatpilot.training.policies.train.Trainer`."""
+    """See `splatpilot.training.policies.trainer.Trainer`."""
 
     policy = "agile_autonomy"
 

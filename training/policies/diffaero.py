@@ -35,7 +35,7 @@ from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import Observation
 from splatpilot.training.policies.ray_casting import PinholeGrid
 from splatpilot.training.policies.rollout_trainer import RolloutTraining
-from splatpilot.training.policies.train import Schedule
+from splatpilot.training.policies.trainer import Schedule
 
 
 @dataclass

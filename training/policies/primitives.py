@@ -51,13 +51,13 @@ class Primitives:
                 stack.append(kind)
         tiny, upright = 1e-3, (1, 0, 0, 0, 1, 0, 0, 0, 1)
         # (W, 4, M): centre, radius
-        self.spheres = _padded(spheres, (_FAR, 0, 0, tiny), device)
+        self.spheres = _pad(spheres, (_FAR, 0, 0, tiny), device)
         # (W, 8, M): centre, axis, half length, radius
-        self.cylinders = _padded(cylinders, (_FAR, 0, 0, 0, 0, 1, tiny, tiny), device)
+        self.cylinders = _pad(cylinders, (_FAR, 0, 0, 0, 0, 1, tiny, tiny), device)
         # (W, 15, M): centre, rotation row by row, half sizes
-        self.boxes = _padded(boxes, (_FAR, 0, 0, *upright, tiny, tiny, tiny), device)
+        self.boxes = _pad(boxes, (_FAR, 0, 0, *upright, tiny, tiny, tiny), device)
         # (W, 4, M): normal, offset; never empty, so that there always is a nearest shape
-        self.planes = _padded(planes, (0, 0, 1, -_FAR), device, least=1)
+        self.planes = _pad(planes, (0, 0, 1, -_FAR), device, least=1)
         # (W, 4): whether a world has any of a kind
         self._has = torch.tensor(
             [
@@ -169,7 +169,7 @@ def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list
     ]
 
 
-def _padded(
+def _pad(
     worlds: list[np.ndarray], filler: Sequence[float], device: torch.device | str, least: int = 0
 ) -> Tensor:
     """(W, size, M), short worlds filled up; M is the size of the fullest, or `least`."""

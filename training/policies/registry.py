@@ -9,7 +9,7 @@ from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, Ag
 from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.rollout_trainer import RolloutTrainer
-from splatpilot.training.policies.train import Trainer
+from splatpilot.training.policies.trainer import Trainer
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) ->
 
     Args:
         name: of the policy.
-        config: the type of its configurations, see `splatpilot.training.policies.train`.
+        config: the type of its configurations, see `splatpilot.training.policies.trainer`.
         make: from a configuration to a `Trainer`.
 
     Raises:

@@ -12,7 +12,7 @@ from splatpilot.training.policies.differentiable_rollout import (
     RolloutConfig,
 )
 from splatpilot.training.policies.evaluation import FlightConditions, evaluate_agent
-from splatpilot.training.policies.train import Schedule
+from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import (
     WorldSelection,
     training_worlds,

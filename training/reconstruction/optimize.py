@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.event_log import event_log
 from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
@@ -21,7 +22,6 @@ from splatpilot.training.reconstruction.photometry import fit_gain
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
-from splatpilot.training.torch_threads import one_torch_thread
 
 # The learning rate of the means falls to this fraction.
 _LAST_RATE = 0.01

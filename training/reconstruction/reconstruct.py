@@ -13,6 +13,7 @@ from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
@@ -37,7 +38,6 @@ from splatpilot.training.reconstruction.views import (
     ShrunkFrames,
     shrink_factor,
 )
-from splatpilot.training.torch_threads import one_torch_thread
 
 
 @dataclass(frozen=True)

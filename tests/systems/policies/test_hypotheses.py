@@ -5,8 +5,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from splatpilot.systems.policies.hypotheses import (
     Hypotheses,
     hypotheses_size,
+    no_plan,
     num_hypotheses_in,
-    unplanned,
 )
 
 
@@ -43,7 +43,7 @@ def test_layout_of_the_vector():
 
 def test_before_the_first_plan_there_is_none():
     """The vector of no plan reads as None."""
-    assert Hypotheses.from_vector(unplanned(3), 3) is None
+    assert Hypotheses.from_vector(no_plan(3), 3) is None
 
 
 def test_waypoints_in_the_world():
@@ -78,7 +78,7 @@ def test_position_interpolates_between_waypoints():
 def test_errors_name_sizes_and_remedy():
     """Vectors and arrays of the wrong size are refused with both sizes in the message."""
     with pytest.raises(ValueError, match=r"\(101,\).*2 hypotheses.*\(70,\).*same number"):
-        Hypotheses.from_vector(unplanned(3), 2)
+        Hypotheses.from_vector(no_plan(3), 2)
     with pytest.raises(ValueError, match=r"\(3, 9, 3\).*\(K, 10, 3\)"):
         Hypotheses(0.0, RigidTransform(), np.zeros((3, 9, 3)), np.zeros(3))
     with pytest.raises(ValueError, match=r"\(2,\).*3 trajectories"):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.systems.policies.hypotheses import Hypotheses, unplanned
+from splatpilot.systems.policies.hypotheses import Hypotheses, no_plan
 from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 
@@ -17,7 +17,7 @@ def waypoint(selector, vector, time):
 
 def test_hovers_before_the_first_plan():
     """Without a plan the waypoint is the vehicle's own position."""
-    np.testing.assert_array_equal(waypoint(HypothesisSelector(3), unplanned(3), 0.5), [7, 8, 9])
+    np.testing.assert_array_equal(waypoint(HypothesisSelector(3), no_plan(3), 0.5), [7, 8, 9])
 
 
 def test_follows_the_cheapest_a_lookahead_ahead():

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import torch
 
 from splatpilot import register_trainer
-from splatpilot.training.policies.train import Schedule
+from splatpilot.training.policies.trainer import Schedule
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTrain
 from splatpilot.training.policies.evaluation import evaluate_agent
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.registry import TRAINERS
-from splatpilot.training.policies.train import Schedule, run
+from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer import Schedule
 
 SMALL = [
     "worlds.kinds=[P10]",
