@@ -2,10 +2,20 @@
 
 import argparse
 import sys
+from typing import Any
 
-from splatpilot import __version__
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.systems.extras import missing_extra
+
+
+class _PrintVersion(argparse.Action):
+    """Finds the version out only when it is asked for, because that takes as long as the rest."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from splatpilot import __version__
+
+        print(f"{parser.prog} {__version__}")
+        parser.exit()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,7 +39,9 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="MODULE",
         help="import a module that registers policies, worlds, sensors, ... (repeatable)",
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument(
+        "--version", action=_PrintVersion, nargs=0, help="show the version and exit"
+    )
     verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb_name")
     for command in COMMANDS:
         command.add_to(verbs)

@@ -1,7 +1,7 @@
 """Packages that only parts of splatpilot need, and the extras of `pip install` that bring them."""
 
 import re
-from importlib import import_module, metadata
+from importlib import import_module
 from types import ModuleType
 
 
@@ -27,7 +27,9 @@ def missing_extra(error: ModuleNotFoundError, needed_by: str) -> str | None:
         A sentence with the extra that brings the missing package, as `pyproject.toml` has it; None
         if no extra does.
     """
-    for requirement in metadata.requires("splatpilot") or []:
+    from importlib.metadata import requires  # Slow to load, and seldom needed.
+
+    for requirement in requires("splatpilot") or []:
         match = re.fullmatch(r"([\w.-]+).*extra == ['\"](\w+)['\"].*", requirement)
         if match is not None and match[1] == error.name:
             return f"{needed_by} needs {error.name}; pip install 'splatpilot[{match[2]}]'"
