@@ -2,13 +2,23 @@
 // with the homography between plane and image inverted in closed form).
 #pragma once
 
+#include "doubles.hpp"
 #include "project_arrays.hpp"
 #include "surfel_lanes.hpp"
 #include "surfel_types.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
-SP_INLINE Vector16 cross(const Vector16& a, const Vector16& b) {
+struct DoubleVector16 {
+  D16 x, y, z;
+};
+
+SP_INLINE Vector16 to_float(const DoubleVector16& a) {
+  return {to_float(a.x), to_float(a.y), to_float(a.z)};
+}
+
+template <typename Vector>
+SP_INLINE Vector cross(const Vector& a, const Vector& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
@@ -17,35 +27,67 @@ SP_INLINE Vector16 sum(const Vector16& a, const Vector16& b) {
   return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
 
-// The unit tangents and the normal t[2] = t[0] x t[1] of surfels, in the world.
-SP_INLINE void surfel_axes(const F16 q[4], Vector16 t[3]) {
-  const F16 ones[3] = {F16(1.0f), F16(1.0f), F16(1.0f)};
-  covariance_factor(q, ones, t);
+SP_INLINE DoubleVector16 to_camera(const Camera& camera, const DoubleVector16& d_W) {
+  const float* R = camera.R_CW;
+  return {D16(R[0]) * d_W.x + (D16(R[1]) * d_W.y + D16(R[2]) * d_W.z),
+          D16(R[3]) * d_W.x + (D16(R[4]) * d_W.y + D16(R[5]) * d_W.z),
+          D16(R[6]) * d_W.x + (D16(R[7]) * d_W.y + D16(R[8]) * d_W.z)};
+}
+
+// A coordinate of world points relative to the camera centre.
+SP_INLINE D16 from_centre(const Camera& camera, const F16& p_W, int axis) {
+  return D16(p_W) - D16(static_cast<double>(camera.centre_high[axis]) + camera.centre_low[axis]);
+}
+
+// The unit tangents of surfels in the world: the first columns of R(q).
+SP_INLINE void surfel_tangents(const F16 q[4], DoubleVector16 t[2]) {
+  const D16 w(q[0]), x(q[1]), y(q[2]), z(q[3]), one = 1.0;
+  const D16 two = D16(2.0) / ((w * w + x * x) + (y * y + z * z));
+  t[0] = {one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)};
+  t[1] = {two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)};
 }
 
 // A surfel in the camera frame, and the coefficients of Surfel::u, v and w before the division by
 // focal lengths: u = (t1 x p) / (s0 n . p), v = (p x t0) / (s1 n . p), w = n / (n . p), of which
 // the x and y components count.
 struct SurfelPlane {
-  Vector16 p, t[3];
-  F16 facing;         // n . p
+  Vector16 p, t[3], t_W[3];  // t[2] = t[0] x t[1] is the normal n
+  F16 facing;                // n . p
   F16 inverse_facing;
   Vector16 u, v, w;
+  F16 mean[2], rest[2];      // the centre's pixel is their sum [px]
   Mask16 edge_on;
 };
 
-SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const Vector16& p_C,
-                                   const Vector16 t_W[3], const F16 scale[2]) {
+// In doubles up to the differences that cancel as n . p goes to zero: a float's error of p or n, or
+// of the pixel against the width of the ellipse, is that error over the sine in every gradient.
+SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians& in) {
+  DoubleVector16 t_W[2];
+  surfel_tangents(in.quat, t_W);
+  const DoubleVector16 t[2] = {to_camera(camera, t_W[0]), to_camera(camera, t_W[1])};
+  const DoubleVector16 p = to_camera(camera, {from_centre(camera, in.mean.x, 0),
+                                              from_centre(camera, in.mean.y, 1),
+                                              from_centre(camera, in.mean.z, 2)});
+  const DoubleVector16 n = cross(t[0], t[1]);
   SurfelPlane s;
-  s.p = p_C;
-  for (int k = 0; k < 2; ++k) s.t[k] = to_camera(camera, t_W[k]);
-  s.t[2] = cross(s.t[0], s.t[1]);
-  s.facing = dot(s.t[2], p_C);
-  s.edge_on = s.facing * s.facing <= F16(kEdgeOn * kEdgeOn) * dot(p_C, p_C);
+  s.p = to_float(p);
+  for (int k = 0; k < 2; ++k) s.t[k] = to_float(t[k]);
+  for (int k = 0; k < 2; ++k) s.t_W[k] = to_float(t_W[k]);
+  s.t[2] = to_float(n);
+  s.t_W[2] = to_float(cross(t_W[0], t_W[1]));
+  s.facing = to_float(n.x * p.x + (n.y * p.y + n.z * p.z));
+  s.edge_on = s.facing * s.facing <= F16(kEdgeOn * kEdgeOn) * dot(s.p, s.p);
   s.inverse_facing = F16(1.0f) / select(s.edge_on, F16(1.0f), s.facing);
-  s.u = scaled(cross(s.t[1], p_C), s.inverse_facing / scale[0]);
-  s.v = scaled(cross(p_C, s.t[0]), s.inverse_facing / scale[1]);
+  s.u = scaled(to_float(cross(t[1], p)), s.inverse_facing / in.scale[0]);
+  s.v = scaled(to_float(cross(p, t[0])), s.inverse_facing / in.scale[1]);
   s.w = scaled(s.t[2], s.inverse_facing);
+  const D16 inverse_z = D16(1.0) / p.z;
+  const D16 mean[2] = {D16(camera.fx) * (p.x * inverse_z) + D16(camera.cx),
+                       D16(camera.fy) * (p.y * inverse_z) + D16(camera.cy)};
+  for (int k = 0; k < 2; ++k) {
+    s.mean[k] = to_float(mean[k]);
+    s.rest[k] = to_float(mean[k] - D16(s.mean[k]));
+  }
   return s;
 }
 
@@ -59,8 +101,6 @@ SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const
   const F16 r = sqrt(max(budget, zero) * F16(1.0f / kHalfLog2e));
   const F16 inverse_z = one / s.p.z;
   const F16 slope_x = s.p.x * inverse_z, slope_y = s.p.y * inverse_z;
-  const F16 mean_x = F16(camera.fx) * slope_x + F16(camera.cx);
-  const F16 mean_y = F16(camera.fy) * slope_y + F16(camera.cy);
 
   // A point (a, b) of the plane is seen at mean + (A (a, b)) / (z + c . (a, b)).
   F16 A_x[2], A_y[2], c[2];
@@ -97,8 +137,8 @@ SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const
   const F16 cut_x = r * sqrt(A_x[0] * A_x[0] + A_x[1] * A_x[1]) / F16(camera.near_plane);
   const F16 cut_y = r * sqrt(A_y[0] * A_y[0] + A_y[1] * A_y[1]) / F16(camera.near_plane);
   const F16 most = F16(1e30f);
-  out.mean_x = mean_x + zero_unless(regular, offset_x);
-  out.mean_y = mean_y + zero_unless(regular, offset_y);
+  out.mean_x = s.mean[0] + zero_unless(regular, offset_x);
+  out.mean_y = s.mean[1] + zero_unless(regular, offset_y);
   // min() returns its second operand for a NaN.
   out.extent_x = min(select(regular, sqrt(xx), cut_x), most);
   out.extent_y = min(select(regular, sqrt(yy), cut_y), most);
@@ -111,10 +151,10 @@ SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const
   out.depth = s.p.z;
   disc_radius = r * F16(__builtin_sqrtf(kBlobVariance));
 
-  const F16 low_x = min(out.mean_x - out.extent_x, mean_x - disc_radius);
-  const F16 high_x = max(out.mean_x + out.extent_x, mean_x + disc_radius);
-  const F16 low_y = min(out.mean_y - out.extent_y, mean_y - disc_radius);
-  const F16 high_y = max(out.mean_y + out.extent_y, mean_y + disc_radius);
+  const F16 low_x = min(out.mean_x - out.extent_x, s.mean[0] - disc_radius);
+  const F16 high_x = max(out.mean_x + out.extent_x, s.mean[0] + disc_radius);
+  const F16 low_y = min(out.mean_y - out.extent_y, s.mean[1] - disc_radius);
+  const F16 high_y = max(out.mean_y + out.extent_y, s.mean[1] + disc_radius);
   return in_depth_range(camera, s.p.z) & (budget >= zero) &
          (max(disc_radius, max(out.extent_x, out.extent_y)) > F16(camera.radius_clip)) &
          (high_x > zero) & (low_x < F16(static_cast<float>(camera.width))) & (high_y > zero) &
@@ -164,9 +204,7 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
     const uint32_t* indices = candidates + first;
     const GatheredGaussians in = gather_gaussians(g, indices);
     const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
-    Vector16 t_W[3];
-    surfel_axes(in.quat, t_W);
-    const SurfelPlane s = surfel_plane(camera, to_camera(camera, d_W), t_W, in.scale);
+    const SurfelPlane s = surfel_plane(camera, in);
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
     SplatPack pack;
     F16 disc[3], color[3];
@@ -176,30 +214,24 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
     if (!bits) continue;
     gather_colors(g, indices, bits, d_W, color);
 
-    const F16 inverse_z = F16(1.0f) / s.p.z;
+    disc[0] = s.mean[0];
+    disc[1] = s.mean[1];
     const F16 inverse_fx = F16(1.0f / camera.fx), inverse_fy = F16(1.0f / camera.fy);
-    disc[0] = F16(camera.fx) * (s.p.x * inverse_z) + F16(camera.cx);
-    disc[1] = F16(camera.fy) * (s.p.y * inverse_z) + F16(camera.cy);
     const F16 zero = F16(0.0f), one = F16(1.0f);
     const F16 towards = select(s.facing > zero, -one, one);
+    F16 rows[3][3];  // u, v and w
+    const Vector16* planes[3] = {&s.u, &s.v, &s.w};
+    for (int i = 0; i < 3; ++i) {
+      rows[i][0] = select(s.edge_on, zero, planes[i]->x * inverse_fx);
+      rows[i][1] = select(s.edge_on, zero, planes[i]->y * inverse_fy);
+      rows[i][2] = -(rows[i][0] * s.rest[0] + rows[i][1] * s.rest[1]);
+    }
+    rows[2][2] = select(s.edge_on, -one, rows[2][2] + one / s.p.z);
     const F16 fields[kSurfelFields] = {
-        disc[0],
-        disc[1],
-        select(s.edge_on, zero, s.u.x * inverse_fx),
-        select(s.edge_on, zero, s.u.y * inverse_fy),
-        select(s.edge_on, zero, s.v.x * inverse_fx),
-        select(s.edge_on, zero, s.v.y * inverse_fy),
-        select(s.edge_on, zero, s.w.x * inverse_fx),
-        select(s.edge_on, zero, s.w.y * inverse_fy),
-        select(s.edge_on, -one, inverse_z),
-        s.p.z,
-        log2_opacity,
-        color[0],
-        color[1],
-        color[2],
-        towards * t_W[2].x,
-        towards * t_W[2].y,
-        towards * t_W[2].z};
+        s.mean[0],  s.mean[1],  rows[0][0],         rows[0][1],         rows[0][2],
+        rows[1][0], rows[1][1], rows[1][2],         rows[2][0],         rows[2][1],
+        rows[2][2], s.p.z,      log2_opacity,       color[0],           color[1],
+        color[2],   towards * s.t_W[2].x, towards * s.t_W[2].y, towards * s.t_W[2].z};
     alignas(64) float soa[kSurfelFields][kLanes];
     for (int f = 0; f < kSurfelFields; ++f) store(soa[f], fields[f]);
     size_t next = count;

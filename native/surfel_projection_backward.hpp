@@ -116,9 +116,8 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
 
     const GatheredGaussians in = gather_gaussians(input, indices);
     const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
-    Vector16 t_W[3];
-    surfel_axes(in.quat, t_W);
-    const SurfelPlane s = surfel_plane(camera, to_camera(camera, d_W), t_W, in.scale);
+    const SurfelPlane s = surfel_plane(camera, in);
+    const Vector16* t_W = s.t_W;
     const PlaneGradient by = plane_gradient(camera, s, in.scale, g);
 
     const F16 one = F16(1.0f), zero = F16(0.0f);

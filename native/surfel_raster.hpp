@@ -61,9 +61,9 @@ SP_INLINE SurfelSample sample_surfel(const Surfel& s, const BlockLanes& pixel,
   SurfelSample a;
   a.dx = pixel.x - F16(s.mean[0]);
   a.dy = pixel.y - F16(s.mean[1]);
-  a.z = F16(1.0f) / (F16(s.w[0]) * a.dx + (F16(s.w[1]) * a.dy + F16(s.inverse_depth)));
-  a.U = F16(s.u[0]) * a.dx + F16(s.u[1]) * a.dy;
-  a.V = F16(s.v[0]) * a.dx + F16(s.v[1]) * a.dy;
+  a.z = F16(1.0f) / (F16(s.w[0]) * a.dx + (F16(s.w[1]) * a.dy + F16(s.w[2])));
+  a.U = F16(s.u[0]) * a.dx + (F16(s.u[1]) * a.dy + F16(s.u[2]));
+  a.V = F16(s.v[0]) * a.dx + (F16(s.v[1]) * a.dy + F16(s.v[2]));
   a.u = a.U * a.z;
   a.v = a.V * a.z;
   const F16 on_plane = a.u * a.u + a.v * a.v;

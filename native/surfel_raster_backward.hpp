@@ -91,7 +91,7 @@ SP_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, 
   const F16 U = zero_unless(a.hit, a.U), V = zero_unless(a.hit, a.V);
   const F16 by_blob = by_exponent - zero_unless(a.hit, by_exponent);
   const F16 of_blob = F16(1.0f / kBlobVariance) * by_blob;
-  const F16 q = F16(surfel.inverse_depth);
+  const F16 q = F16(1.0f / surfel.depth);
   sums[0] += by_U * U;
   sums[1] += by_U * V;
   sums[2] += by_V * U;

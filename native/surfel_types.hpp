@@ -13,15 +13,14 @@ constexpr float kEdgeOn = 1e-5f;
 // exp(-r2 / 2) = exp2(-kHalfLog2e r2).
 constexpr float kHalfLog2e = 0.72134752f;
 
-// A visible surfel. With d = pixel - mean the ray through the pixel meets its plane at the depth
-// z = 1 / (inverse_depth + w . d), at z (u . d) and z (v . d) standard deviations from its centre.
-// Seen edge-on, inverse_depth is -1 and w zero: no ray meets the plane in front of the camera.
+// A visible surfel. With d = (pixel - mean, 1) the ray through the pixel meets its plane at the
+// depth z = 1 / (w . d), at z (u . d) and z (v . d) standard deviations from its centre: the third
+// entries are what the rounding of mean leaves, and in w the inverse depth of the centre.
+// Seen edge-on, w is (0, 0, -1): no ray meets the plane in front of the camera.
 struct Surfel {
-  float mean[2];        // [px]
-  float u[2], v[2];     // [1/(m px)]
-  float w[2];           // [1/(m px)]
-  float inverse_depth;  // [1/m]
-  float depth;          // of the centre [m]
+  float mean[2];           // [px]
+  float u[3], v[3], w[3];  // [1/(m px)], the third entries [1/m]
+  float depth;             // of the centre [m]
   float log2_opacity;
   float color[3];
   float normal[3];      // in the world, towards the camera

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from random_scenes import normal_tensor
 from torch import Tensor
 
 HALF = 2.0  # [m] of the cube about the origin that is kept
@@ -30,7 +31,7 @@ def load_garden(data: Path, count: int | None = None) -> Garden:
     N = len(inside)
     scene = {
         "means": means[inside],
-        "quats": torch.nn.functional.normalize(torch.randn(N, 4, generator=g)),
+        "quats": normal_tensor(42, N, 4),
         "scales": SCALES[0] + (SCALES[1] - SCALES[0]) * torch.rand(N, 3, generator=g),
         "opacities": torch.rand(N, generator=g),
         "colors": colors[inside].float(),

@@ -34,31 +34,6 @@ class Reference(NamedTuple):
     margin: Tensor  # (H, W) least relative distance of an alpha or a T to the threshold it met
 
 
-def random_scene(count=300, seed=0, sh_degree=None, cameras=1, size=(67, 45)) -> dict[str, Any]:
-    """Needles, discs and blobs in front of, around and behind cameras that look at the origin."""
-    g = torch.Generator().manual_seed(seed)
-    scene = {
-        "means": 1.5 * torch.randn(count, 3, generator=g),
-        "quats": 3 * torch.randn(count, 4, generator=g),
-        "scales": torch.exp(torch.randn(count, 3, generator=g) - 2.5),
-        "opacities": torch.rand(count, generator=g),
-        "colors": torch.rand(count, 3, generator=g),
-    }
-    if sh_degree is not None:
-        K = (sh_degree + 1) ** 2
-        scene["colors"] = 0.4 * torch.randn(count, K, 3, generator=g)
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
-    for c in range(cameras):
-        q = torch.randn(1, 4, generator=g, dtype=torch.float64) * 0.1 + torch.tensor([1.0, 0, 0, 0])
-        viewmats[c, :3, :3] = rotation_matrices(q)[0]
-        viewmats[c, 2, 3] = 3.0 + c
-    width, height = size
-    K = torch.tensor([[0.9 * width, 0, 0.48 * width], [0, 1.1 * width, 0.55 * height], [0, 0, 1]])
-    scene["viewmats"] = viewmats.float()
-    scene["Ks"] = K.repeat(cameras, 1, 1)
-    return scene
-
-
 def single_gaussian(opacity=0.5, scale=0.1, depth=2.0, color=(0.2, 0.4, 0.8)) -> dict[str, Any]:
     return {
         "means": torch.tensor([[0.0, 0.0, depth]]),

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from random_scenes import normal_tensor
 from torch import Tensor
 
 from splatpilot.systems.splats.camera_models import (
@@ -33,8 +34,7 @@ def models() -> dict[str, Any]:
 
 
 def points(count: int = 500, depth: float = 2.0, seed: int = 1) -> Tensor:
-    g = torch.Generator().manual_seed(seed)
-    p_C = torch.randn(count, 3, generator=g, dtype=torch.float64)
+    p_C = normal_tensor(seed, count, 3).double()
     p_C[:, 2] = depth + p_C[:, 2].abs()
     return p_C
 
@@ -96,11 +96,10 @@ def test_limits():
 def test_moments_against_samples(model):
     """The unscented mean and covariance are those of a million projected samples."""
     project = models()[model]
-    g = torch.Generator().manual_seed(5)
     p_C = torch.tensor([[0.9, -0.6, 2.0]], dtype=torch.float64)
-    factor = 0.06 * torch.randn(1, 3, 3, generator=g, dtype=torch.float64)
+    factor = 0.06 * normal_tensor(5, 1, 3, 3).double()
     means2d, covariances, valid = unscented_projection(p_C, factor, project)
-    noise = torch.randn(500_000, 3, generator=g, dtype=torch.float64)
+    noise = normal_tensor(6, 500_000, 3).double()
     noise = torch.cat([noise, -noise])
     pixels, _ = project(p_C + noise @ factor[0].T)
     sampled = pixels.T.cov()
@@ -116,7 +115,7 @@ def test_projection_gradients():
     """Derivatives by points, intrinsics and coefficients pass gradcheck in float64."""
     p_C = points(4).requires_grad_()
     inputs = [t.clone().requires_grad_() for t in (K, RADIAL, TANGENTIAL, FISHEYE)]
-    factors = 0.1 * torch.randn(4, 3, 3, dtype=torch.float64, generator=torch.Generator())
+    factors = 0.1 * normal_tensor(0, 4, 3, 3).double()
     factors.requires_grad_()
 
     def projected(p_C, factors, K, radial, tangential, fisheye):

@@ -9,11 +9,12 @@ import reference_rasterizer as reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scenes import normal_tensor, random_scene
 
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
 
-random_scene, single_gaussian = reference.random_scene, reference.single_gaussian
+single_gaussian = reference.single_gaussian
 
 LEVELS = _native.simd_levels()
 
@@ -309,10 +310,9 @@ def test_fuzz_finite_and_bounded(
     seed, count, width, height, spread, log_scale, mode, simd, threads
 ):
     """Any valid scene renders finite values, alpha in [0, 1] and colours within their hull."""
-    g = torch.Generator().manual_seed(seed)
     scene = random_scene(count=count, seed=seed, size=(width, height))
     scene["means"] *= 10.0**spread
-    scene["scales"] = 10.0 ** (log_scale + torch.randn(count, 3, generator=g))
+    scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
     image, alpha, _ = rasterize(
         **scene, width=width, height=height, render_mode=mode, simd=simd, threads=threads
     )

@@ -9,12 +9,13 @@ import reference_rasterizer as reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scenes import normal_tensor, random_scene
 from torch import Tensor
 
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
 
-random_scene, single_gaussian = reference.random_scene, reference.single_gaussian
+single_gaussian = reference.single_gaussian
 
 LEVELS = _native.simd_levels()
 SCENE = ("means", "quats", "scales", "opacities", "colors")
@@ -68,9 +69,8 @@ def compare(
     image, alpha, margin = reference_views(wide, size, mode, sh_degree, antialiased=antialiased)
     clear = (margin > 1e-3)[..., None]
     assert clear.double().mean() > least_clear
-    g = torch.Generator().manual_seed(0)
-    v_image = torch.randn(image.shape, generator=g) * clear
-    v_alpha = torch.randn(alpha.shape, generator=g) * clear
+    v_image = normal_tensor(0, *image.shape) * clear
+    v_alpha = normal_tensor(1, *alpha.shape) * clear
     torch.autograd.backward([image, alpha], [v_image.double(), v_alpha.double()])
 
     narrow = leaves(scene)
@@ -94,13 +94,17 @@ def compare(
 
 
 def assert_agree(pairs: dict[str, tuple[Tensor, Tensor]], p99=2e-4) -> None:
-    """gsplat's tolerances for its own kernels but for one in 500, 1e-4 relative in all."""
+    """gsplat's tolerances for its own kernels but for one in 500, 1e-4 relative in all.
+
+    The entries for poses are sums that cancel: their errors are relative to the largest entry.
+    """
     for name, (gradient, expected) in pairs.items():
-        error = (gradient - expected).abs()
-        beyond = error > 1e-3 + 1e-5 * expected.abs()
+        error, size = (gradient - expected).abs(), expected.abs()
+        size = size.max() if name == "viewmats" else size
+        beyond = error > 1e-3 + 1e-5 * size
         assert beyond.sum() <= max(1, beyond.numel() // 500), (name, error.max())
-        assert not (error > 1e-3 + 1e-4 * expected.abs()).any(), (name, error.max())
-        relative = error / (expected.abs() + 1e-2)
+        assert not (error > 1e-3 + 1e-4 * size).any(), (name, error.max())
+        relative = error / (size + 1e-2)
         assert relative.median() < 5e-6, name
         if len(expected) > 100:
             assert torch.quantile(relative.flatten(), 0.99) < p99, name
@@ -206,8 +210,7 @@ def test_directional_derivatives_agree_with_finite_differences():
     """The gradient along random directions equals the float64 reference's central difference."""
     scene = random_scene(count=12, seed=13, size=(19, 14))
     scene["opacities"] = 0.2 + 0.5 * scene["opacities"]
-    g = torch.Generator().manual_seed(1)
-    v = torch.randn(1, 14, 19, 4, generator=g)
+    v = normal_tensor(1, 1, 14, 19, 4)
 
     def loss(moved):
         image, _, margin = reference_views(moved, (19, 14), "RGB+D")
@@ -218,8 +221,8 @@ def test_directional_derivatives_agree_with_finite_differences():
     narrow = leaves(scene)
     image, _, _ = rasterize(**narrow, width=19, height=14, render_mode="RGB+D")
     (image * v * clear).sum().backward()
-    for name in (*SCENE, "viewmats"):
-        direction = torch.randn(scene[name].shape, generator=g).double()
+    for seed, name in enumerate((*SCENE, "viewmats")):
+        direction = normal_tensor(seed, *scene[name].shape).double()
         if name == "viewmats":
             direction[:, 3] = 0
         step = 1e-6
@@ -265,8 +268,7 @@ def test_screen_space_gradients_agree_with_reference():
     narrow = leaves(scene)
     image, alpha, meta = rasterize(**narrow, width=13, height=11, render_mode="RGB+D", absgrad=True)
     meta["means2d"].retain_grad()
-    g = torch.Generator().manual_seed(2)
-    v = torch.randn(11, 13, 5, generator=g)
+    v = normal_tensor(2, 11, 13, 5)
 
     wide = {name: tensor.double() for name, tensor in scene.items()}
     p = reference.project(*(wide[n] for n in SCENE[:4]), wide["viewmats"][0], wide["Ks"][0], 13, 11)
@@ -442,10 +444,9 @@ def test_fuzz_finite(
     threads,
 ):
     """Any valid scene differentiates to finite values."""
-    g = torch.Generator().manual_seed(seed)
     scene = random_scene(count=count, seed=seed, size=(width, height), sh_degree=sh_degree)
     scene["means"] *= 10.0**spread
-    scene["scales"] = 10.0 ** (log_scale + torch.randn(count, 3, generator=g))
+    scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
     narrow = leaves(scene)
     image, alpha, meta = rasterize(
         **narrow,
@@ -459,7 +460,7 @@ def test_fuzz_finite(
         simd=simd,
         threads=threads,
     )
-    upstream = [torch.randn(image.shape, generator=g), torch.randn(alpha.shape, generator=g)]
+    upstream = [normal_tensor(seed, *image.shape), normal_tensor(seed, *alpha.shape)]
     torch.autograd.backward([image, alpha], upstream)
     assert all(torch.isfinite(narrow[n].grad).all() for n in (*SCENE, "viewmats"))
     assert torch.isfinite(meta["means2d"].absgrad).all() and (meta["means2d"].absgrad >= 0).all()
@@ -473,10 +474,9 @@ def test_fitting_recovers_an_image():
     truth["opacities"] = 0.5 + 0.4 * truth["opacities"]
     size: dict[str, Any] = {"width": 40, "height": 30}
     target = rasterize(**truth, **size)[0]
-    g = torch.Generator().manual_seed(3)
-    means = (truth["means"] + 0.05 * torch.randn(8, 3, generator=g)).requires_grad_()
-    log_scales = (truth["scales"].log() + 0.2 * torch.randn(8, 3, generator=g)).requires_grad_()
-    quats = (truth["quats"] + 0.3 * torch.randn(8, 4, generator=g)).requires_grad_()
+    means = (truth["means"] + 0.05 * normal_tensor(3, 8, 3)).requires_grad_()
+    log_scales = (truth["scales"].log() + 0.2 * normal_tensor(4, 8, 3)).requires_grad_()
+    quats = (truth["quats"] + 0.3 * normal_tensor(5, 8, 4)).requires_grad_()
     colors = (0.5 * torch.ones(8, 3)).requires_grad_()
     optimizer = torch.optim.Adam([means, log_scales, quats, colors], lr=0.01)
     losses = []

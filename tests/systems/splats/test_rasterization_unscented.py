@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from random_scenes import normal_tensor
 from torch import Tensor
 
 from splatpilot.systems.splats import rasterize
@@ -38,7 +39,7 @@ def blobs(count: int, scale: float, seed: int = 0, spread: float = 0.6) -> dict[
     slopes = spread * (2 * torch.rand(count, 2, generator=g) - 1)
     return {
         "means": torch.cat([slopes * z, z], 1),
-        "quats": torch.randn(count, 4, generator=g),
+        "quats": normal_tensor(seed, count, 4),
         "scales": scale * z * (0.5 + torch.rand(count, 3, generator=g)),
         "opacities": 0.3 + 0.6 * torch.rand(count, generator=g),
         "colors": torch.rand(count, 3, generator=g),
@@ -71,7 +72,7 @@ def test_zero_distortion_is_the_pinhole():
 def test_spherical_harmonics_see_the_pose():
     """Colours from spherical harmonics are the pinhole's for a camera that is moved and turned."""
     scene = blobs(2000, 1 / 400)
-    scene["colors"] = torch.randn(2000, 16, 3, generator=torch.Generator().manual_seed(1))
+    scene["colors"] = normal_tensor(1, 2000, 16, 3)
     cos, sin = math.cos(0.2), math.sin(0.2)
     scene["viewmats"] = torch.tensor(
         [[[cos, 0, sin, -0.5], [0, 1, 0, 0.3], [-sin, 0, cos, 0.2], [0, 0, 0, 1]]]
@@ -149,7 +150,7 @@ def test_rendered_gradients(model, rasterize_mode):
     g = torch.Generator().manual_seed(2)
     scene = blobs(5, 1.2, seed=3, spread=0.3) | lens(model)
     scene["opacities"] = scene["opacities"] * 0.5
-    scene["colors"] = 0.2 * torch.randn(5, 9, 3, generator=g)
+    scene["colors"] = 0.2 * normal_tensor(2, 5, 9, 3)
     scene["backgrounds"] = torch.rand(1, 3, generator=g)
     if rasterize_mode == "antialiased":
         scene["eps2d"] = 30.0
@@ -168,10 +169,10 @@ def test_rendered_gradients(model, rasterize_mode):
 
     leaves = {name: t.clone().requires_grad_() for name, t in tensors.items()}
     loss(**leaves).backward()
-    for name, tensor in tensors.items():
+    for seed, (name, tensor) in enumerate(tensors.items()):
         gradient = leaves[name].grad
         assert gradient is not None and gradient.isfinite().all()
-        direction = torch.randn(tensor.shape, generator=g)
+        direction = normal_tensor(seed, *tensor.shape)
         if name == "viewmats":
             direction[:, 3] = 0
             direction *= 0.1  # stays a rotation to the tolerance of the check
