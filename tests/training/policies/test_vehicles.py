@@ -6,6 +6,7 @@ import torch
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from random_scenes import normal_tensor
 
 from splatpilot.systems.vehicle.flatness_controller import (
     FlatnessController,
@@ -27,7 +28,7 @@ CONTROL = FlatnessControllerConfig()
 
 def point_masses(count: int) -> PointMass:
     generator = torch.Generator().manual_seed(0)
-    p, v, a = (torch.randn(count, 3, generator=generator, dtype=torch.float64) for _ in "pva")
+    p, v, a = (normal_tensor(seed, count, 3).double() for seed in range(3))
     yaw = torch.rand(count, generator=generator, dtype=torch.float64)
     return PointMass(p, v, a, yaw, torch.full((count, 1), 0.13, dtype=torch.float64))
 

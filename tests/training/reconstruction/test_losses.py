@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scenes import normal_tensor
 from scipy.ndimage import correlate1d
 
 from splatpilot import _native
@@ -33,7 +34,7 @@ def image_pair(shape, seed=0):
     rng = torch.Generator().manual_seed(seed)
     target = torch.rand(shape, generator=rng)
     target[..., : shape[-2] // 3, :] = 0.25
-    rendered = (target + 0.1 * torch.randn(shape, generator=rng)).clamp(0, 1)
+    rendered = (target + 0.1 * normal_tensor(seed, *shape)).clamp(0, 1)
     return rendered, target
 
 
@@ -41,7 +42,7 @@ def depth_pair(shape, seed=0):
     """A true depth of 0 to 200 m, of which some pixels are unknown, and a noisy render of it."""
     rng = torch.Generator().manual_seed(seed)
     depth = 200 * torch.rand(shape, generator=rng) ** 3
-    rendered = depth * torch.exp(0.1 * torch.randn(shape, generator=rng))
+    rendered = depth * (1 + 0.1 * normal_tensor(seed, *shape))
     flat = depth.view(-1)
     flat[::7], flat[1::11], flat[2::13] = 0.0, math.nan, math.inf
     return rendered.contiguous(), depth
