@@ -4,6 +4,7 @@ import base64
 import json
 
 import cv2
+import msgpack
 import numpy as np
 import pytest
 from pydrake.common.value import Value
@@ -15,6 +16,7 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
@@ -61,21 +63,90 @@ def test_flight_is_drawn_page_by_page(meshcat):
     assert not meshcat.HasPath("/splatpilot/hypotheses/00000/3")
 
 
-def test_still_life_is_drawn(meshcat):
-    """Scene, goal and distance slice appear under the paths they were given, and in the page."""
+def drawn(meshcat, path: str) -> dict:
+    """The object at a path, as the page gets it: its geometry, its material and itself."""
+    return msgpack.unpackb(meshcat._GetPackedObject(path))["object"]
+
+
+def vertices(drawing: dict, attribute: str) -> np.ndarray:
+    """(n, 3) An attribute of the vertices of a drawing: position [m] or color."""
+    packed = drawing["geometries"][0]["data"]["attributes"][attribute]["array"]
+    return np.frombuffer(packed.data, "<f4").reshape(-1, 3)
+
+
+def test_gaussians_are_drawn_as_points_of_their_size(meshcat):
+    """Those inside the box are points at their means, in their colours as linear light."""
     scene = GaussianScene.from_colors(
-        means=[[1, 0, 1], [2, 0, 1], [100, 0, 1]],
+        means=[[1, 0, 1], [2, 0.5, 1], [100, 0, 1]],
         quats=np.tile([1.0, 0, 0, 0], (3, 1)),
-        scales=np.full((3, 3), 0.1),
+        scales=[[0.1, 0.02, 0.01], [0.01, 0.3, 0.1], [9, 9, 9]],
         opacities=np.full(3, 0.9),
-        colors=np.full((3, 3), 0.5),
+        colors=[[1.0, 0.5, 0.0], [0.2, 0.2, 0.8], [1, 1, 1]],
     )
-    field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [4, 1, 2])
-    draw_gaussians(meshcat, "/splatpilot/scene", scene, field.lower_W, field.upper_W)
-    draw_goal(meshcat, "/splatpilot/goal", np.array([3.0, 0, 1]), radius=0.3)
+    draw_gaussians(meshcat, "/splatpilot/scene", scene, np.zeros(3) - 1, np.full(3, 4.0))
+    drawing = drawn(meshcat, "/splatpilot/scene")
+    np.testing.assert_array_equal(vertices(drawing, "position"), [[1, 0, 1], [2, 0.5, 1]])
+    shown = vertices(drawing, "color") ** (1 / 2.2)  # as the screen encodes it
+    np.testing.assert_allclose(shown, [[1, 0.5, 0], [0.2, 0.2, 0.8]], atol=0.02)
+    # As wide as the median over Gaussians of their largest deviations, 0.1 m and 0.3 m.
+    assert drawing["materials"][0]["size"] == pytest.approx(2 * 0.2)
+
+
+def test_many_gaussians_are_thinned_evenly(meshcat):
+    """A third of the points are every third one, from the first to the last."""
+    x = np.arange(301.0)
+    scene = GaussianScene.from_colors(
+        means=np.column_stack([x, 0 * x, 0 * x]),
+        quats=np.tile([1.0, 0, 0, 0], (301, 1)),
+        scales=np.full((301, 3), 0.1),
+        opacities=np.full(301, 0.9),
+        colors=np.full((301, 3), 0.5),
+    )
+    box = np.full(3, 1e3)
+    draw_gaussians(meshcat, "/splatpilot/scene", scene, -box, box, max_points=101)
+    position = vertices(drawn(meshcat, "/splatpilot/scene"), "position")
+    np.testing.assert_array_equal(position[:, 0], x[::3])
+
+
+def test_goal_is_a_ball_at_its_place(meshcat):
+    """A translucent sphere of the goal's radius about the goal."""
+    draw_goal(meshcat, "/splatpilot/goal", np.array([3.0, -1.0, 2.0]), radius=0.3)
+    drawing = drawn(meshcat, "/splatpilot/goal")
+    assert drawing["geometries"][0]["radius"] == 0.3
+    assert drawing["materials"][0]["transparent"]
+    matrix = msgpack.unpackb(meshcat._GetPackedTransform("/splatpilot/goal"))["matrix"]
+    assert matrix[12:15] == [3.0, -1.0, 2.0]
+
+
+def test_distance_slice_is_coloured_by_distance(meshcat):
+    """The slice fills the box at its height: red on and in surfaces, yellow at 1 m, blue from 2 m,
+    grey where the distance is unknown."""
+    field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
     draw_distance_slice(meshcat, "/splatpilot/slice", field, height=1.0)
-    for name in ("scene", "goal", "slice"):
-        assert meshcat.HasPath(f"/splatpilot/{name}")
+    drawing = drawn(meshcat, "/splatpilot/slice")
+    p, color = (vertices(drawing, name) for name in ("position", "color"))
+    index = np.frombuffer(drawing["geometries"][0]["data"]["index"]["array"].data, "<u4")
+    a, b, c = np.moveaxis(p[index].reshape(-1, 3, 3), 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    assert area == pytest.approx(6 * 2, rel=5e-3)
+    assert (p[:, 2] == 1).all()
+    distance = np.linalg.norm(p - [2, 0, 1], axis=1) - 0.5
+    assert (distance < 0).any() and (distance > 2).any()
+    np.testing.assert_allclose(color[distance < 0], np.tile([1, 0, 0], (sum(distance < 0), 1)))
+    np.testing.assert_allclose(color[distance > 2], np.tile([0, 0, 1], (sum(distance > 2), 1)))
+    about_1 = color[abs(distance - 1) < 0.05]
+    assert len(about_1) and (about_1[:, :2] > 0.9).all() and (about_1[:, 2] < 0.3).all()
+
+    class Unknown(AnalyticDistanceField):
+        def query(self, p_WQ):
+            sample = super().query(p_WQ)
+            sample.state[...] = FieldState.UNKNOWN
+            return sample
+
+    unknown = Unknown([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
+    draw_distance_slice(meshcat, "/splatpilot/slice", unknown, height=1.0)
+    color = vertices(drawn(meshcat, "/splatpilot/slice"), "color")
+    np.testing.assert_allclose(color, 0.4)
 
 
 def test_camera_picture_is_hung_at_its_rate(meshcat):

@@ -50,8 +50,10 @@ def test_video_holds_every_frame_in_order(recorder_after_one_second, tmp_path):
     assert len(frames) == 10
     assert frames[0].shape == (16, 64, 3)
     reds = [frame[:, :32, 2].mean() for frame in frames]
-    np.testing.assert_allclose(reds, 20 * np.arange(10), atol=25)
-    assert np.all(np.diff(reds) > 0)
+    np.testing.assert_allclose(reds, 20 * np.arange(10), atol=5)  # a quarter of a step
+    for frame in frames:
+        right = frame[:, 36:].reshape(-1, 3).mean(axis=0)  # but for what runs over the seam
+        np.testing.assert_allclose(right, colorize_depth(np.ones((1, 1)), 20.0)[0, 0], atol=5)
     assert list(tmp_path.iterdir()) == [path]
 
 
