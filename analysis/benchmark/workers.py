@@ -1,7 +1,7 @@
 """Where the flights of a study are flown: worker processes here, or on a cluster."""
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any
 
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
@@ -26,7 +26,7 @@ _Fly = Callable[[_Chunk], list[Rollout | Fault]]
 
 def fly_all(
     flights: Iterable[tuple[RolloutSpec, Scenario]], jobs: int, cluster: str | None = None
-) -> Iterator[Rollout | Fault]:
+) -> Generator[Rollout | Fault, None, None]:
     """
     Flies rollouts in worker processes and yields them as they end, in any order.
 
