@@ -4,7 +4,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -149,7 +149,7 @@ class Registry[Kind]:
         )
 
 
-def import_modules(names: list[str]) -> None:
+def import_modules(names: Sequence[str]) -> None:
     """
     Imports modules that register kinds; those in the working directory are found too.
 

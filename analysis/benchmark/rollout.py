@@ -8,7 +8,7 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import dump_config, parse_config
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, way_lengths
+from splatpilot.systems.registry import import_modules
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 ARRAYS = "times", "states", "commands", "clearances"
@@ -57,12 +58,16 @@ class Fault(NamedTuple):
     traceback: str
 
 
-def fly_rollouts(flights: list[tuple[RolloutSpec, str]]) -> list[Rollout | Fault]:
+def fly_rollouts(
+    flights: list[tuple[RolloutSpec, str]], modules: Sequence[str] = ()
+) -> list[Rollout | Fault]:
     """Flies some flights in this process, each with its scenario as YAML, up to the first fault.
+    `modules` are imported first: those of others that register what flies.
 
     Configurations of Drake's own do not pickle, and so scenarios travel between processes as text;
     as does what went wrong, because exceptions of others may not either.
     """
+    import_modules(modules)
     flown: list[Rollout | Fault] = []
     for spec, text in flights:
         try:
@@ -148,11 +153,12 @@ def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict
 
 def study_world(scenario: Scenario) -> World:
     """The world of a flight; the last two of a process are kept."""
-    return _world(_Described(dump_config(scenario.world), scenario.world), scenario.seed)
+    world = scenario.world
+    return _world(_Described(f"{type(world)} {dump_config(world)}", world), scenario.seed)
 
 
 class _Described(NamedTuple):
-    """A configuration, compared by its YAML."""
+    """A configuration, compared by its type and YAML."""
 
     text: str
     config: Any

@@ -1,11 +1,15 @@
 """Where the flights of a study are flown: worker processes here, or on a cluster."""
 
-from collections.abc import Iterable, Iterator
+import functools
+from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any
 
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
 from splatpilot.analysis.benchmark.study import RolloutSpec
+from splatpilot.diagrams.policies import POLICIES
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.sensors import SENSORS
+from splatpilot.diagrams.worlds.make_world import WORLDS
 from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.extras import import_extra
 
@@ -15,13 +19,14 @@ CONNECT_TIMEOUT = 10.0
 _CHUNK = 6
 """Most flights through one place handed out together: what of a kill is flown again."""
 
-_Work = Iterator[list[tuple[RolloutSpec, str]]]
-"""Arguments of `fly_rollouts`."""
+_Chunk = list[tuple[RolloutSpec, str]]
+_Work = Iterator[_Chunk]
+_Fly = Callable[[_Chunk], list[Rollout | Fault]]
 
 
 def fly_all(
     flights: Iterable[tuple[RolloutSpec, Scenario]], jobs: int, cluster: str | None = None
-) -> Iterator[Rollout | Fault]:
+) -> Generator[Rollout | Fault, None, None]:
     """
     Flies rollouts in worker processes and yields them as they end, in any order.
 
@@ -35,23 +40,24 @@ def fly_all(
         OSError: if a worker process dies, or the cluster cannot be reached; all that was yielded
             before is good.
     """
+    modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
+    fly = functools.partial(fly_rollouts, modules=modules)
     work = chunks(((spec, dump_config(scenario)) for spec, scenario in flights), _CHUNK)
     if cluster is not None:
-        yield from _on_cluster(work, cluster)
+        yield from _on_cluster(fly, work, cluster)
         return
-    yield from _in_processes(work, jobs)
+    yield from _in_processes(fly, work, jobs)
 
 
-def _in_processes(work: _Work, jobs: int) -> Iterator[Rollout | Fault]:
+def _in_processes(fly: _Fly, work: _Work, jobs: int) -> Iterator[Rollout | Fault]:
     from joblib import Parallel, delayed
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     # One more than the jobs are handed out ahead, so that no worker waits.
     parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
-    fly = delayed(fly_rollouts)
     try:
-        for rollouts in parallel(map(fly, work)):
+        for rollouts in parallel(map(delayed(fly), work)):
             yield from rollouts
     except TerminatedWorkerError as error:
         raise OSError(
@@ -63,7 +69,7 @@ def _in_processes(work: _Work, jobs: int) -> Iterator[Rollout | Fault]:
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
-def _on_cluster(work: _Work, address: str) -> Iterator[Rollout | Fault]:
+def _on_cluster(fly: _Fly, work: _Work, address: str) -> Iterator[Rollout | Fault]:
     distributed = import_extra("distributed", "cluster")
     try:
         client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
@@ -74,7 +80,7 @@ def _on_cluster(work: _Work, address: str) -> Iterator[Rollout | Fault]:
         ) from None
     with client:
         # A chunk whose worker dies is given to another; flights are pure, so that costs only time.
-        futures = client.map(fly_rollouts, list(work), pure=False, retries=3)
+        futures = client.map(fly, list(work), pure=False, retries=3)
         try:
             for _, rollouts in distributed.as_completed(futures, with_results=True):
                 yield from rollouts

@@ -1,10 +1,10 @@
 """Flights that fail, and faults that are no failures of flights."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 
-from splatpilot.analysis.benchmark import replay
+from splatpilot.analysis.benchmark import replay, rollout
 from splatpilot.analysis.benchmark import run as benchmark
 from splatpilot.analysis.benchmark.rollout import Fault
 from splatpilot.analysis.benchmark.study import StudyConfig
@@ -12,6 +12,8 @@ from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights
 from splatpilot.analysis.benchmark.workers import fly_all
 from splatpilot.analysis.cli import main
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 
@@ -80,3 +82,17 @@ def test_fault_in_a_worker_process_stops_the_study(short_scenario, tmp_path):
     assert {fault.id for fault in faults} == {f"short-mine-2-00{seed}" for seed in range(3)}
     assert all("FileNotFoundError: there are no weights at" in fault.reason for fault in faults)
     assert len(flown) == 6
+
+
+def test_worlds_of_two_types_with_the_same_fields_are_two(monkeypatch):
+    """The worlds that a process keeps are told apart by the types of their configurations too."""
+
+    @dataclass
+    class OtherForestConfig(ForestConfig):
+        pass
+
+    monkeypatch.setattr(rollout, "make_world", lambda config, seed: (type(config), seed))
+    for config in (ForestConfig(), OtherForestConfig()):
+        for seed in (1_000, 1_001):
+            scenario = Scenario(seed=seed, world=config)
+            assert rollout.study_world(scenario) == (type(config), seed)
