@@ -35,7 +35,7 @@ def test_chunks_are_flights_through_one_place(short_scenario):
         ({"scenarios": ["P99"]}, "there is no scenario 'P99'"),
         ({"scenarios": ["nowhere.yaml"]}, "nowhere.yaml: there is no such file"),
         ({"scenarios": []}, "the study has no scenario"),
-        ({"policies": ["plan"]}, r"there is no policy 'plan'; the policies are planner"),
+        ({"policies": ["plan"]}, r"there is no policy 'plan'; there are planner, straight"),
         ({"policies": ["planner", "planner"]}, "the policy planner is given twice"),
         ({"policies": ["a=straight", "a=planner"]}, "the policy a is given twice"),
         ({"policies": ["reactive:margn=0.2"]}, "policy reactive-margn-0.2: .*did you mean margin"),
