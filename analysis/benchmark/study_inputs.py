@@ -1,6 +1,7 @@
 """What the flights of a study depend on, kept in its folder: scenarios, scenes and weights."""
 
 import shutil
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -63,10 +64,17 @@ def kept_flights(
     Flights with the scenario of each, complete with policy and seed, from the study's folder alone.
 
     Raises:
-        FileNotFoundError, ValueError: if the folder is damaged.
+        FileNotFoundError, ValueError: if the folder is damaged, or names a module that nobody has
+            imported: files alone import nothing.
     """
     variants = {}
     for variant in folder.config().variants:
+        module, colon, _ = variant.policy.partition(":")
+        if colon and module not in sys.modules:
+            raise ValueError(
+                f"{folder.path} flies {variant.policy}, whose module is not imported; if you trust "
+                f"it, add --import {module} in front of the verb"
+            )
         if variant.weights is not None:
             kept = str(folder.weights(variant.label).absolute())
             variant = variant._replace(policy=kept)

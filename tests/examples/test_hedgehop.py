@@ -27,7 +27,7 @@ def installed(tmp_path_factory) -> Path:
     return target
 
 
-def splatpilot(*words: str, path: Path, cwd: Path) -> str:
+def splatpilot(*words: str, path: Path, cwd: Path, status: int = 0) -> str:
     """What the command line prints."""
     environment = os.environ | {"PYTHONPATH": str(path)}
     answer = subprocess.run(
@@ -37,8 +37,8 @@ def splatpilot(*words: str, path: Path, cwd: Path) -> str:
         cwd=cwd,
         env=environment,
     )
-    assert answer.returncode == 0, answer.stderr
-    return answer.stdout
+    assert answer.returncode == status, answer.stderr
+    return answer.stdout + answer.stderr
 
 
 def test_its_world_sensor_and_policy_fly_in_a_study(installed, tmp_path):
@@ -87,7 +87,7 @@ def test_its_captures_are_read(installed, tmp_path):
 def test_it_flies_uninstalled(tmp_path):
     """Modules that nobody installed are named on the command line; worker processes find them."""
     (tmp_path / "hedges.yaml").write_text("world: !HedgesConfig {hedges: 2, length: 16}\n")
-    imports = ["--import", "hedgehop.hedges"]
+    imports = ["--import", "hedgehop.hedges", "--import", "hedgehop.climber"]
     words = ["--scenarios", "hedges.yaml", "--policies", "mine=hedgehop.climber:ClimberConfig"]
     out = splatpilot(
         *imports,
@@ -96,7 +96,9 @@ def test_it_flies_uninstalled(tmp_path):
         cwd=tmp_path,
     )
     assert "2/2" in out
-    replay = splatpilot(
-        *imports, "replay", "study", "hedges-mine-2-000", path=EXAMPLE, cwd=tmp_path
-    )
+    words = ["replay", "study", "hedges-mine-2-000"]
+    replay = splatpilot(*imports, *words, path=EXAMPLE, cwd=tmp_path)
     assert "equals the recorded flight to the last bit" in replay
+    # A study's files say what to import; only who replays it does.
+    refusal = splatpilot(*imports[:2], *words, path=EXAMPLE, cwd=tmp_path, status=1)
+    assert "add --import hedgehop.climber" in refusal
