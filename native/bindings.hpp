@@ -31,7 +31,8 @@ inline void require(bool condition, const char* message) {
 }
 
 inline GaussianArrays gaussian_arrays(const Means& means, const Quats& quats, const Means& scales,
-                                      const Opacities& opacities, const Colors& colors, int sh_degree) {
+                                      const Opacities& opacities, const Colors& colors,
+                                      int sh_degree) {
   const size_t n = means.shape(0);
   require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n &&
               colors.shape(0) == n,
@@ -40,17 +41,16 @@ inline GaussianArrays gaussian_arrays(const Means& means, const Quats& quats, co
   const int coefficients = static_cast<int>(colors.shape(1));
   require(sh_degree <= 3 && coefficients >= std::max(1, (sh_degree + 1) * (sh_degree + 1)),
           "too few spherical-harmonic coefficients for the degree");
-  return {n, means.data(), quats.data(), scales.data(), opacities.data(), colors.data(), sh_degree,
-          coefficients};
+  return {n,         means.data(), quats.data(), scales.data(), opacities.data(), colors.data(),
+          sh_degree, coefficients};
 }
 
 inline Camera camera_from(const Doubles<nb::shape<3, 3>>& K, const Doubles<nb::shape<4, 4>>& X_CW,
-                          int width, int height, double near_plane, double far_plane, double radius_clip,
-                          double eps2d, bool antialiased = false) {
+                          int width, int height, double near_plane, double far_plane,
+                          double radius_clip, double eps2d, bool antialiased = false) {
   require(width > 0 && height > 0, "the image must have pixels");
   require(width <= 32768 && height <= 32768, "the image is larger than 32768 pixels");
-  CameraParameters p{width, height, {}, {}, near_plane, far_plane, radius_clip, eps2d,
-                     antialiased};
+  CameraParameters p{width, height, {}, {}, near_plane, far_plane, radius_clip, eps2d, antialiased};
   std::copy_n(K.data(), 9, p.K);
   std::copy_n(X_CW.data(), 16, p.X_CW);
   return make_camera(p);
@@ -85,7 +85,8 @@ nb::ndarray<nb::numpy, T> new_array(std::initializer_list<size_t> shape) {
   size_t size = 1;
   for (const size_t n : shape) size *= n;
   auto* values = new T[size];
-  return {values, shape, nb::capsule(values, [](void* p) noexcept { delete[] static_cast<T*>(p); })};
+  return {values, shape,
+          nb::capsule(values, [](void* p) noexcept { delete[] static_cast<T*>(p); })};
 }
 
 // Pixels, rounded up; bounded, so that it fits an integer.

@@ -26,10 +26,10 @@ void check_pixels(const Pixels& array, const Camera& camera, size_t channels) {
 }
 
 size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image, Pixels v_alpha,
-                     Pixels image, Pixels alpha, Floats<nb::shape<3>> background,
-                     bool expected_depth, bool absolute,
-                     Writable<nb::shape<-1, 16>> splat_gradients,
-                     Writable<nb::shape<-1, 2>> v_means2d) {
+                       Pixels image, Pixels alpha, Floats<nb::shape<3>> background,
+                       bool expected_depth, bool absolute,
+                       Writable<nb::shape<-1, 16>> splat_gradients,
+                       Writable<nb::shape<-1, 2>> v_means2d) {
   const Camera& camera = kept.frame->camera;
   const size_t channels = v_image.shape(2);
   require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
@@ -51,9 +51,8 @@ size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image
 
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
-  return renderer.raster_backward(*kept.frame, g,
-                                  reinterpret_cast<SplatGradient*>(splat_gradients.data()),
-                                  v_means2d.data());
+  return renderer.raster_backward(
+      *kept.frame, g, reinterpret_cast<SplatGradient*>(splat_gradients.data()), v_means2d.data());
 }
 
 // Returns PoseSums.
@@ -62,7 +61,8 @@ std::vector<double> project_backward(
     Opacities opacities, Colors colors, int sh_degree, Floats<nb::shape<-1, 16>> splat_gradients,
     Floats<nb::shape<-1, 2>> v_means2d, Writable<nb::shape<-1, 3>> v_means,
     Writable<nb::shape<-1, 4>> v_quats, Writable<nb::shape<-1, 3>> v_scales,
-    Writable<nb::ndim<1>> v_opacities, Writable<nb::shape<-1, -1, 3>> v_colors, bool overwrite, bool overwrite_colors) {
+    Writable<nb::ndim<1>> v_opacities, Writable<nb::shape<-1, -1, 3>> v_colors, bool overwrite,
+    bool overwrite_colors) {
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
   require(gaussians.count == kept.gaussians, "these are not the Gaussians of the frame");

@@ -63,10 +63,10 @@ static float multiply_add(size_t rounds) {
 
 #define SP_STRING_OF(name) #name
 #define SP_STRING(name) SP_STRING_OF(name)
-static const Kernels kTable = {SP_STRING(SIMD_LEVEL), project_arrays, project_baked,
-                               bin_footprints<SplatFootprint>, raster_tile,
-                               raster_tile_backward, gather_gradients, project_backward,
-                               first_nonfinite, all_within, all_normalisable, multiply_add};
+static const Kernels kTable = {
+    SP_STRING(SIMD_LEVEL), project_arrays,       project_baked,    bin_footprints<SplatFootprint>,
+    raster_tile,           raster_tile_backward, gather_gradients, project_backward,
+    first_nonfinite,       all_within,           all_normalisable, multiply_add};
 
 }  // namespace SIMD_LEVEL
 

@@ -13,8 +13,6 @@ static const LossKernels kLossTable = {photometric_scratch, photometric, log_dep
 
 #define SP_LOSS_JOIN_OF(a, b) a##b
 #define SP_LOSS_JOIN(a, b) SP_LOSS_JOIN_OF(a, b)
-const LossKernels& SP_LOSS_JOIN(loss_kernels_, SIMD_LEVEL)() {
-  return SIMD_LEVEL::kLossTable;
-}
+const LossKernels& SP_LOSS_JOIN(loss_kernels_, SIMD_LEVEL)() { return SIMD_LEVEL::kLossTable; }
 
 }  // namespace splatpilot

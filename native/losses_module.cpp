@@ -83,8 +83,8 @@ double log_depth_loss(Pixels rendered, Pixels depth, std::optional<Pixels> weigh
               (!gradient || gradient->size() == count),
           "depth images differ in size");
   const LossKernels& kernels = loss_kernels(simd);
-  const LogDepthInput in{rendered.data(), depth.data(), weights ? weights->data() : nullptr,
-                         count, epsilon, far, gradient ? gradient->data() : nullptr};
+  const LogDepthInput in{rendered.data(), depth.data(), weights ? weights->data() : nullptr,  count,
+                         epsilon,         far,          gradient ? gradient->data() : nullptr};
   const nb::gil_scoped_release release;
   return kernels.log_depth(in);
 }
@@ -95,9 +95,10 @@ void bind_losses(nb::module_& m) {
   m.def("photometric_loss", &photometric_loss, "rendered"_a, "target"_a, "ssim_weight"_a,
         "gradient"_a.none(), "simd"_a = "",
         "(1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.");
-  m.def("log_depth_loss", &log_depth_loss, "rendered"_a, "depth"_a, "weights"_a.none(),
-        "epsilon"_a, "far"_a, "gradient"_a.none(), "simd"_a = "",
-        "Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.");
+  m.def(
+      "log_depth_loss", &log_depth_loss, "rendered"_a, "depth"_a, "weights"_a.none(), "epsilon"_a,
+      "far"_a, "gradient"_a.none(), "simd"_a = "",
+      "Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.");
 }
 
 }  // namespace splatpilot

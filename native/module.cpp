@@ -31,8 +31,8 @@ nb::dict stage_seconds(const Renderer& renderer) {
   return seconds;
 }
 
-// What gsplat calls meta, for the splats of the last frame, in the order of the input. Opacities are
-// the rows of `given`, or without it those that the splats had.
+// What gsplat calls meta, for the splats of the last frame, in the order of the input. Opacities
+// are the rows of `given`, or without it those that the splats had.
 nb::tuple projected(Renderer& renderer, std::optional<Opacities> given) {
   const std::scoped_lock lock(renderer.mutex());
   require(!given || (renderer.frame() && given->size() == renderer.frame()->gaussians),
@@ -67,8 +67,8 @@ size_t render(Renderer& renderer, Means means, Quats quats, Means scales, Opacit
               bool keep) {
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip,
-                                    eps2d, antialiased);
+  const Camera camera =
+      camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased);
   const Image out = output_image(image, alpha, width, height, expected_depth, background);
 
   const nb::gil_scoped_release release;
@@ -116,8 +116,8 @@ NB_MODULE(_native, m) {
         const size_t n = means.shape(0);
         require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n,
                 "arrays of Gaussians differ in length");
-        const GaussianArrays gaussians{n, means.data(), quats.data(), scales.data(),
-                                       opacities.data(), colors.data(), -1, 1};
+        const GaussianArrays gaussians{
+            n, means.data(), quats.data(), scales.data(), opacities.data(), colors.data(), -1, 1};
         const nb::gil_scoped_release release;
         const std::scoped_lock lock(renderer.mutex());
         return renderer.are_valid(gaussians, colors.size());
@@ -148,8 +148,7 @@ NB_MODULE(_native, m) {
           },
           "threads"_a, "simd"_a = "")
       .def_prop_ro("simd", [](const Renderer& r) { return std::string(r.kernels().name); })
-      .def_prop_ro("pair_count", &Renderer::pair_count,
-                   "(Gaussian, tile) pairs of the last frame.")
+      .def_prop_ro("pair_count", &Renderer::pair_count, "(Gaussian, tile) pairs of the last frame.")
       .def_prop_ro("seconds", &stage_seconds, "Seconds that each stage of the last frame took.")
       .def("projected", &projected, "opacities"_a.none(),
            "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3), "
@@ -162,8 +161,7 @@ NB_MODULE(_native, m) {
           [](BakedScene* self, Means means, Quats quats, Means scales, Opacities opacities,
              Colors sh, int sh_degree) {
             require(sh_degree >= 0, "a baked scene needs spherical harmonics");
-            new (self) BakedScene(
-                gaussian_arrays(means, quats, scales, opacities, sh, sh_degree));
+            new (self) BakedScene(gaussian_arrays(means, quats, scales, opacities, sh, sh_degree));
           },
           "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a)
       .def("render", &render_baked);

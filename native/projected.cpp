@@ -46,10 +46,12 @@ using namespace nb::literals;
 using Rows = Doubles<nb::shape<-1, 3>>;
 
 // Returns (ux, uy, vy) of every visible splat, which the derivative by the covariance needs.
-nb::ndarray<nb::numpy, float> render_projected(
-    Renderer& renderer, Doubles<nb::shape<-1, 2>> means2d, Rows covariances, Opacities depths,
-    Opacities opacities, Means colors, int width, int height, double radius_clip,
-    bool expected_depth, Floats<nb::shape<3>> background, Output image, Output alpha, bool keep) {
+nb::ndarray<nb::numpy, float> render_projected(Renderer& renderer,
+                                               Doubles<nb::shape<-1, 2>> means2d, Rows covariances,
+                                               Opacities depths, Opacities opacities, Means colors,
+                                               int width, int height, double radius_clip,
+                                               bool expected_depth, Floats<nb::shape<3>> background,
+                                               Output image, Output alpha, bool keep) {
   const size_t n = means2d.shape(0);
   require(covariances.shape(0) == n && depths.shape(0) == n && opacities.shape(0) == n &&
               colors.shape(0) == n,
@@ -57,8 +59,8 @@ nb::ndarray<nb::numpy, float> render_projected(
   require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
   require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
           "the image must have pixels, and at most 32768 a side");
-  const ProjectedArrays projected{n, means2d.data(), covariances.data(), depths.data(),
-                                  opacities.data(), colors.data()};
+  const ProjectedArrays projected{
+      n, means2d.data(), covariances.data(), depths.data(), opacities.data(), colors.data()};
   Camera camera{};
   camera.width = width;
   camera.height = height;

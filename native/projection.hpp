@@ -70,8 +70,7 @@ SP_INLINE F16 largest_component(const Vector16& a) {
 // from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
 // of large entries. Returns the lanes that are visible.
 SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
-                                   Vector16 p0, Vector16 p1, F16 log2_opacity,
-                                   SplatPack& out) {
+                                   Vector16 p0, Vector16 p1, F16 log2_opacity, SplatPack& out) {
   // Scaling by g keeps the squares of huge Gaussians within range; it is exactly 1 for all others.
   const F16 largest = max(max(largest_component(p0), largest_component(p1)), F16(1e8f));
   const F16 g = F16(1e8f) / largest;
@@ -126,9 +125,9 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
 SP_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t bits,
                                const uint32_t* indices, Splat* splats, uint32_t* depth_bits) {
   alignas(64) float fields[14][kLanes];
-  const F16* packs[14] = {&p.mean_x, &p.mean_y, &p.extent_x, &p.extent_y, &p.ux,
-                          &p.uy, &p.vy, &p.log2_opacity, color, color + 1,
-                          color + 2, &p.depth, &p.slope_x, &p.slope_y};
+  const F16* packs[14] = {&p.mean_x, &p.mean_y, &p.extent_x,     &p.extent_y, &p.ux,
+                          &p.uy,     &p.vy,     &p.log2_opacity, color,       color + 1,
+                          color + 2, &p.depth,  &p.slope_x,      &p.slope_y};
   for (int f = 0; f < 14; ++f) store(fields[f], *packs[f]);
   size_t count = 0;
   for (; bits; bits &= bits - 1) {

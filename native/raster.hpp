@@ -28,8 +28,10 @@ struct alignas(64) StagedTile {
 
 SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
   const float x = s.mean_x - left, y = s.mean_y - top;
-  return {s.ux, s.uy, -(s.ux * x + s.uy * y), s.vy, -(s.vy * y),
-          s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
+  return {s.ux,       s.uy,        -(s.ux * x + s.uy * y),
+          s.vy,       -(s.vy * y), s.log2_opacity,
+          s.color[0], s.color[1],  s.color[2],
+          s.depth};
 }
 
 // From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
@@ -174,9 +176,9 @@ SP_INLINE F16 ones_inside(const RasterInput& in, const LaneCentres& centres, int
                           int b) {
   const int columns = in.width - left - kBlockSize * (b % 4);
   const int rows = in.height - top - kBlockSize * (b / 4);
-  return zero_unless((centres.x < F16(static_cast<float>(columns))) &
-                         (centres.y < F16(static_cast<float>(rows))),
-                     F16(1.0f));
+  return zero_unless(
+      (centres.x < F16(static_cast<float>(columns))) & (centres.y < F16(static_cast<float>(rows))),
+      F16(1.0f));
 }
 
 template <bool kColor, bool kDepth>
@@ -197,7 +199,8 @@ void raster_tile_channels(const RasterInput& in, int tile) {
   uint32_t stages = 0;
   for (uint32_t begin = in.tile_offsets[tile]; begin < end && live; begin += kStageSize) {
     if (in.transmittance && stages > 0) {
-      float* saved = in.transmittance + (in.later_stages[tile] + stages - 1) * kTileSize * kTileSize;
+      float* saved =
+          in.transmittance + (in.later_stages[tile] + stages - 1) * kTileSize * kTileSize;
       for (int b = 0; b < kBlocksPerTile; ++b) store(saved + kLanes * b, state[b].transmittance);
     }
     ++stages;
@@ -207,8 +210,7 @@ void raster_tile_channels(const RasterInput& in, int tile) {
       const int b = __builtin_ctz(bits);
       const F16 x = centres.x + F16(static_cast<float>(kBlockSize * (b % 4)));
       const F16 y = centres.y + F16(static_cast<float>(kBlockSize * (b / 4)));
-      const bool open =
-          composite<kColor, kDepth>(staged, (count + 63) / 64, b, x, y, state[b]);
+      const bool open = composite<kColor, kDepth>(staged, (count + 63) / 64, b, x, y, state[b]);
       if (!open) live &= ~(1u << b);
     }
   }

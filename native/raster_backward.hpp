@@ -37,8 +37,8 @@ SP_INLINE F16 load_pixels(const float* values, int stride, const RasterInput& in
   const int columns = in.width - left < kBlockSize ? in.width - left : kBlockSize;
   const int rows = in.height - top < kBlockSize ? in.height - top : kBlockSize;
   for (int row = 0; row < rows; ++row) {
-    const size_t first = static_cast<size_t>(top + row) * static_cast<size_t>(in.width) +
-                         static_cast<size_t>(left);
+    const size_t first =
+        static_cast<size_t>(top + row) * static_cast<size_t>(in.width) + static_cast<size_t>(left);
     for (int i = 0; i < columns; ++i) {
       pixels[kBlockSize * row + i] = values[(first + i) * static_cast<size_t>(stride)];
     }
@@ -54,9 +54,9 @@ SP_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int lef
     block.red = load_pixels(g.color, g.stride, in, left, top);
     block.green = load_pixels(g.color + 1, g.stride, in, left, top);
     block.blue = load_pixels(g.color + 2, g.stride, in, left, top);
-    block.alpha = block.alpha - (block.red * F16(g.background[0]) +
-                                 (block.green * F16(g.background[1]) +
-                                  block.blue * F16(g.background[2])));
+    block.alpha =
+        block.alpha - (block.red * F16(g.background[0]) +
+                       (block.green * F16(g.background[1]) + block.blue * F16(g.background[2])));
   }
   if constexpr (kDepth) {
     block.depth = load_pixels(g.depth, g.stride, in, left, top);
@@ -149,7 +149,7 @@ SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
 
 template <bool kColor, bool kDepth, bool kAbsolute>
 size_t raster_tile_backward_channels(const RasterInput& in, const ImageGradient& g, int tile,
-                                   BackwardScratch& s, PairGradient* gradients) {
+                                     BackwardScratch& s, PairGradient* gradients) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const uint32_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
   const uint32_t stages = in.stages_done[tile];
@@ -172,8 +172,8 @@ size_t raster_tile_backward_channels(const RasterInput& in, const ImageGradient&
     for (int i = 0; i < count; ++i) {
       const Pair* pair = in.pairs + begin + i;
       if (i + kPrefetchAhead < count) __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
-      s.splats[i] = in_tile(in.splats[pair->splat], static_cast<float>(left),
-                            static_cast<float>(top));
+      s.splats[i] =
+          in_tile(in.splats[pair->splat], static_cast<float>(left), static_cast<float>(top));
     }
     uint32_t live = 0;
     for (int b = 0; b < kBlocksPerTile; ++b) {
@@ -230,7 +230,13 @@ inline void gather_gradients(const Splat* splats, size_t count, const PairRange*
     const Splat& s = splats[i];
     gradients[i] = {{two_ln2 * (s.ux * t[1]), two_ln2 * (s.uy * t[1] + s.vy * t[2])},
                     {two_ln2 * (s.ux * t[10]), two_ln2 * t[11]},
-                    t[0], t[3], t[4], t[5], {t[6], t[7], t[8]}, t[9], {}};
+                    t[0],
+                    t[3],
+                    t[4],
+                    t[5],
+                    {t[6], t[7], t[8]},
+                    t[9],
+                    {}};
   }
 }
 

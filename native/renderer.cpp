@@ -156,8 +156,8 @@ void Renderer::start_frame(const Camera& camera) {
   lap();
 }
 
-void Renderer::project(
-    size_t count, const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project) {
+void Renderer::project(size_t count,
+                       const std::function<size_t(size_t, size_t, Splat*, uint32_t*)>& project) {
   Frame& frame = *frame_;
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
   frame.gaussians = count;

@@ -17,10 +17,10 @@ namespace splatpilot {
 
 struct CameraParameters {
   int width, height;
-  double K[9];                      // row-major, [px]; skew is ignored
-  double X_CW[16];                  // world to camera, row-major
-  double near_plane, far_plane;     // [m]
-  double radius_clip, eps2d;        // [px], [px^2]
+  double K[9];                   // row-major, [px]; skew is ignored
+  double X_CW[16];               // world to camera, row-major
+  double near_plane, far_plane;  // [m]
+  double radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;
 };
 
@@ -43,7 +43,8 @@ struct Frame {
   std::vector<uint32_t> tile_offsets;
   std::vector<Pair> pairs;
 
-  // For the backward pass, if `kept`. Splat i is in pairs[slots[k]] for k in ranges[i], by increasing tile.
+  // For the backward pass, if `kept`. Splat i is in pairs[slots[k]] for k in ranges[i], by
+  // increasing tile.
   bool kept = false;
   std::vector<PairRange> ranges;
   std::vector<uint32_t> slots;
@@ -65,12 +66,14 @@ class Renderer {
   void render(const GaussianArrays& gaussians, const Camera& camera, const Image& image,
               bool keep = false);
   void render(const BakedArrays& scene, const Camera& camera, const Image& image);
-  void render(const ProjectedArrays& projected, const Camera& camera, const Image& image, bool keep);
+  void render(const ProjectedArrays& projected, const Camera& camera, const Image& image,
+              bool keep);
 
   std::shared_ptr<const Frame> frame() const { return frame_; }
 
   // From the image to the frame's splats, in the order of the input; `gradients` and
-  // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count(). Returns how many (splat, 4x4 block) were composited.
+  // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count(). Returns how many
+  // (splat, 4x4 block) were composited.
   size_t raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients,
                          float* means2d);
   // From the splats to the Gaussians, which must be those of the frame; `means2d` (n, 2) stands in

@@ -32,32 +32,34 @@ const float* optional_plane(const ConstPlane& image, const Camera& camera, size_
   return image ? plane(*image, camera, channels) : nullptr;
 }
 
-void render(SurfelRenderer& renderer, Means means, Quats quats, Means scales,
-            Opacities opacities, Colors colors, int sh_degree,
-            Doubles<nb::shape<3, 3>> K, Doubles<nb::shape<4, 4>> X_CW,
+void render(SurfelRenderer& renderer, Means means, Quats quats, Means scales, Opacities opacities,
+            Colors colors, int sh_degree, Doubles<nb::shape<3, 3>> K, Doubles<nb::shape<4, 4>> X_CW,
             int width, int height, double near_plane, double far_plane, double radius_clip,
             Plane color, Plane normal, Plane depth, Plane alpha, Plane median,
             std::optional<Plane> distort, bool record) {
-  const GaussianArrays surfels = gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip,
-                                    kBlobVariance);
+  const GaussianArrays surfels =
+      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
+  const Camera camera =
+      camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, kBlobVariance);
   const SurfelImages<float> images{
-      plane(color, camera, 3), plane(normal, camera, 3), plane(depth, camera, 1),
-      plane(alpha, camera, 1), plane(median, camera, 1),
-      distort ? plane(*distort, camera, 1) : nullptr};
+      plane(color, camera, 3),  plane(normal, camera, 3),
+      plane(depth, camera, 1),  plane(alpha, camera, 1),
+      plane(median, camera, 1), distort ? plane(*distort, camera, 1) : nullptr};
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
   renderer.render(surfels, camera, images, record);
 }
 
 // Adds to the arrays of gradients; returns that of the camera as (5, 3): R, t and the centre.
-nb::ndarray<nb::numpy, double> backward(
-    SurfelRenderer& renderer, Means means, Quats quats, Means scales,
-    Opacities opacities, Colors colors, int sh_degree, ConstPlane color,
-    ConstPlane normal, ConstPlane depth, ConstPlane alpha, ConstPlane median, ConstPlane distort,
-    Sums<nb::ndim<2>> by_means, Sums<nb::ndim<2>> by_quats,
-    Sums<nb::ndim<2>> by_scales, Sums<nb::ndim<1>> by_opacities, Plane by_colors) {
-  const GaussianArrays surfels = gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
+nb::ndarray<nb::numpy, double> backward(SurfelRenderer& renderer, Means means, Quats quats,
+                                        Means scales, Opacities opacities, Colors colors,
+                                        int sh_degree, ConstPlane color, ConstPlane normal,
+                                        ConstPlane depth, ConstPlane alpha, ConstPlane median,
+                                        ConstPlane distort, Sums<nb::ndim<2>> by_means,
+                                        Sums<nb::ndim<2>> by_quats, Sums<nb::ndim<2>> by_scales,
+                                        Sums<nb::ndim<1>> by_opacities, Plane by_colors) {
+  const GaussianArrays surfels =
+      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
   require(by_means.size() == means.size() && by_quats.size() == quats.size() &&
               by_scales.size() == scales.size() && by_opacities.size() == opacities.size() &&
               by_colors.size() == colors.size(),
@@ -71,13 +73,13 @@ nb::ndarray<nb::numpy, double> backward(
     require(frame && frame->gaussians == surfels.count, "not the surfels of the last frame");
     const Camera& camera = frame->camera;
     const SurfelImages<const float> gradients{
-        optional_plane(color, camera, 3), optional_plane(normal, camera, 3),
-        optional_plane(depth, camera, 1), optional_plane(alpha, camera, 1),
+        optional_plane(color, camera, 3),  optional_plane(normal, camera, 3),
+        optional_plane(depth, camera, 1),  optional_plane(alpha, camera, 1),
         optional_plane(median, camera, 1), optional_plane(distort, camera, 1)};
-    const CameraGradient by_camera = renderer.backward(
-        surfels, gradients,
-        {by_means.data(), by_quats.data(), by_scales.data(), by_opacities.data(),
-         by_colors.data()});
+    const CameraGradient by_camera =
+        renderer.backward(surfels, gradients,
+                          {by_means.data(), by_quats.data(), by_scales.data(), by_opacities.data(),
+                           by_colors.data()});
     std::copy_n(by_camera.R, 9, values);
     std::copy_n(by_camera.t, 3, values + 9);
     std::copy_n(by_camera.centre, 3, values + 12);

@@ -55,7 +55,7 @@ struct SurfelPlane {
   F16 facing;                // n . p
   F16 inverse_facing;
   Vector16 u, v, w;
-  F16 mean[2], rest[2];      // the centre's pixel is their sum [px]
+  F16 mean[2], rest[2];  // the centre's pixel is their sum [px]
   Mask16 edge_on;
 };
 
@@ -65,9 +65,9 @@ SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians
   DoubleVector16 t_W[2];
   surfel_tangents(in.quat, t_W);
   const DoubleVector16 t[2] = {to_camera(camera, t_W[0]), to_camera(camera, t_W[1])};
-  const DoubleVector16 p = to_camera(camera, {from_centre(camera, in.mean.x, 0),
-                                              from_centre(camera, in.mean.y, 1),
-                                              from_centre(camera, in.mean.z, 2)});
+  const DoubleVector16 p =
+      to_camera(camera, {from_centre(camera, in.mean.x, 0), from_centre(camera, in.mean.y, 1),
+                         from_centre(camera, in.mean.z, 2)});
   const DoubleVector16 n = cross(t[0], t[1]);
   SurfelPlane s;
   s.p = to_float(p);
@@ -183,8 +183,8 @@ inline size_t cull_surfels(const GaussianArrays& g, const Camera& camera, size_t
     const F16 largest_scale = max(load(soa[3]), load(soa[4]));
     Mask16 visible = in_depth_range(camera, p_C.z);
     for (int side = 0; side < 4; ++side) {
-      visible = visible & (dot(camera.side_normal[side], p_C) + F16(reach[side]) * largest_scale >
-                           F16(0.0f));
+      visible = visible &
+                (dot(camera.side_normal[side], p_C) + F16(reach[side]) * largest_scale > F16(0.0f));
     }
     for (uint32_t bits = lane_bits(visible) & ((1u << lanes) - 1); bits; bits &= bits - 1) {
       candidates[count++] = static_cast<uint32_t>(first) + __builtin_ctz(bits);
@@ -208,8 +208,7 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
     SplatPack pack;
     F16 disc[3], color[3];
-    uint32_t bits =
-        lane_bits(surfel_bounds(camera, s, in.scale, log2_opacity, pack, disc[2]));
+    uint32_t bits = lane_bits(surfel_bounds(camera, s, in.scale, log2_opacity, pack, disc[2]));
     if (candidate_count - first < kLanes) bits &= (1u << (candidate_count - first)) - 1;
     if (!bits) continue;
     gather_colors(g, indices, bits, d_W, color);
@@ -227,11 +226,25 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
       rows[i][2] = -(rows[i][0] * s.rest[0] + rows[i][1] * s.rest[1]);
     }
     rows[2][2] = select(s.edge_on, -one, rows[2][2] + one / s.p.z);
-    const F16 fields[kSurfelFields] = {
-        s.mean[0],  s.mean[1],  rows[0][0],         rows[0][1],         rows[0][2],
-        rows[1][0], rows[1][1], rows[1][2],         rows[2][0],         rows[2][1],
-        rows[2][2], s.p.z,      log2_opacity,       color[0],           color[1],
-        color[2],   towards * s.t_W[2].x, towards * s.t_W[2].y, towards * s.t_W[2].z};
+    const F16 fields[kSurfelFields] = {s.mean[0],
+                                       s.mean[1],
+                                       rows[0][0],
+                                       rows[0][1],
+                                       rows[0][2],
+                                       rows[1][0],
+                                       rows[1][1],
+                                       rows[1][2],
+                                       rows[2][0],
+                                       rows[2][1],
+                                       rows[2][2],
+                                       s.p.z,
+                                       log2_opacity,
+                                       color[0],
+                                       color[1],
+                                       color[2],
+                                       towards * s.t_W[2].x,
+                                       towards * s.t_W[2].y,
+                                       towards * s.t_W[2].z};
     alignas(64) float soa[kSurfelFields][kLanes];
     for (int f = 0; f < kSurfelFields; ++f) store(soa[f], fields[f]);
     size_t next = count;

@@ -22,8 +22,8 @@ SP_INLINE Vector16 zero_unless(const Mask16& m, const Vector16& a) {
 // its rotation matrix.
 SP_INLINE void quaternion_gradient(const F16 raw[4], const Vector16& a, const Vector16& b,
                                    F16 gradient[4]) {
-  const F16 inverse_norm = F16(1.0f) / sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] +
-                                            raw[3] * raw[3]);
+  const F16 inverse_norm =
+      F16(1.0f) / sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] + raw[3] * raw[3]);
   const F16 two = F16(2.0f);
   const F16 w = raw[0] * inverse_norm, x = raw[1] * inverse_norm, y = raw[2] * inverse_norm,
             z = raw[3] * inverse_norm;
@@ -59,8 +59,7 @@ SP_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& 
   const Vector16 by_w = sum(scaled(A[0], g[4]), scaled(A[1], g[5]));
   // Derivatives with respect to the logarithms of common factors; w . A[k] is -scale t.z / p.z.
   const F16 by_log_u = g[0], by_log_v = g[3];
-  const F16 by_log_w =
-      -((g[4] * scale[0] * s.t[0].z + g[5] * scale[1] * s.t[1].z) * inverse_z);
+  const F16 by_log_w = -((g[4] * scale[0] * s.t[0].z + g[5] * scale[1] * s.t[1].z) * inverse_z);
   const F16 u_factor = s.inverse_facing * inverse_s0, v_factor = s.inverse_facing * inverse_s1;
   const Vector16 by_u = scaled(by_u0, u_factor);  // of t1 x p
   const Vector16 by_v = scaled(by_v0, v_factor);  // of p x t0
@@ -136,8 +135,8 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
         colors_backward(input, indices, static_cast<int>(lanes), d_W, by_color, out.colors);
     const Vector16 by_p = sum(to_world(camera, by.p), by_d);
 
-    F16 rows[10] = {by_p.x, by_p.y, by_p.z, zero, zero, zero, zero, by.scale[0], by.scale[1],
-                    g[9] / max(in.opacity, F16(1e-30f))};
+    F16 rows[10] = {by_p.x, by_p.y, by_p.z,      zero,        zero,
+                    zero,   zero,   by.scale[0], by.scale[1], g[9] / max(in.opacity, F16(1e-30f))};
     quaternion_gradient(in.quat, by_t0, by_t1, rows + 3);
     alignas(64) float fields[10][kLanes];
     for (int f = 0; f < 10; ++f) store(fields[f], rows[f]);
@@ -159,8 +158,8 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     const F16 by_centre[3] = {-by_d.x, -by_d.y, -by_d.z};
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) {
-        by_camera->R[3 * i + j] += masked_sum(
-            by_p_C[i] * p_W[j] + (by_t0_C[i] * t0_W[j] + by_t1_C[i] * t1_W[j]), bits);
+        by_camera->R[3 * i + j] +=
+            masked_sum(by_p_C[i] * p_W[j] + (by_t0_C[i] * t0_W[j] + by_t1_C[i] * t1_W[j]), bits);
       }
       by_camera->t[i] += masked_sum(by_p_C[i], bits);
       by_camera->centre[i] += masked_sum(by_centre[i], bits);

@@ -46,12 +46,12 @@ SP_INLINE BlockLanes block_lanes(int b) {
 // How a surfel appears in 16 pixels.
 struct SurfelSample {
   F16 dx, dy;
-  F16 U, V;      // u . d and v . d of the surfel
-  F16 u, v;      // where the ray meets the plane, in standard deviations
-  F16 z;         // at which depth
-  Mask16 hit;    // whether that counts, or else the blob
+  F16 U, V;    // u . d and v . d of the surfel
+  F16 u, v;    // where the ray meets the plane, in standard deviations
+  F16 z;       // at which depth
+  Mask16 hit;  // whether that counts, or else the blob
   F16 r2, depth;
-  F16 alpha;     // 0 below the cut
+  F16 alpha;  // 0 below the cut
 };
 
 // alpha = o exp(-r2 / 2): r2 is the lesser of u^2 + v^2 on the surfel's plane and of the blob's
@@ -129,8 +129,8 @@ SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Mo
   const int columns = width - left < kBlockSize ? width - left : kBlockSize;
   const int rows = height - top < kBlockSize ? height - top : kBlockSize;
   for (int row = 0; row < rows; ++row) {
-    const size_t pixel = static_cast<size_t>(top + row) * static_cast<size_t>(width) +
-                         static_cast<size_t>(left);
+    const size_t pixel =
+        static_cast<size_t>(top + row) * static_cast<size_t>(width) + static_cast<size_t>(left);
     for (int i = 0; i < columns; ++i) move(kBlockSize * row + i, pixel + static_cast<size_t>(i));
   }
 }
@@ -138,8 +138,8 @@ SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Mo
 SP_INLINE void write_surfel_block(const SurfelImages<float>& out, const SurfelBlockState& s,
                                   int width, int height, int left, int top) {
   alignas(64) float lanes[10][kLanes];
-  const F16* packs[10] = {s.color, s.color + 1, s.color + 2, s.normal, s.normal + 1,
-                          s.normal + 2, &s.depth, &s.alpha, &s.median, &s.distort};
+  const F16* packs[10] = {s.color,      s.color + 1, s.color + 2, s.normal,  s.normal + 1,
+                          s.normal + 2, &s.depth,    &s.alpha,    &s.median, &s.distort};
   for (int f = 0; f < 10; ++f) store(lanes[f], *packs[f]);
   for_each_pixel(width, height, left, top, [&](int lane, size_t pixel) {
     for (int c = 0; c < 3; ++c) out.color[3 * pixel + c] = lanes[c][lane];
@@ -163,8 +163,8 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
     const Mask16 on_image = (pixel.x < F16(static_cast<float>(in.width - left))) &
                             (pixel.y < F16(static_cast<float>(in.height - top)));
     const F16 open = zero_unless(on_image, one);
-    state[b] = {open, {zero, zero, zero}, {zero, zero, zero}, zero, zero, zero, zero,
-                one,  zero,               -one};
+    state[b] = {open, {zero, zero, zero}, {zero, zero, zero}, zero, zero, zero, zero, one, zero,
+                -one};
     if (any(on_image)) inside |= 1u << b;
   }
 
@@ -177,10 +177,8 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
                   staged);
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
-      const bool open =
-          composite_surfels<kDistort, kRecord>(staged, (count + 63) / 64, b,
-                                               static_cast<float>(begin - start), near_plane,
-                                               state[b]);
+      const bool open = composite_surfels<kDistort, kRecord>(
+          staged, (count + 63) / 64, b, static_cast<float>(begin - start), near_plane, state[b]);
       if (!open) live &= ~(1u << b);
     }
   }

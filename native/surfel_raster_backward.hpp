@@ -10,9 +10,9 @@ namespace splatpilot::SIMD_LEVEL {
 struct BackwardBlock {
   F16 color[3], normal[3], depth, alpha, median, distort;
   F16 passed, median_index, all_alpha, all_depth;
-  F16 transmittance;                // behind the surfel at hand
-  F16 behind;                       // sum over surfels behind it of weight * gradient of weight
-  F16 alpha_behind, depth_behind;   // sums of weights and of weighted depths
+  F16 transmittance;               // behind the surfel at hand
+  F16 behind;                      // sum over surfels behind it of weight * gradient of weight
+  F16 alpha_behind, depth_behind;  // sums of weights and of weighted depths
 };
 
 SP_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
@@ -84,8 +84,7 @@ SP_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, 
   const F16 by_v = -(zero_unless(a.hit, by_exponent * a.v));
   // u = z U and v = z V with U, V and q = 1 / z linear in the pixel, so dL/dq is
   // -z^2 (dL/dz + U dL/du + V dL/dv).
-  const F16 by_q =
-      -(zero_unless(a.hit, a.z * (a.z * by_depth + (a.u * by_u + a.v * by_v))));
+  const F16 by_q = -(zero_unless(a.hit, a.z * (a.z * by_depth + (a.u * by_u + a.v * by_v))));
   const F16 by_U = zero_unless(a.hit, a.z * by_u), by_V = zero_unless(a.hit, a.z * by_v);
   // Masked, since a product of zero and an infinity is none.
   const F16 U = zero_unless(a.hit, a.U), V = zero_unless(a.hit, a.V);

@@ -23,7 +23,7 @@ struct Surfel {
   float depth;             // of the centre [m]
   float log2_opacity;
   float color[3];
-  float normal[3];      // in the world, towards the camera
+  float normal[3];  // in the world, towards the camera
 };
 constexpr int kSurfelFields = sizeof(Surfel) / sizeof(float);
 
@@ -59,8 +59,8 @@ struct SurfelRasterInput {
   const Pair* pairs;             // grouped by tile, in depth order
   const uint32_t* tile_offsets;  // (tiles + 1,)
   int width, height, tiles_x;
-  float near_plane;              // rays that meet a surfel nearer than this miss it [m]
-  SurfelBlockRecord* records;          // (tiles, 16), null when no backward pass follows
+  float near_plane;            // rays that meet a surfel nearer than this miss it [m]
+  SurfelBlockRecord* records;  // (tiles, 16), null when no backward pass follows
 };
 
 // Derivatives of the loss, summed over the pixels of a tile, with respect to fields of a Surfel

@@ -27,8 +27,14 @@ SurfelRenderer::SurfelRenderer(int threads, const std::string& simd_level)
 
 SurfelRasterInput SurfelRenderer::raster_input() {
   const int tiles_x = (frame_->camera.width + kTileSize - 1) / kTileSize;
-  return {surfels_.data(), frame_->pairs.data(), frame_->tile_offsets.data(), frame_->camera.width, frame_->camera.height,
-          tiles_x,         frame_->camera.near_plane, recorded_ ? records_.data() : nullptr};
+  return {surfels_.data(),
+          frame_->pairs.data(),
+          frame_->tile_offsets.data(),
+          frame_->camera.width,
+          frame_->camera.height,
+          tiles_x,
+          frame_->camera.near_plane,
+          recorded_ ? records_.data() : nullptr};
 }
 
 void SurfelRenderer::render(const GaussianArrays& gaussians, const Camera& camera,
@@ -63,7 +69,8 @@ CameraGradient SurfelRenderer::backward(const GaussianArrays& gaussians,
   for (size_t i = 0; i < frame_->splats.size(); ++i) pair_offsets_[i + 1] += pair_offsets_[i];
   pair_slots_.resize(frame_->pairs.size());
   pair_gradients_.resize(frame_->pairs.size());
-  for (size_t i = 0; i < frame_->pairs.size(); ++i) pair_slots_[i] = pair_offsets_[frame_->pairs[i].splat]++;
+  for (size_t i = 0; i < frame_->pairs.size(); ++i)
+    pair_slots_[i] = pair_offsets_[frame_->pairs[i].splat]++;
   // The offsets have moved on by one splat.
 
   const SurfelRasterInput input = raster_input();

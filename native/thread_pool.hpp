@@ -29,7 +29,8 @@ class ThreadPool {
       for (size_t task = 0; task < tasks; ++task) body(task);
       return;
     }
-    run(tasks, [](const void* b, size_t task) { (*static_cast<const Body*>(b))(task); }, &body);
+    run(
+        tasks, [](const void* b, size_t task) { (*static_cast<const Body*>(b))(task); }, &body);
   }
 
  private:
@@ -43,9 +44,9 @@ class ThreadPool {
   const void* body_ = nullptr;
   size_t tasks_ = 0;
   std::atomic<size_t> next_task_{0};
-  std::atomic<bool> open_{false};      // whether the current loop still takes workers
-  std::atomic<uint32_t> active_{0};    // workers inside the current loop
-  std::atomic<uint32_t> loop_{0};      // counts loops; workers wait for it to change
+  std::atomic<bool> open_{false};    // whether the current loop still takes workers
+  std::atomic<uint32_t> active_{0};  // workers inside the current loop
+  std::atomic<uint32_t> loop_{0};    // counts loops; workers wait for it to change
   std::atomic<bool> stop_{false};
 };
 
