@@ -7,6 +7,22 @@
 #endif
 
 namespace splatpilot {
+#if defined(__x86_64__)
+namespace v2 {
+extern const Kernels kKernels;
+}
+namespace v3 {
+extern const Kernels kKernels;
+}
+namespace v4 {
+extern const Kernels kKernels;
+}
+#else
+namespace generic {
+extern const Kernels kKernels;
+}
+#endif
+
 namespace {
 
 #if defined(__x86_64__)
@@ -31,11 +47,11 @@ std::vector<const Kernels*> usable_kernels() {
   const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
                   __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
                   __builtin_cpu_supports("avx512vl");
-  if (v4) usable.push_back(&kernels_v4());
-  if (v3) usable.push_back(&kernels_v3());
-  if (v2) usable.push_back(&kernels_v2());
+  if (v4) usable.push_back(&v4::kKernels);
+  if (v3) usable.push_back(&v3::kKernels);
+  if (v2) usable.push_back(&v2::kKernels);
 #else
-  usable.push_back(&kernels_generic());
+  usable.push_back(&generic::kKernels);
 #endif
   return usable;
 }

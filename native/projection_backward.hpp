@@ -6,15 +6,6 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-SP_INLINE Vector16 operator*(const F16& s, const Vector16& a) {
-  return {s * a.x, s * a.y, s * a.z};
-}
-SP_INLINE Vector16 operator+(const Vector16& a, const Vector16& b) {
-  return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-SP_INLINE Vector16 operator-(const Vector16& a, const Vector16& b) {
-  return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
 SP_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
 
 // Splats and their gradients, one pack per field.
@@ -41,10 +32,9 @@ SP_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s,
   const F16 largest = max(max(largest_component(p0), largest_component(p1)), F16(1e8f));
   const F16 g = F16(1e8f) / largest;
   const Vector16 q0 = g * p0, q1 = g * p1;
-  const Vector16 cross = {q0.y * q1.z - q0.z * q1.y, q0.z * q1.x - q0.x * q1.z,
-                          q0.x * q1.y - q0.y * q1.x};
+  const Vector16 c = cross(q0, q1);
   const F16 factor =
-      F16(2.0f * ln2 * camera.eps2d) * s.log_opacity * g * g / max(dot(cross, cross), F16(1e-37f));
+      F16(2.0f * ln2 * camera.eps2d) * s.log_opacity * g * g / max(dot(c, c), F16(1e-37f));
   const Vector16 t0 = s.ux * a0, t1 = s.uy * a0 + s.vy * a1;
   const F16 x01 = dot(q0, q1);
   dp[0] = dp[0] + factor * (dot(q1, q1) * t0 - x01 * t1);

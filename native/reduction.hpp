@@ -53,4 +53,13 @@ SP_INLINE void sum_lanes(const Register a[16], float sums[16]) {
   }
 }
 
+SP_INLINE void sum_lanes(const F16 a[16], float sums[16]) {
+  Register whole[16];
+  for (int i = 0; i < 16; ++i) {
+    whole[i] = a[i].r[0];
+    for (int k = 1; k < kRegisters; ++k) whole[i] += a[i].r[k];
+  }
+  sum_lanes(whole, sums);
+}
+
 }  // namespace splatpilot::SIMD_LEVEL

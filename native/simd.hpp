@@ -235,6 +235,20 @@ SP_INLINE F16 zero_unless(const Mask16& m, const F16& a) {
   return c;
 }
 
+// Lane by lane, a where m is true, else b.
+SP_INLINE F16 select(const Mask16& m, const F16& a, const F16& b) {
+  F16 c;
+#if defined(__AVX512F__)
+  c.r[0] = _mm512_mask_mov_ps(b.r[0], m.bits, a.r[0]);
+#else
+  SP_EACH_REGISTER(k) {
+    c.r[k] = reinterpret_cast<FloatRegister>((reinterpret_cast<IntRegister>(a.r[k]) & m.r[k]) |
+                                             (reinterpret_cast<IntRegister>(b.r[k]) & ~m.r[k]));
+  }
+#endif
+  return c;
+}
+
 // The signs of the lanes, lane 0 lowest.
 SP_INLINE uint32_t sign_bits(const I16& a) {
 #if defined(__AVX512F__)

@@ -4,7 +4,6 @@
 
 #include "doubles.hpp"
 #include "project_arrays.hpp"
-#include "surfel_lanes.hpp"
 #include "surfel_types.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
@@ -15,16 +14,6 @@ struct DoubleVector16 {
 
 SP_INLINE Vector16 to_float(const DoubleVector16& a) {
   return {to_float(a.x), to_float(a.y), to_float(a.z)};
-}
-
-template <typename Vector>
-SP_INLINE Vector cross(const Vector& a, const Vector& b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
-
-SP_INLINE Vector16 scaled(const Vector16& a, const F16& s) { return {a.x * s, a.y * s, a.z * s}; }
-SP_INLINE Vector16 sum(const Vector16& a, const Vector16& b) {
-  return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
 
 SP_INLINE DoubleVector16 to_camera(const Camera& camera, const DoubleVector16& d_W) {
@@ -78,9 +67,9 @@ SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians
   s.facing = to_float(n.x * p.x + (n.y * p.y + n.z * p.z));
   s.edge_on = s.facing * s.facing <= F16(kEdgeOn * kEdgeOn) * dot(s.p, s.p);
   s.inverse_facing = F16(1.0f) / select(s.edge_on, F16(1.0f), s.facing);
-  s.u = scaled(to_float(cross(t[1], p)), s.inverse_facing / in.scale[0]);
-  s.v = scaled(to_float(cross(p, t[0])), s.inverse_facing / in.scale[1]);
-  s.w = scaled(s.t[2], s.inverse_facing);
+  s.u = (s.inverse_facing / in.scale[0]) * to_float(cross(t[1], p));
+  s.v = (s.inverse_facing / in.scale[1]) * to_float(cross(p, t[0]));
+  s.w = s.inverse_facing * s.t[2];
   const D16 inverse_z = D16(1.0) / p.z;
   const D16 mean[2] = {D16(camera.fx) * (p.x * inverse_z) + D16(camera.cx),
                        D16(camera.fy) * (p.y * inverse_z) + D16(camera.cy)};

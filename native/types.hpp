@@ -98,18 +98,24 @@ struct Image {
   float background[3];
 };
 
+// What a backward pass starts from: transmittance (16 blocks of 16 pixels) where the second and
+// later stages of a tile start, from entry later_stages[tile] on; and how many stages were
+// composited before every pixel was finished. Written by the forward pass, or read: then with
+// constant Float and Count.
+template <typename Float, typename Count>
+struct StageRecord {
+  const size_t* later_stages;  // (tiles + 1,)
+  Float* transmittance;
+  Count* stages_done;  // (tiles,)
+};
+using StageWriter = StageRecord<float, uint32_t>;
+using StageReader = StageRecord<const float, const uint32_t>;
+
 struct RasterInput {
   const Splat* splats;
-  const Pair* pairs;             // grouped by tile, in depth order
-  const uint32_t* tile_offsets;  // (tiles + 1,)
+  const Pair* pairs;           // grouped by tile, in depth order
+  const size_t* tile_offsets;  // (tiles + 1,)
   int width, height, tiles_x;
-  Image image;
-  // What a backward pass starts from, or null: transmittance (16 blocks of 16 pixels) where the
-  // second and later stages of a tile start, from entry later_stages[tile] on; and how many stages
-  // were composited before every pixel was finished.
-  const uint32_t* later_stages;  // (tiles + 1,)
-  float* transmittance;
-  uint32_t* stages_done;  // (tiles,)
 };
 
 // The loss's derivatives by what was rendered; strides as in Image.
@@ -174,8 +180,14 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
                              int tiles_x, int tiles_y, TilePair*, size_t capacity,
                              size_t* pair_count, uint32_t* tile_counts);
 
+struct SurfelKernels;
+struct LossKernels;
+
+// Of one SIMD level.
 struct Kernels {
   const char* name;
+  const SurfelKernels* surfels;
+  const LossKernels* losses;
   // Projects Gaussians [begin, end); writes visible ones and the bits of their depths in input
   // order; returns how many.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,
@@ -183,11 +195,12 @@ struct Kernels {
   size_t (*project_baked)(const BakedArrays&, const Camera&, size_t begin, size_t end, Splat*,
                           uint32_t* depth_bits);
   BinKernel bin;
-  void (*raster_tile)(const RasterInput&, int tile);
+  // With `record`, a backward pass can follow.
+  void (*raster_tile)(const RasterInput&, const Image&, const StageWriter* record, int tile);
   // Writes the gradients of a tile's pairs and returns how many (splat, block) it composited;
   // `scratch` has kBackwardScratchBytes, aligned to 64.
-  size_t (*raster_tile_backward)(const RasterInput&, const ImageGradient&, int tile, void* scratch,
-                                 PairGradient*);
+  size_t (*raster_tile_backward)(const RasterInput&, const StageReader&, const ImageGradient&,
+                                 int tile, void* scratch, PairGradient*);
   // Adds up the pairs of `count` splats.
   void (*gather_gradients)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
                            const PairGradient*, SplatGradient*);
@@ -205,13 +218,5 @@ struct Kernels {
   float (*multiply_add)(size_t rounds);
 };
 constexpr int kFmaChains = 12;
-
-#if defined(__x86_64__)
-const Kernels& kernels_v2();
-const Kernels& kernels_v3();
-const Kernels& kernels_v4();
-#else
-const Kernels& kernels_generic();
-#endif
 
 }  // namespace splatpilot
