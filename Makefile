@@ -5,8 +5,9 @@ PYTHON ?= $(shell for python in python3.12 python3.13 python3 python; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null && echo $$python && break; done)
 BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
+NATIVE := $(wildcard native/*.hpp native/*.cpp)
 
-.PHONY: fly test lint sanitize clean
+.PHONY: fly test lint stub sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly
@@ -17,12 +18,20 @@ test: lint
 lint: .venv/installed
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/clang-format --dry-run --Werror $(NATIVE)
 	.venv/bin/pyright
 
-# The splat tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
+# Writes the types of the native module, after a change of its bindings.
+stub: .venv/installed
+	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file splatpilot/_native.pyi
+
+# The tests of the native kernels on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
 sanitize: .venv/installed
-	.venv/bin/uv pip install --quiet --python .venv/bin/python cmake ninja nanobind
+	.venv/bin/uv pip install --quiet --python .venv/bin/python cmake ninja
 	native/sanitize.sh
+
+nightly: sanitize
+	for table in agreement losses rasterize surfels; do .venv/bin/python benchmarks/$$table.py || exit 1; done
 
 clean:
 	rm -rf .venv build

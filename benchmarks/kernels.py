@@ -30,17 +30,21 @@ class Kernel:
         tensors = tensors_of(scene)
         viewmats, Ks = cameras_of(X_WC, WIDTH, HEIGHT)
         self.renderer = _native.Renderer(1, simd)
-        self._scene = [tensors[name].numpy() for name in ("means", "quats", "scales", "opacities")]
-        self._scene.append(tensors["colors"].numpy()[:, None])
-        self._camera = (Ks[0].double().numpy(), viewmats[0].double().numpy(), WIDTH, HEIGHT)
-        self._images = [np.zeros((HEIGHT, WIDTH, n), np.float32) for n in (3, 1)]
+        self._arguments: dict[str, Any] = {
+            name: tensors[name].numpy() for name in ("means", "quats", "scales", "opacities")
+        }
+        self._image, self._alpha = (np.zeros((HEIGHT, WIDTH, n), np.float32) for n in (3, 1))
         self._black = np.zeros(3, np.float32)
+        self._arguments |= {
+            "colors": tensors["colors"].numpy()[:, None], "sh_degree": -1,
+            "K": Ks[0].double().numpy(), "X_CW": viewmats[0].double().numpy(),
+            "width": WIDTH, "height": HEIGHT, "near_plane": 0.01, "far_plane": 1e10,
+            "radius_clip": 0.0, "eps2d": 0.3, "antialiased": False, "expected_depth": False,
+            "background": self._black, "image": self._image, "alpha": self._alpha, "keep": True,
+        }  # fmt: skip
 
-    def render(self) -> None:
-        self.renderer.render(
-            *self._scene, -1, *self._camera, 0.01, 1e10, 0.0, 0.3, False, False, self._black,
-            *self._images, True,
-        )  # fmt: skip
+    def render(self) -> _native.Frame:
+        return _native.render(self.renderer, **self._arguments)
 
     def raster_ms(self, repeats: int = 60) -> float:
         """Least milliseconds of the forward raster kernel alone, all tiles."""
@@ -52,16 +56,16 @@ class Kernel:
 
     def backward(self) -> tuple[float, int]:
         """Least milliseconds of the backward raster kernel, and (Gaussian, block) composited."""
-        self.render()
-        frame = _native.kept_frame(self.renderer)
-        upstream = [np.ones_like(image) for image in self._images]
+        frame = self.render()
         gradients = np.zeros((frame.splat_count, 16), np.float32)
         means2d = np.zeros((frame.splat_count, 2), np.float32)
         least, blocks = np.inf, 0
         for _ in range(60):
             blocks = _native.raster_backward(
-                self.renderer, frame, *upstream, *self._images, self._black, False, False,
-                gradients, means2d,
+                self.renderer, frame, v_image=np.ones_like(self._image),
+                v_alpha=np.ones_like(self._alpha), image=self._image, alpha=self._alpha,
+                background=self._black, expected_depth=False, absolute=False,
+                v_splats=gradients, v_means2d=means2d,
             )  # fmt: skip
             least = min(least, 1e3 * self.renderer.seconds["raster backward"])
         return float(least), blocks
@@ -107,7 +111,7 @@ def print_limits(scene: GaussianScene, X_WC: RigidTransform) -> None:
         rate = burst()[1] / least  # lanes per ms
         forward = kernel.raster_ms()
         backward, blocks = kernel.backward()
-        pairs = kernel.renderer.pair_count
+        pairs = kernel.render().pair_count
         work = 16 * (VECTOR_WORK["block"] * blocks + VECTOR_WORK["pair"] * pairs)
         read = BYTES_PER_PAIR * pairs / forward / 1e6
         row(

@@ -102,13 +102,25 @@ def main() -> None:
         gradient = torch.empty_like(rendered)
 
         def photometric_kernel(level: str, x=rendered, y=target, out=gradient) -> None:
-            images = (t[None].numpy() for t in (x, y))
-            _native.photometric_loss(*images, SSIM_WEIGHT, out[None].numpy(), level)
+            _native.photometric_loss(
+                rendered=x[None].numpy(),
+                target=y[None].numpy(),
+                ssim_weight=SSIM_WEIGHT,
+                gradient=out[None].numpy(),
+                simd=level,
+            )
 
         def log_depth_kernel(level: str, x=noisy, d=depth, w=weights, out=gradient) -> None:
-            images = (t.view(-1).numpy() for t in (x, d, w))
-            out = out.view(-1)[: x.numel()].numpy()
-            _native.log_depth_loss(*images, EPSILON, FAR, out, level)
+            rendered, truth, weight = (t.view(-1).numpy() for t in (x, d, w))
+            _native.log_depth_loss(
+                rendered=rendered,
+                depth=truth,
+                weights=weight,
+                epsilon=EPSILON,
+                far=FAR,
+                gradient=out.view(-1)[: x.numel()].numpy(),
+                simd=level,
+            )
 
         def photometric(loss: Callable[..., Tensor], y=target) -> Loss:
             return lambda x: loss(x, y.to(x.dtype), SSIM_WEIGHT)

@@ -25,8 +25,8 @@ from pydrake.math import RigidTransform
 from scenes import cameras_of, intrinsics, load_scene, scene_name, tensors_of
 
 from splatpilot import _native
-from splatpilot.systems.splats import rasterization, rasterize
-from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 COUNTS = (100_000, 500_000)
@@ -35,7 +35,7 @@ SCALING_ROUNDS = 40
 
 
 def step_calls(
-    scene: GaussianScene, X_WC: RigidTransform, size: tuple[int, int], simd: str, threads: int,
+    scene: GaussianScene, X_WC: RigidTransform, size: tuple[int, int], renderer: _native.Renderer,
     sh_degree: int | None = None,
 ) -> dict[str, Callable[[], object]]:  # fmt: skip
     """forward, forward + backward, and these with an optimiser's step, of RGB images."""
@@ -52,7 +52,7 @@ def step_calls(
     def forward() -> torch.Tensor:
         return rasterize(
             **leaves, viewmats=viewmats, Ks=Ks, width=width, height=height,
-            sh_degree=sh_degree, threads=threads, simd=simd,
+            sh_degree=sh_degree, renderer=renderer,
         )[0]  # fmt: skip
 
     def forward_only() -> None:
@@ -72,12 +72,12 @@ def step_calls(
 
 def print_steps(scene: GaussianScene, X_WC: RigidTransform) -> None:
     levels = _native.simd_levels()
-    cases: list[tuple] = [(size, levels[0], 1, None) for size in SIZES]
+    cases: list[tuple] = [(size, levels[0], None) for size in SIZES]
     if len(scene) == COUNTS[0]:
-        cases += [((320, 240), level, 1, None) for level in levels[1:]]
-        cases += [((320, 240), levels[0], 1, degree) for degree in (0, 1, 2, 3)]
-    for size, simd, threads, degree in cases:
-        calls = step_calls(scene, X_WC, size, simd, threads, degree)
+        cases += [((320, 240), level, None) for level in levels[1:]]
+        cases += [((320, 240), levels[0], degree) for degree in (0, 1, 2, 3)]
+    for size, simd, degree in cases:
+        calls = step_calls(scene, X_WC, size, create_renderer(1, simd), degree)
         least = [f"{milliseconds(call)[0]:.2f}" for call in calls.values()]
         colour = "RGB" if degree is None else f"SH {degree}"
         row(f"{len(scene):,}", f"{size[0]}x{size[1]}", colour, simd, *least)
@@ -85,7 +85,8 @@ def print_steps(scene: GaussianScene, X_WC: RigidTransform) -> None:
 
 def print_scaling(scene: GaussianScene, X_WC: RigidTransform) -> None:
     """Whole calls and native stages by threads, in turns, so that all see the same machine."""
-    calls = {n: step_calls(scene, X_WC, (320, 240), "", n) for n in (1, 2, 4)}
+    renderers = {n: create_renderer(n) for n in (1, 2, 4)}
+    calls = {n: step_calls(scene, X_WC, (320, 240), r) for n, r in renderers.items()}
     least: dict[tuple[int, str], float] = {}
 
     def keep(threads: int, stage: str, duration: float) -> None:
@@ -99,7 +100,7 @@ def print_scaling(scene: GaussianScene, X_WC: RigidTransform) -> None:
                     by_label[label]()
                     keep(threads, label, time.perf_counter() - start)
                     if label == "+ backward":
-                        for stage, seconds in rasterization.last_stages(threads).items():
+                        for stage, seconds in renderers[threads].seconds.items():
                             keep(threads, stage, seconds)
     header("320x240, RGB", "1 thread", "2 threads", "gain", "4 threads")
     for stage in dict.fromkeys(stage for _, stage in least):
@@ -109,11 +110,12 @@ def print_scaling(scene: GaussianScene, X_WC: RigidTransform) -> None:
 
 def print_baked(scene: GaussianScene, X_WC: RigidTransform) -> None:
     header("RGB+ED without gradients", "rasterize", "baked", "gain")
-    baked = BakedScene(scene)
+    baked, renderer = BakedScene(scene), create_renderer()
     for width, height in SIZES:
         viewmats, Ks = cameras_of(X_WC, width, height)
         arguments: dict[str, Any] = tensors_of(scene) | {"viewmats": viewmats, "Ks": Ks}
         arguments |= {"width": width, "height": height, "render_mode": "RGB+ED"}
+        arguments["renderer"] = renderer
         K = intrinsics(width, height)
         plain, _ = milliseconds(lambda arguments=arguments: rasterize(**arguments))
         fast, _ = milliseconds(lambda K=K, w=width, h=height: baked.render(K, w, h, X_WC))
@@ -123,6 +125,7 @@ def print_baked(scene: GaussianScene, X_WC: RigidTransform) -> None:
 def print_distorted(scene: GaussianScene, X_WC: RigidTransform) -> None:
     header("distorted cameras, 320x240", "forward", "+ backward")
     viewmats, Ks = cameras_of(X_WC, 320, 240)
+    renderer = create_renderer()
     lenses: dict[str, dict[str, Any]] = {
         "pinhole": {},
         "OpenCV, k1 k2 k3 and p1 p2": {
@@ -137,6 +140,7 @@ def print_distorted(scene: GaussianScene, X_WC: RigidTransform) -> None:
     for name, lens in lenses.items():
         leaves = {n: t.clone().requires_grad_() for n, t in tensors_of(scene).items()}
         view = {"viewmats": viewmats, "Ks": Ks, "width": 320, "height": 240}
+        view["renderer"] = renderer
 
         def forward(leaves: dict = leaves, view: dict = view, lens: dict = lens) -> torch.Tensor:
             return rasterize(**leaves, **view, **lens)[0]
@@ -178,7 +182,7 @@ def main() -> None:
     torch.manual_seed(0)
     print(machine())
     scene, X_WC = load_scene(COUNTS[0])
-    calls = step_calls(scene, X_WC, (320, 240), "", 1)
+    calls = step_calls(scene, X_WC, (320, 240), create_renderer())
     peaks = ", ".join(f"{label} {peak_growth(call):.0f} MiB" for label, call in calls.items())
     print(f"{scene_name()}: {len(scene):,} Gaussians; one thread unless said otherwise")
     print(f"peak of resident memory above what it was, first calls at 320x240: {peaks}")

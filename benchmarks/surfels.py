@@ -14,7 +14,9 @@ from harness import header, machine, milliseconds, row
 from scenes import cameras_of, load_scene, tensors_of
 
 from splatpilot import _native
+from splatpilot._native import Renderer
 from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.surfels import rasterize_surfels
 
 COUNT = 100_000  # surfels
@@ -36,22 +38,25 @@ def main() -> None:
         viewmats, Ks = cameras_of(X_WC, width, height)
         view = {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
         for level in _native.simd_levels():
+            renderer = create_renderer(1, level)
             learned = {k: v.clone().requires_grad_() for k, v in surfels.items()}
 
-            def forward_3d(level: str = level, view: dict = view) -> object:
-                return rasterize(**surfels, **view, simd=level, render_mode="RGB+D")
+            def forward_3d(renderer: Renderer = renderer, view: dict = view) -> object:
+                return rasterize(**surfels, **view, renderer=renderer, render_mode="RGB+D")
 
-            def forward(level: str = level, view: dict = view, mode: str = "RGB") -> object:
-                return rasterize_surfels(**surfels, **view, simd=level, render_mode=mode)
+            def forward(
+                renderer: Renderer = renderer, view: dict = view, mode: str = "RGB"
+            ) -> object:
+                return rasterize_surfels(**surfels, **view, renderer=renderer, render_mode=mode)
 
             def both(
                 distort: bool = False,
-                level: str = level,
+                renderer: Renderer = renderer,
                 view: dict = view,
                 learned: dict[str, torch.Tensor] = learned,
             ) -> None:
                 image, _, normal, _, distortion, _, _ = rasterize_surfels(
-                    **learned, **view, simd=level, render_mode="RGB+D", distloss=distort
+                    **learned, **view, renderer=renderer, render_mode="RGB+D", distloss=distort
                 )
                 loss = image.sum() + normal.sum()
                 (loss + distortion.sum() if distort else loss).backward()

@@ -7,6 +7,22 @@
 #endif
 
 namespace splatpilot {
+#if defined(__x86_64__)
+namespace v2 {
+extern const Kernels kKernels;
+}
+namespace v3 {
+extern const Kernels kKernels;
+}
+namespace v4 {
+extern const Kernels kKernels;
+}
+#else
+namespace generic {
+extern const Kernels kKernels;
+}
+#endif
+
 namespace {
 
 #if defined(__x86_64__)
@@ -25,16 +41,17 @@ std::vector<const Kernels*> usable_kernels() {
 #if defined(__x86_64__)
   __builtin_cpu_init();
   const bool v2 = __builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt");
-  const bool v3 = v2 && has_v3_extras() && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                  __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2");
+  const bool v3 = v2 && has_v3_extras() && __builtin_cpu_supports("avx2") &&
+                  __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+                  __builtin_cpu_supports("bmi2");
   const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
                   __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
                   __builtin_cpu_supports("avx512vl");
-  if (v4) usable.push_back(&kernels_v4());
-  if (v3) usable.push_back(&kernels_v3());
-  if (v2) usable.push_back(&kernels_v2());
+  if (v4) usable.push_back(&v4::kKernels);
+  if (v3) usable.push_back(&v3::kKernels);
+  if (v2) usable.push_back(&v2::kKernels);
 #else
-  usable.push_back(&kernels_generic());
+  usable.push_back(&generic::kKernels);
 #endif
   return usable;
 }

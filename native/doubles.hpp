@@ -15,9 +15,7 @@ struct D16 {
   DoubleRegister r[kDoubleRegisters];
 
   D16() = default;
-  SP_INLINE D16(double s) {
-    SP_EACH_DOUBLE(k) r[k] = s - DoubleRegister{};
-  }
+  SP_INLINE D16(double s) { SP_EACH_DOUBLE(k) r[k] = s - DoubleRegister{}; }
   SP_INLINE explicit D16(const F16& a) {
     alignas(64) float lanes[kLanes];
     store(lanes, a);

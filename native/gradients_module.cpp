@@ -1,6 +1,5 @@
-// Python bindings of the backward pass.
+// Python bindings of the backward pass of Gaussians.
 #include <nanobind/stl/pair.h>
-#include <nanobind/stl/vector.h>
 
 #include "bindings.hpp"
 
@@ -9,35 +8,20 @@ namespace {
 
 using namespace nb::literals;
 
-template <typename... Shape>
-using Writable = nb::ndarray<float, Shape..., nb::c_contig, nb::device::cpu>;
-using Pixels = Floats<nb::ndim<3>>;
-
-// Handed to Python instead of Frame: nothing there may change it.
-struct KeptFrame {
-  std::shared_ptr<const Frame> frame;
-  size_t splats, gaussians;
-};
-
-void check_pixels(const Pixels& array, const Camera& camera, size_t channels) {
-  require(array.shape(0) == static_cast<size_t>(camera.height) &&
-              array.shape(1) == static_cast<size_t>(camera.width) && array.shape(2) == channels,
-          "an image has the wrong shape");
-}
-
-size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image, Pixels v_alpha,
-                     Pixels image, Pixels alpha, Floats<nb::shape<3>> background,
-                     bool expected_depth, bool absolute,
-                     Writable<nb::shape<-1, 16>> splat_gradients,
-                     Writable<nb::shape<-1, 2>> v_means2d) {
-  const Camera& camera = kept.frame->camera;
+size_t raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
+                       const Pixels& v_alpha, const Pixels& image, const Pixels& alpha,
+                       const Floats<nb::shape<3>>& background, bool expected_depth, bool absolute,
+                       const Writable<nb::shape<-1, 16>>& v_splats,
+                       const Writable<nb::shape<-1, 2>>& v_means2d) {
+  const Frame& frame = *rendered.frame;
+  require(frame.kept, "the frame was not kept for a backward pass");
   const size_t channels = v_image.shape(2);
   require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
-  check_pixels(v_image, camera, channels);
-  check_pixels(image, camera, channels);
-  check_pixels(v_alpha, camera, 1);
-  check_pixels(alpha, camera, 1);
-  require(splat_gradients.shape(0) == kept.splats && v_means2d.shape(0) == kept.splats,
+  check_size(v_image, frame.camera, channels);
+  check_size(image, frame.camera, channels);
+  check_size(v_alpha, frame.camera, 1);
+  check_size(alpha, frame.camera, 1);
+  require(v_splats.shape(0) == rendered.splat_count && v_means2d.shape(0) == rendered.splat_count,
           "one row of gradients a splat is needed");
   ImageGradient g{};
   if (channels >= 3) g.color = v_image.data();
@@ -51,62 +35,60 @@ size_t raster_backward(Renderer& renderer, const KeptFrame& kept, Pixels v_image
 
   const nb::gil_scoped_release release;
   const std::scoped_lock lock(renderer.mutex());
-  return renderer.raster_backward(*kept.frame, g,
-                                  reinterpret_cast<SplatGradient*>(splat_gradients.data()),
+  return renderer.raster_backward(frame, g, reinterpret_cast<SplatGradient*>(v_splats.data()),
                                   v_means2d.data());
 }
 
-// Returns PoseSums.
-std::vector<double> project_backward(
-    Renderer& renderer, const KeptFrame& kept, Means means, Quats quats, Means scales,
-    Opacities opacities, Colors colors, int sh_degree, Floats<nb::shape<-1, 16>> splat_gradients,
-    Floats<nb::shape<-1, 2>> v_means2d, Writable<nb::shape<-1, 3>> v_means,
-    Writable<nb::shape<-1, 4>> v_quats, Writable<nb::shape<-1, 3>> v_scales,
-    Writable<nb::ndim<1>> v_opacities, Writable<nb::shape<-1, -1, 3>> v_colors, bool overwrite, bool overwrite_colors) {
+OwnedArray<double, 5, 3> project_backward(
+    Renderer& renderer, const RenderedFrame& rendered, const Means& means, const Quats& quats,
+    const Means& scales, const Opacities& opacities, const Colors& colors, int sh_degree,
+    const Floats<nb::shape<-1, 16>>& v_splats, const Floats<nb::shape<-1, 2>>& v_means2d,
+    const Rows3& v_means, const Rows4& v_quats, const Rows3& v_scales,
+    const Writable<nb::ndim<1>>& v_opacities, const ColorRows& v_colors, bool overwrite,
+    bool overwrite_colors) {
+  const Frame& frame = *rendered.frame;
+  require(frame.kept, "the frame was not kept for a backward pass");
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  require(gaussians.count == kept.gaussians, "these are not the Gaussians of the frame");
-  require(splat_gradients.shape(0) == kept.splats && v_means2d.shape(0) == kept.splats,
+  require(gaussians.count == frame.gaussians, "these are not the Gaussians of the frame");
+  require(v_splats.shape(0) == rendered.splat_count && v_means2d.shape(0) == rendered.splat_count,
           "one row of gradients a splat is needed");
-  const size_t n = gaussians.count;
-  require(v_means.shape(0) == n && v_quats.shape(0) == n && v_scales.shape(0) == n &&
-              v_opacities.shape(0) == n && v_colors.shape(0) == n &&
-              v_colors.shape(1) == colors.shape(1),
-          "gradients and Gaussians differ in shape");
-  const nb::gil_scoped_release release;
-  const std::scoped_lock lock(renderer.mutex());
-  const PoseSums sums = renderer.project_backward(
-      *kept.frame, gaussians, reinterpret_cast<const SplatGradient*>(splat_gradients.data()),
-      v_means2d.data(),
-      {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data(),
-       overwrite, overwrite_colors});
-  return {std::begin(sums.values), std::end(sums.values)};
+  require_rows(gaussians, v_means, v_quats, v_scales, v_opacities, v_colors);
+  PoseSums sums;
+  {
+    const nb::gil_scoped_release release;
+    const std::scoped_lock lock(renderer.mutex());
+    sums = renderer.project_backward(
+        frame, gaussians, reinterpret_cast<const SplatGradient*>(v_splats.data()), v_means2d.data(),
+        {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data(),
+         overwrite, overwrite_colors});
+  }
+  OwnedArray<double, 5, 3> rows = new_array<double, 5, 3>();
+  std::copy_n(sums.values, 15, rows.data());
+  return rows;
 }
 
 }  // namespace
 
 void bind_gradients(nb::module_& m) {
-  nb::class_<KeptFrame>(m, "Frame", "What the backward pass of one rendered image starts from.")
-      .def_ro("splat_count", &KeptFrame::splats, "Gaussians that were visible.");
-  m.def(
-      "kept_frame",
-      [](Renderer& renderer) {
-        const std::scoped_lock lock(renderer.mutex());
-        const std::shared_ptr<const Frame> frame = renderer.frame();
-        require(frame && frame->kept, "the last frame was not kept");
-        return KeptFrame{frame, frame->splat_count(), frame->gaussians};
-      },
-      "renderer"_a, "The last frame, if it was rendered with keep=True.");
-  m.def("raster_backward", &raster_backward,
-        "Writes (n, 16) gradients; returns how many (Gaussian, 4x4 block) were composited.");
+  m.def("raster_backward", &raster_backward, "renderer"_a, "frame"_a, nb::kw_only(), "v_image"_a,
+        "v_alpha"_a, "image"_a, "alpha"_a, "background"_a, "expected_depth"_a, "absolute"_a,
+        "v_splats"_a, "v_means2d"_a,
+        "Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were\n"
+        "composited. v_image etc. are derivatives of the loss by image etc.");
+  m.def("project_backward", &project_backward, "renderer"_a, "frame"_a, nb::kw_only(), "means"_a,
+        "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a, "v_splats"_a,
+        "v_means2d"_a, "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
+        "overwrite"_a, "overwrite_colors"_a,
+        "Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by\n"
+        "R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.");
   m.def(
       "multiply_add",
-      [](Renderer& renderer, size_t rounds) {
+      [](const Renderer& renderer, size_t rounds) {
         const nb::gil_scoped_release release;
         return std::pair(renderer.kernels().multiply_add(rounds), 16 * kFmaChains * rounds);
       },
       "renderer"_a, "rounds"_a, "Does float multiply-adds; returns a sum and how many they were.");
-  m.def("project_backward", &project_backward);
 }
 
 }  // namespace splatpilot

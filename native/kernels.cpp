@@ -5,8 +5,7 @@
 #include "raster_backward.hpp"
 #include "tiles.hpp"
 
-namespace splatpilot {
-namespace SIMD_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
 static size_t first_nonfinite(const float* values, size_t count) {
   size_t i = 0;
@@ -61,17 +60,17 @@ static float multiply_add(size_t rounds) {
   return total;
 }
 
+extern const SurfelKernels kSurfelKernels;
+extern const LossKernels kLossKernels;
+
 #define SP_STRING_OF(name) #name
 #define SP_STRING(name) SP_STRING_OF(name)
-static const Kernels kTable = {SP_STRING(SIMD_LEVEL), project_arrays, project_baked,
-                               bin_footprints<SplatFootprint>, raster_tile,
-                               raster_tile_backward, gather_gradients, project_backward,
-                               first_nonfinite, all_within, all_normalisable, multiply_add};
+extern const Kernels kKernels;
+const Kernels kKernels = {
+    SP_STRING(SIMD_LEVEL), &kSurfelKernels,      &kLossKernels,
+    project_arrays,        project_baked,        bin_footprints<SplatFootprint>,
+    raster_tile,           raster_tile_backward, gather_gradients,
+    project_backward,      first_nonfinite,      all_within,
+    all_normalisable,      multiply_add};
 
-}  // namespace SIMD_LEVEL
-
-#define SP_JOIN_OF(a, b) a##b
-#define SP_JOIN(a, b) SP_JOIN_OF(a, b)
-const Kernels& SP_JOIN(kernels_, SIMD_LEVEL)() { return SIMD_LEVEL::kTable; }
-
-}  // namespace splatpilot
+}  // namespace splatpilot::SIMD_LEVEL

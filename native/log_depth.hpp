@@ -43,8 +43,8 @@ static double log_depth(const LogDepthInput& in) {
     if (!in.gradient) continue;
     const F16 slope = weight * F16(scale) / at_least;
     const Mask16 moves = valid & (d > F16(in.epsilon));
-    const F16 gradient = zero_unless(moves & (d > truth), slope) -
-                         zero_unless(moves & (d < truth), slope);
+    const F16 gradient =
+        zero_unless(moves & (d > truth), slope) - zero_unless(moves & (d < truth), slope);
     if (whole) {
       store(in.gradient + i, gradient);
     } else {

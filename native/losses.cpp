@@ -4,17 +4,9 @@
 #include "log_depth.hpp"
 #include "photometric.hpp"
 
-namespace splatpilot {
-namespace SIMD_LEVEL {
+namespace splatpilot::SIMD_LEVEL {
 
-static const LossKernels kLossTable = {photometric_scratch, photometric, log_depth};
+extern const LossKernels kLossKernels;
+const LossKernels kLossKernels = {photometric_scratch, photometric, log_depth};
 
-}  // namespace SIMD_LEVEL
-
-#define SP_LOSS_JOIN_OF(a, b) a##b
-#define SP_LOSS_JOIN(a, b) SP_LOSS_JOIN_OF(a, b)
-const LossKernels& SP_LOSS_JOIN(loss_kernels_, SIMD_LEVEL)() {
-  return SIMD_LEVEL::kLossTable;
-}
-
-}  // namespace splatpilot
+}  // namespace splatpilot::SIMD_LEVEL

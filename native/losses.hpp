@@ -39,12 +39,4 @@ struct LossKernels {
   double (*log_depth)(const LogDepthInput&);
 };
 
-#if defined(__x86_64__)
-const LossKernels& loss_kernels_v2();
-const LossKernels& loss_kernels_v3();
-const LossKernels& loss_kernels_v4();
-#else
-const LossKernels& loss_kernels_generic();
-#endif
-
 }  // namespace splatpilot

@@ -1,47 +1,26 @@
 // Python bindings of the losses.
-#include "losses_module.hpp"
-
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
-#include <cmath>
-#include <stdexcept>
+#include <optional>
 #include <string>
 #include <vector>
 
+#include "bindings.hpp"
 #include "dispatch.hpp"
 #include "losses.hpp"
-
-namespace nb = nanobind;
-using namespace nb::literals;
 
 namespace splatpilot {
 namespace {
 
-using Images = nb::ndarray<const float, nb::ndim<4>, nb::c_contig, nb::device::cpu>;
-using ImagesOut = nb::ndarray<float, nb::ndim<4>, nb::c_contig, nb::device::cpu>;
-using Pixels = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using PixelsOut = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using namespace nb::literals;
+using Images = Floats<nb::ndim<4>>;
+using ImagesOut = Writable<nb::ndim<4>>;
+using Values = Floats<nb::ndim<1>>;
+using ValuesOut = Writable<nb::ndim<1>>;
 
-const LossKernels& loss_kernels(const std::string& level) {
-#if defined(__x86_64__)
-  const std::string name = kernels(level).name;
-  if (name == "v4") return loss_kernels_v4();
-  if (name == "v3") return loss_kernels_v3();
-  return loss_kernels_v2();
-#else
-  (void)kernels(level);
-  return loss_kernels_generic();
-#endif
-}
-
-void require(bool condition, const char* message) {
-  if (!condition) throw std::invalid_argument(message);
-}
-
-double photometric_loss(Images rendered, Images target, float ssim_weight,
-                        std::optional<ImagesOut> gradient, const std::string& simd) {
+double photometric_loss(const Images& rendered, const Images& target, float ssim_weight,
+                        const std::optional<ImagesOut>& gradient, const std::string& simd) {
   for (size_t axis = 0; axis < 4; ++axis) {
     require(rendered.shape(axis) == target.shape(axis), "images differ in shape");
     require(!gradient || rendered.shape(axis) == gradient->shape(axis),
@@ -50,7 +29,7 @@ double photometric_loss(Images rendered, Images target, float ssim_weight,
             "an image has no pixels, or more than 32768 along a side");
   }
   require(rendered.shape(0) > 0, "there is no image");
-  const LossKernels& kernels = loss_kernels(simd);
+  const LossKernels& kernels = *splatpilot::kernels(simd).losses;
   const double count = static_cast<double>(rendered.size());
   PhotometricInput in{};
   in.height = static_cast<int>(rendered.shape(1));
@@ -76,15 +55,16 @@ double photometric_loss(Images rendered, Images target, float ssim_weight,
   return ((1.0 - ssim_weight) * sums.l1 + ssim_weight * sums.dissimilarity) / count;
 }
 
-double log_depth_loss(Pixels rendered, Pixels depth, std::optional<Pixels> weights, float epsilon,
-                      float far, std::optional<PixelsOut> gradient, const std::string& simd) {
+double log_depth_loss(const Values& rendered, const Values& depth,
+                      const std::optional<Values>& weights, float epsilon, float far,
+                      const std::optional<ValuesOut>& gradient, const std::string& simd) {
   const size_t count = rendered.size();
   require(depth.size() == count && (!weights || weights->size() == count) &&
               (!gradient || gradient->size() == count),
           "depth images differ in size");
-  const LossKernels& kernels = loss_kernels(simd);
-  const LogDepthInput in{rendered.data(), depth.data(), weights ? weights->data() : nullptr,
-                         count, epsilon, far, gradient ? gradient->data() : nullptr};
+  const LossKernels& kernels = *splatpilot::kernels(simd).losses;
+  const LogDepthInput in{rendered.data(), depth.data(), weights ? weights->data() : nullptr,  count,
+                         epsilon,         far,          gradient ? gradient->data() : nullptr};
   const nb::gil_scoped_release release;
   return kernels.log_depth(in);
 }
@@ -92,12 +72,13 @@ double log_depth_loss(Pixels rendered, Pixels depth, std::optional<Pixels> weigh
 }  // namespace
 
 void bind_losses(nb::module_& m) {
-  m.def("photometric_loss", &photometric_loss, "rendered"_a, "target"_a, "ssim_weight"_a,
-        "gradient"_a.none(), "simd"_a = "",
+  m.def("photometric_loss", &photometric_loss, nb::kw_only(), "rendered"_a, "target"_a,
+        "ssim_weight"_a, "gradient"_a.none(), "simd"_a = "",
         "(1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.");
-  m.def("log_depth_loss", &log_depth_loss, "rendered"_a, "depth"_a, "weights"_a.none(),
-        "epsilon"_a, "far"_a, "gradient"_a.none(), "simd"_a = "",
-        "Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.");
+  m.def(
+      "log_depth_loss", &log_depth_loss, nb::kw_only(), "rendered"_a, "depth"_a, "weights"_a.none(),
+      "epsilon"_a, "far"_a, "gradient"_a.none(), "simd"_a = "",
+      "Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.");
 }
 
 }  // namespace splatpilot

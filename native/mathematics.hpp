@@ -31,11 +31,11 @@ SP_INLINE F16 log2(const F16& x) {
   const F16 m = float_from_bits(mantissa);
   const F16 s = (m - F16(1.0f)) / (m + F16(1.0f));
   const F16 s2 = s * s;
-  F16 p = F16(0.320598898f);         // 2 / (9 ln 2)
-  p = p * s2 + F16(0.412198583f);    // 2 / (7 ln 2)
-  p = p * s2 + F16(0.577078016f);    // 2 / (5 ln 2)
-  p = p * s2 + F16(0.961796694f);    // 2 / (3 ln 2)
-  p = p * s2 + F16(2.885390082f);    // 2 / ln 2
+  F16 p = F16(0.320598898f);       // 2 / (9 ln 2)
+  p = p * s2 + F16(0.412198583f);  // 2 / (7 ln 2)
+  p = p * s2 + F16(0.577078016f);  // 2 / (5 ln 2)
+  p = p * s2 + F16(0.961796694f);  // 2 / (3 ln 2)
+  p = p * s2 + F16(2.885390082f);  // 2 / ln 2
   return p * s + to_float(exponent);
 }
 

@@ -16,13 +16,13 @@ constexpr int kWindowRadius = 5;
 constexpr int kWindow = 2 * kWindowRadius + 1;
 constexpr float kSsimC1 = 0.01f * 0.01f, kSsimC2 = 0.03f * 0.03f;
 // exp(-k^2 / (2 * 1.5^2)), normalised to a sum of 1 over k = -5..5.
-constexpr float kGaussian[kWindowRadius + 1] = {0.2660117249f,  0.2130055377f, 0.1093606895f,
+constexpr float kGaussian[kWindowRadius + 1] = {0.2660117249f,  0.2130055377f,   0.1093606895f,
                                                 0.03600077213f, 0.007598758135f, 0.001028380084f};
 
 struct RowLayout {
-  size_t values;   // width * channels
-  size_t blocks;   // packs in a row
-  size_t margin;   // zeros before and after a padded row, at least the reach of the window
+  size_t values;  // width * channels
+  size_t blocks;  // packs in a row
+  size_t margin;  // zeros before and after a padded row, at least the reach of the window
   size_t padded;
 };
 
@@ -103,7 +103,8 @@ SP_INLINE void filter_columns(const float* const* rows, size_t offset, F16* mean
   }
 #pragma GCC unroll 5
   for (int k = 1; k <= kWindowRadius; ++k) {
-    const float *above = rows[kWindowRadius - k] + offset, *below = rows[kWindowRadius + k] + offset;
+    const float *above = rows[kWindowRadius - k] + offset,
+                *below = rows[kWindowRadius + k] + offset;
 #pragma GCC unroll 4
     for (int i = 0; i < kCount; ++i) {
       means[i] += F16(kGaussian[k]) * (load(above + i * kLanes) + load(below + i * kLanes));
@@ -171,7 +172,8 @@ static PhotometricSums photometric(const PhotometricInput& in) {
         const F16 var_u = m[1] - uu, var_v = m[3] - vv;
         const F16 inv_b1 = F16(1.0f) / (half * (uu + vv) + c1);
         const F16 inv_b2 = F16(1.0f) / (half * (var_u + var_v) + c2);
-        // One minus either factor of SSIM, free of the cancellation that 1 - SSIM has for good renders.
+        // One minus either factor of SSIM, free of the cancellation that 1 - SSIM has for good
+        // renders.
         const F16 e1 = vv * inv_b1, e2 = var_v * inv_b2;
         dissimilarity += first_lanes(e1 + e2 - e1 * e2, l.values - i);
         if (!in.gradient) continue;
@@ -189,7 +191,8 @@ static PhotometricSums photometric(const PhotometricInput& in) {
       if (in.gradient) {
         float* out = slopes + (middle % kWindow) * slope_row;
         for (size_t i = 0; i < l.values; i += kLanes, out += 3 * kLanes) {
-          for (int d = 0; d < 3; ++d) store(out + d * kLanes, filter_row(padded[2 + d] + i, stride));
+          for (int d = 0; d < 3; ++d)
+            store(out + d * kLanes, filter_row(padded[2 + d] + i, stride));
         }
       }
     }

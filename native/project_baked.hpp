@@ -29,8 +29,8 @@ SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
   Mask16 visible = (p_C.z + depth_reach >= F16(camera.near_plane)) &
                    (p_C.z - depth_reach <= F16(camera.far_plane));
   for (int side = 0; side < 4; ++side) {
-    const F16 reach = reach_along(camera.side_normal[side]) +
-                      F16(camera.side_reach[side]) * largest_scale;
+    const F16 reach =
+        reach_along(camera.side_normal[side]) + F16(camera.side_reach[side]) * largest_scale;
     visible = visible & (dot(camera.side_normal[side], p_C) + reach > F16(0.0f));
   }
   return lane_bits(visible);

@@ -45,38 +45,39 @@ bool place(const ProjectedArrays& in, const Camera& camera, size_t i, Splat& s) 
 using namespace nb::literals;
 using Rows = Doubles<nb::shape<-1, 3>>;
 
-// Returns (ux, uy, vy) of every visible splat, which the derivative by the covariance needs.
-nb::ndarray<nb::numpy, float> render_projected(
-    Renderer& renderer, Doubles<nb::shape<-1, 2>> means2d, Rows covariances, Opacities depths,
-    Opacities opacities, Means colors, int width, int height, double radius_clip,
-    bool expected_depth, Floats<nb::shape<3>> background, Output image, Output alpha, bool keep) {
+RenderedFrame render_projected(Renderer& renderer, const Doubles<nb::shape<-1, 2>>& means2d,
+                               const Rows& covariances, const Opacities& depths,
+                               const Opacities& opacities, const Means& colors, int width,
+                               int height, double radius_clip, bool expected_depth,
+                               const Floats<nb::shape<3>>& background, const Output& image,
+                               const Output& alpha, bool keep) {
   const size_t n = means2d.shape(0);
   require(covariances.shape(0) == n && depths.shape(0) == n && opacities.shape(0) == n &&
               colors.shape(0) == n,
           "arrays of Gaussians differ in length");
   require(n < (size_t{1} << 32) - kChunkSize, "too many Gaussians");
-  require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
-          "the image must have pixels, and at most 32768 a side");
-  const ProjectedArrays projected{n, means2d.data(), covariances.data(), depths.data(),
-                                  opacities.data(), colors.data()};
+  check_image_size(width, height);
+  const ProjectedArrays projected{
+      n, means2d.data(), covariances.data(), depths.data(), opacities.data(), colors.data()};
   Camera camera{};
   camera.width = width;
   camera.height = height;
   camera.radius_clip = static_cast<float>(std::floor(radius_clip));
-  const Image out = output_image(image, alpha, width, height, expected_depth, background);
+  const Image out = output_image(image, alpha, camera, expected_depth, background);
+  const Exclusive use(renderer);
+  return RenderedFrame(renderer.render(projected, camera, out, keep));
+}
 
-  {
-    const nb::gil_scoped_release release;
-    const std::scoped_lock lock(renderer.mutex());
-    renderer.render(projected, camera, out, keep);
-  }
-  const auto factors = new_array<float>({renderer.splat_count(), 3});
-  renderer.for_each_splat([&](size_t i, const Splat& s) {
-    factors.data()[3 * i] = s.ux;
-    factors.data()[3 * i + 1] = s.uy;
-    factors.data()[3 * i + 2] = s.vy;
+// What the derivative by the covariance needs.
+OwnedArray<float, -1, 3> factors(Renderer& renderer, const RenderedFrame& rendered) {
+  const auto rows = new_array<float, -1, 3>(rendered.splat_count);
+  const Exclusive use(renderer);
+  renderer.for_each_splat(*rendered.frame, [&](size_t i, const Splat& s) {
+    rows.data()[3 * i] = s.ux;
+    rows.data()[3 * i + 1] = s.uy;
+    rows.data()[3 * i + 2] = s.vy;
   });
-  return factors;
+  return rows;
 }
 
 }  // namespace
@@ -95,8 +96,13 @@ size_t place_splats(const ProjectedArrays& projected, const Camera& camera, size
 }
 
 void bind_projected(nb::module_& m) {
-  m.def("render_projected", &render_projected,
-        "Renders projected Gaussians; returns the factors (ux, uy, vy) of the visible ones.");
+  m.def("render_projected", &render_projected, "renderer"_a, nb::kw_only(), "means2d"_a,
+        "covariances"_a, "depths"_a, "opacities"_a, "colors"_a, "width"_a, "height"_a,
+        "radius_clip"_a, "expected_depth"_a, "background"_a, "image"_a, "alpha"_a, "keep"_a,
+        "As render, of Gaussians that are projected.");
+  m.def("splat_factors", &factors, "renderer"_a, "frame"_a,
+        "(n, 3) ux, uy, vy of a frame's splats: u = ux dx + uy dy and v = vy dy make the\n"
+        "exponent, in base 2, -u^2 - v^2.");
 }
 
 }  // namespace splatpilot

@@ -12,6 +12,21 @@ struct Vector16 {
   F16 x, y, z;
 };
 
+SP_INLINE Vector16 operator*(const F16& s, const Vector16& a) {
+  return {s * a.x, s * a.y, s * a.z};
+}
+SP_INLINE Vector16 operator+(const Vector16& a, const Vector16& b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+SP_INLINE Vector16 operator-(const Vector16& a, const Vector16& b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+
+template <typename Vector>
+SP_INLINE Vector cross(const Vector& a, const Vector& b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
 SP_INLINE F16 dot(const float n[3], const Vector16& p) {
   return F16(n[0]) * p.x + (F16(n[1]) * p.y + F16(n[2]) * p.z);
 }
@@ -70,23 +85,20 @@ SP_INLINE F16 largest_component(const Vector16& a) {
 // from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
 // of large entries. Returns the lanes that are visible.
 SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
-                                   Vector16 p0, Vector16 p1, F16 log2_opacity,
-                                   SplatPack& out) {
+                                   Vector16 p0, Vector16 p1, F16 log2_opacity, SplatPack& out) {
   // Scaling by g keeps the squares of huge Gaussians within range; it is exactly 1 for all others.
   const F16 largest = max(max(largest_component(p0), largest_component(p1)), F16(1e8f));
   const F16 g = F16(1e8f) / largest;
-  p0 = {p0.x * g, p0.y * g, p0.z * g};
-  p1 = {p1.x * g, p1.y * g, p1.z * g};
+  p0 = g * p0;
+  p1 = g * p1;
   const F16 blur = F16(camera.eps2d) * g * g;
   const F16 raw00 = p0.x * p0.x + p0.y * p0.y + p0.z * p0.z;
   const F16 raw11 = p1.x * p1.x + p1.y * p1.y + p1.z * p1.z;
   const F16 s00 = raw00 + blur;
   const F16 s11 = raw11 + blur;
   const F16 s01 = p0.x * p1.x + p0.y * p1.y + p0.z * p1.z;
-  const F16 cross_x = p0.y * p1.z - p0.z * p1.y;
-  const F16 cross_y = p0.z * p1.x - p0.x * p1.z;
-  const F16 cross_z = p0.x * p1.y - p0.y * p1.x;
-  const F16 raw_det = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z;
+  const Vector16 c = cross(p0, p1);
+  const F16 raw_det = c.x * c.x + c.y * c.y + c.z * c.z;
   const F16 det = raw_det + blur * (raw00 + raw11 + blur);
   if (camera.antialiased) {
     // What the blur adds to the area is taken from the opacity (Yu et al. 2024).
@@ -126,9 +138,9 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
 SP_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t bits,
                                const uint32_t* indices, Splat* splats, uint32_t* depth_bits) {
   alignas(64) float fields[14][kLanes];
-  const F16* packs[14] = {&p.mean_x, &p.mean_y, &p.extent_x, &p.extent_y, &p.ux,
-                          &p.uy, &p.vy, &p.log2_opacity, color, color + 1,
-                          color + 2, &p.depth, &p.slope_x, &p.slope_y};
+  const F16* packs[14] = {&p.mean_x, &p.mean_y, &p.extent_x,     &p.extent_y, &p.ux,
+                          &p.uy,     &p.vy,     &p.log2_opacity, color,       color + 1,
+                          color + 2, &p.depth,  &p.slope_x,      &p.slope_y};
   for (int f = 0; f < 14; ++f) store(fields[f], *packs[f]);
   size_t count = 0;
   for (; bits; bits &= bits - 1) {

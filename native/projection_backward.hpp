@@ -6,13 +6,6 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-SP_INLINE Vector16 operator*(const F16& s, const Vector16& a) { return {s * a.x, s * a.y, s * a.z}; }
-SP_INLINE Vector16 operator+(const Vector16& a, const Vector16& b) {
-  return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-SP_INLINE Vector16 operator-(const Vector16& a, const Vector16& b) {
-  return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
 SP_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
 
 // Splats and their gradients, one pack per field.
@@ -39,10 +32,9 @@ SP_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s,
   const F16 largest = max(max(largest_component(p0), largest_component(p1)), F16(1e8f));
   const F16 g = F16(1e8f) / largest;
   const Vector16 q0 = g * p0, q1 = g * p1;
-  const Vector16 cross = {q0.y * q1.z - q0.z * q1.y, q0.z * q1.x - q0.x * q1.z,
-                          q0.x * q1.y - q0.y * q1.x};
-  const F16 factor = F16(2.0f * ln2 * camera.eps2d) * s.log_opacity * g * g /
-                     max(dot(cross, cross), F16(1e-37f));
+  const Vector16 c = cross(q0, q1);
+  const F16 factor =
+      F16(2.0f * ln2 * camera.eps2d) * s.log_opacity * g * g / max(dot(c, c), F16(1e-37f));
   const Vector16 t0 = s.ux * a0, t1 = s.uy * a0 + s.vy * a1;
   const F16 x01 = dot(q0, q1);
   dp[0] = dp[0] + factor * (dot(q1, q1) * t0 - x01 * t1);
@@ -147,8 +139,11 @@ SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients
     }
     soa[12][lane] = keep * g.depth;
   }
-  s = {load(soa[0]), load(soa[1]), load(soa[2]), load(soa[3]), load(soa[4]), load(soa[5]),
-       load(soa[6]), load(soa[7]), load(soa[8]), {load(soa[9]), load(soa[10]), load(soa[11])},
+  s = {load(soa[0]), load(soa[1]),
+       load(soa[2]), load(soa[3]),
+       load(soa[4]), load(soa[5]),
+       load(soa[6]), load(soa[7]),
+       load(soa[8]), {load(soa[9]), load(soa[10]), load(soa[11])},
        load(soa[12])};
 }
 
@@ -162,8 +157,8 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     const int lanes = count - first < kLanes ? static_cast<int>(count - first) : kLanes;
     uint32_t indices[kLanes];
     SplatGradientPack s;
-    gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes,
-                  g.sh_degree >= 0, indices, s);
+    gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes, g.sh_degree >= 0,
+                  indices, s);
     const GatheredGaussians in = gather_gaussians(g, indices);
     const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
     const Vector16 p_C = to_camera(camera, d_W);
@@ -194,8 +189,8 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     const Vector16 direction = colors_backward(g, indices, lanes, d_W, s.color, out.colors);
     direction_sum = direction_sum + direction;
     const float* R = camera.R_CW;
-    const Vector16 dd_W = dp_C.x * broadcast(R) +
-                          (dp_C.y * broadcast(R + 3) + dp_C.z * broadcast(R + 6)) + direction;
+    const Vector16 dd_W =
+        dp_C.x * broadcast(R) + (dp_C.y * broadcast(R + 3) + dp_C.z * broadcast(R + 6)) + direction;
     pack.mean[0] = dd_W.x;
     pack.mean[1] = dd_W.y;
     pack.mean[2] = dd_W.z;

@@ -28,8 +28,10 @@ struct alignas(64) StagedTile {
 
 SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
   const float x = s.mean_x - left, y = s.mean_y - top;
-  return {s.ux, s.uy, -(s.ux * x + s.uy * y), s.vy, -(s.vy * y),
-          s.log2_opacity, s.color[0], s.color[1], s.color[2], s.depth};
+  return {s.ux,       s.uy,        -(s.ux * x + s.uy * y),
+          s.vy,       -(s.vy * y), s.log2_opacity,
+          s.color[0], s.color[1],  s.color[2],
+          s.depth};
 }
 
 // From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
@@ -50,10 +52,9 @@ SP_INLINE void transpose_blocks(int32_t* blocks, int count,
   }
 }
 
-SP_INLINE void stage(const RasterInput& in, uint32_t begin, uint32_t end, float left, float top,
+SP_INLINE void stage(const RasterInput& in, size_t begin, int count, float left, float top,
                      StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
-  const int count = static_cast<int>(end - begin);
   for (int i = 0; i < count; ++i) {
     const Pair* pair = in.pairs + begin + i;
     if (i + kPrefetchAhead < count) __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
@@ -70,16 +71,36 @@ SP_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
   return zero_unless(exponent >= F16(kLog2AlphaCut), min(exp2(exponent), F16(kMaxAlpha)));
 }
 
+// Pixel centres of the 16 lanes of a block, from its corner.
+struct LaneCentres {
+  F16 x, y;
+};
+
+SP_INLINE LaneCentres lane_centres() {
+  alignas(64) float x[kLanes], y[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
+    y[lane] = static_cast<float>(lane / kBlockSize) + 0.5f;
+  }
+  return {load(x), load(y)};
+}
+
+// The same of block b of a tile, from the tile's corner.
+SP_INLINE LaneCentres block_centres(const LaneCentres& centres, int b) {
+  return {centres.x + F16(static_cast<float>(kBlockSize * (b % 4))),
+          centres.y + F16(static_cast<float>(kBlockSize * (b / 4)))};
+}
+
 // Composites the staged splats of one block; returns whether any pixel is still open.
 template <bool kColor, bool kDepth>
-SP_INLINE bool composite(const StagedTile& staged, int words, int b, const F16& x, const F16& y,
+SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
                          BlockState& state) {
   BlockState s = state;
   bool open = true;
   for (int word = 0; word < words && open; ++word) {
     for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
       const StagedSplat& splat = staged.splats[64 * word + __builtin_ctzll(bits)];
-      const F16 alpha = alpha_at(splat, x, y);
+      const F16 alpha = alpha_at(splat, pixel.x, pixel.y);
       const F16 rest = s.transmittance * (F16(1.0f) - alpha);
       const Mask16 keep = rest > F16(kMinTransmittance);
       const F16 weight = zero_unless(keep, s.transmittance * alpha);
@@ -121,19 +142,19 @@ SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPi
   }
 }
 
-// Writes the first `columns` pixels of a row of a block; `lane` is the row's first lane.
-template <bool kColor, bool kDepth>
-SP_INLINE void write_row(const Image& image, const BlockPixels& pixels, int lane, size_t pixel,
-                         int columns) {
-  for (int i = 0; i < columns; ++i) {
-    image.alpha[pixel + i] = pixels.alpha[lane + i];
-    if constexpr (kColor) {
-      float* color = image.color + (pixel + i) * image.color_stride;
-      color[0] = pixels.red[lane + i];
-      color[1] = pixels.green[lane + i];
-      color[2] = pixels.blue[lane + i];
+// Calls visit(lane, pixel) for the pixels of a block that are on the image.
+template <typename Visit>
+SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Visit& visit) {
+  const int columns = width - left < kBlockSize ? width - left : kBlockSize;
+  const int rows = height - top < kBlockSize ? height - top : kBlockSize;
+  size_t pixel = static_cast<size_t>(top) * static_cast<size_t>(width) + static_cast<size_t>(left);
+  for (int row = 0; row < rows; ++row, pixel += static_cast<size_t>(width)) {
+    const int lane = kBlockSize * row;
+    if (columns == kBlockSize) {  // of a length that the compiler knows
+      for (int i = 0; i < kBlockSize; ++i) visit(lane + i, pixel + static_cast<size_t>(i));
+    } else {
+      for (int i = 0; i < columns; ++i) visit(lane + i, pixel + static_cast<size_t>(i));
     }
-    if constexpr (kDepth) image.depth[(pixel + i) * image.depth_stride] = pixels.depth[lane + i];
   }
 }
 
@@ -142,91 +163,80 @@ SP_INLINE void write_block(const Image& image, const BlockState& state, int widt
                            int left, int top) {
   BlockPixels pixels;
   finish_block<kColor, kDepth>(image, state, pixels);
-  const int columns = width - left < kBlockSize ? width - left : kBlockSize;
-  const int rows = height - top < kBlockSize ? height - top : kBlockSize;
-  size_t pixel = static_cast<size_t>(top) * static_cast<size_t>(width) + static_cast<size_t>(left);
-  for (int row = 0; row < rows; ++row, pixel += static_cast<size_t>(width)) {
-    const int lane = kBlockSize * row;
-    if (columns == kBlockSize) {
-      write_row<kColor, kDepth>(image, pixels, lane, pixel, kBlockSize);
-    } else {
-      write_row<kColor, kDepth>(image, pixels, lane, pixel, columns);
+  for_each_pixel(width, height, left, top, [&](int lane, size_t pixel) {
+    image.alpha[pixel] = pixels.alpha[lane];
+    if constexpr (kColor) {
+      float* color = image.color + pixel * image.color_stride;
+      color[0] = pixels.red[lane];
+      color[1] = pixels.green[lane];
+      color[2] = pixels.blue[lane];
     }
-  }
-}
-
-// Pixel centres of the 16 lanes of a block, from its corner.
-struct LaneCentres {
-  F16 x, y;
-};
-
-SP_INLINE LaneCentres lane_centres() {
-  alignas(64) float x[kLanes], y[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
-    y[lane] = static_cast<float>(lane / kBlockSize) + 0.5f;
-  }
-  return {load(x), load(y)};
+    if constexpr (kDepth) image.depth[pixel * image.depth_stride] = pixels.depth[lane];
+  });
 }
 
 // 1 for pixels of block b of the tile that lie inside the image, else 0.
-SP_INLINE F16 ones_inside(const RasterInput& in, const LaneCentres& centres, int left, int top,
+SP_INLINE F16 ones_inside(int width, int height, const LaneCentres& centres, int left, int top,
                           int b) {
-  const int columns = in.width - left - kBlockSize * (b % 4);
-  const int rows = in.height - top - kBlockSize * (b / 4);
-  return zero_unless((centres.x < F16(static_cast<float>(columns))) &
-                         (centres.y < F16(static_cast<float>(rows))),
-                     F16(1.0f));
+  const int columns = width - left - kBlockSize * (b % 4);
+  const int rows = height - top - kBlockSize * (b / 4);
+  return zero_unless(
+      (centres.x < F16(static_cast<float>(columns))) & (centres.y < F16(static_cast<float>(rows))),
+      F16(1.0f));
 }
 
 template <bool kColor, bool kDepth>
-void raster_tile_channels(const RasterInput& in, int tile) {
+void raster_tile_channels(const RasterInput& in, const Image& image, const StageWriter* record,
+                          int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const LaneCentres centres = lane_centres();
   BlockState state[kBlocksPerTile];
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const F16 zero = F16(0.0f);
-    state[b] = {ones_inside(in, centres, left, top, b), zero, zero, zero, zero, zero};
+    state[b] = {
+        ones_inside(in.width, in.height, centres, left, top, b), zero, zero, zero, zero, zero};
     if (any(state[b].transmittance > zero)) inside |= 1u << b;
   }
 
   StagedTile staged;
   uint32_t live = inside;
-  const uint32_t end = in.tile_offsets[tile + 1];
+  const size_t end = in.tile_offsets[tile + 1];
   uint32_t stages = 0;
-  for (uint32_t begin = in.tile_offsets[tile]; begin < end && live; begin += kStageSize) {
-    if (in.transmittance && stages > 0) {
-      float* saved = in.transmittance + (in.later_stages[tile] + stages - 1) * kTileSize * kTileSize;
-      for (int b = 0; b < kBlocksPerTile; ++b) store(saved + kLanes * b, state[b].transmittance);
+  for (size_t begin = in.tile_offsets[tile]; begin < end && live; begin += kStageSize) {
+    if (record && stages > 0) {
+      const size_t saved = record->later_stages[tile] + stages - 1;
+      float* transmittance = record->transmittance + saved * kTileSize * kTileSize;
+      for (int b = 0; b < kBlocksPerTile; ++b) {
+        store(transmittance + kLanes * b, state[b].transmittance);
+      }
     }
     ++stages;
     const int count = end - begin < kStageSize ? static_cast<int>(end - begin) : kStageSize;
-    stage(in, begin, begin + count, static_cast<float>(left), static_cast<float>(top), staged);
+    stage(in, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
-      const F16 x = centres.x + F16(static_cast<float>(kBlockSize * (b % 4)));
-      const F16 y = centres.y + F16(static_cast<float>(kBlockSize * (b / 4)));
-      const bool open =
-          composite<kColor, kDepth>(staged, (count + 63) / 64, b, x, y, state[b]);
+      const LaneCentres pixel = block_centres(centres, b);
+      const bool open = composite<kColor, kDepth>(staged, (count + 63) / 64, b, pixel, state[b]);
       if (!open) live &= ~(1u << b);
     }
   }
-  if (in.stages_done) in.stages_done[tile] = stages;
+  if (record) record->stages_done[tile] = stages;
   for (uint32_t bits = inside; bits; bits &= bits - 1) {
     const int b = __builtin_ctz(bits);
-    write_block<kColor, kDepth>(in.image, state[b], in.width, in.height,
-                                left + kBlockSize * (b % 4), top + kBlockSize * (b / 4));
+    write_block<kColor, kDepth>(image, state[b], in.width, in.height, left + kBlockSize * (b % 4),
+                                top + kBlockSize * (b / 4));
   }
 }
 
-inline void raster_tile(const RasterInput& in, int tile) {
-  if (in.image.color && in.image.depth) {
-    raster_tile_channels<true, true>(in, tile);
-  } else if (in.image.color) {
-    raster_tile_channels<true, false>(in, tile);
+inline void raster_tile(const RasterInput& in, const Image& image, const StageWriter* record,
+                        int tile) {
+  if (image.color && image.depth) {
+    raster_tile_channels<true, true>(in, image, record, tile);
+  } else if (image.color) {
+    raster_tile_channels<true, false>(in, image, record, tile);
   } else {
-    raster_tile_channels<false, true>(in, tile);
+    raster_tile_channels<false, true>(in, image, record, tile);
   }
 }
 

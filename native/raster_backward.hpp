@@ -17,7 +17,8 @@ struct BlockRecord {
 };
 
 struct BlockBackward {
-  F16 x, y, transmittance;
+  LaneCentres pixel;
+  F16 transmittance;
   F16 red, green, blue, depth, alpha;  // dL/d of what the pixel shows
   F16 behind;
 };
@@ -34,15 +35,9 @@ static_assert(sizeof(BackwardScratch) <= kBackwardScratchBytes);
 SP_INLINE F16 load_pixels(const float* values, int stride, const RasterInput& in, int left,
                           int top) {
   alignas(64) float pixels[kLanes] = {};
-  const int columns = in.width - left < kBlockSize ? in.width - left : kBlockSize;
-  const int rows = in.height - top < kBlockSize ? in.height - top : kBlockSize;
-  for (int row = 0; row < rows; ++row) {
-    const size_t first = static_cast<size_t>(top + row) * static_cast<size_t>(in.width) +
-                         static_cast<size_t>(left);
-    for (int i = 0; i < columns; ++i) {
-      pixels[kBlockSize * row + i] = values[(first + i) * static_cast<size_t>(stride)];
-    }
-  }
+  for_each_pixel(in.width, in.height, left, top, [&](int lane, size_t pixel) {
+    pixels[lane] = values[pixel * static_cast<size_t>(stride)];
+  });
   return load(pixels);
 }
 
@@ -54,9 +49,9 @@ SP_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int lef
     block.red = load_pixels(g.color, g.stride, in, left, top);
     block.green = load_pixels(g.color + 1, g.stride, in, left, top);
     block.blue = load_pixels(g.color + 2, g.stride, in, left, top);
-    block.alpha = block.alpha - (block.red * F16(g.background[0]) +
-                                 (block.green * F16(g.background[1]) +
-                                  block.blue * F16(g.background[2])));
+    block.alpha =
+        block.alpha - (block.red * F16(g.background[0]) +
+                       (block.green * F16(g.background[1]) + block.blue * F16(g.background[2])));
   }
   if constexpr (kDepth) {
     block.depth = load_pixels(g.depth, g.stride, in, left, top);
@@ -81,7 +76,7 @@ SP_INLINE BlockRecord* replay(BackwardScratch& s, const Pair* pairs, int count, 
     for (uint32_t bits = touched; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
       BlockBackward& block = s.blocks[b];
-      const F16 alpha = alpha_at(splat, block.x, block.y);
+      const F16 alpha = alpha_at(splat, block.pixel.x, block.pixel.y);
       const F16 transmittance = block.transmittance;
       const F16 rest = transmittance * (F16(1.0f) - alpha);
       const Mask16 keep = rest > F16(kMinTransmittance);
@@ -108,7 +103,7 @@ SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
   for (uint32_t bits = touched; bits; bits &= bits - 1, ++record) {
     BlockBackward& block = blocks[__builtin_ctz(bits)];
     SP_EACH_REGISTER(k) {
-      const Register x = block.x.r[k], y = block.y.r[k];
+      const Register x = block.pixel.x.r[k], y = block.pixel.y.r[k];
       const Register alpha = record->alpha.r[k], weight = record->weight.r[k];
       const Register behind = block.behind.r[k];
       const Register u = splat.ux * x + (splat.uy * y + splat.u0);
@@ -148,62 +143,65 @@ SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
 }
 
 template <bool kColor, bool kDepth, bool kAbsolute>
-size_t raster_tile_backward_channels(const RasterInput& in, const ImageGradient& g, int tile,
-                                   BackwardScratch& s, PairGradient* gradients) {
+size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& record,
+                                     const ImageGradient& g, int tile, BackwardScratch& s,
+                                     PairGradient* gradients) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
-  const uint32_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
-  const uint32_t stages = in.stages_done[tile];
+  const size_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
+  const size_t stages = record.stages_done[tile];
   const LaneCentres centres = lane_centres();
   F16 inside[kBlocksPerTile];
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const int block_left = kBlockSize * (b % 4), block_top = kBlockSize * (b / 4);
-    inside[b] = ones_inside(in, centres, left, top, b);
-    s.blocks[b].x = centres.x + F16(static_cast<float>(block_left));
-    s.blocks[b].y = centres.y + F16(static_cast<float>(block_top));
+    inside[b] = ones_inside(in.width, in.height, centres, left, top, b);
+    s.blocks[b].pixel = block_centres(centres, b);
     load_block<kColor, kDepth>(in, g, left + block_left, top + block_top, s.blocks[b]);
   }
 
-  const uint32_t reached = first + stages * kStageSize < last ? first + stages * kStageSize : last;
-  for (uint32_t slot = reached; slot < last; ++slot) gradients[slot] = {};
+  const size_t reached = first + stages * kStageSize < last ? first + stages * kStageSize : last;
+  for (size_t slot = reached; slot < last; ++slot) gradients[slot] = {};
   size_t records = 0;
-  for (uint32_t stage = stages; stage-- > 0;) {
-    const uint32_t begin = first + stage * kStageSize;
+  for (size_t stage = stages; stage-- > 0;) {
+    const size_t begin = first + stage * kStageSize;
     const int count = static_cast<int>(last - begin < kStageSize ? last - begin : kStageSize);
     for (int i = 0; i < count; ++i) {
       const Pair* pair = in.pairs + begin + i;
       if (i + kPrefetchAhead < count) __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
-      s.splats[i] = in_tile(in.splats[pair->splat], static_cast<float>(left),
-                            static_cast<float>(top));
+      s.splats[i] =
+          in_tile(in.splats[pair->splat], static_cast<float>(left), static_cast<float>(top));
     }
     uint32_t live = 0;
     for (int b = 0; b < kBlocksPerTile; ++b) {
-      const size_t saved = stage ? in.later_stages[tile] + stage - 1 : 0;
+      const size_t saved = stage ? record.later_stages[tile] + stage - 1 : 0;
       s.blocks[b].transmittance =
-          stage ? load(in.transmittance + (saved * kBlocksPerTile + b) * kLanes) : inside[b];
+          stage ? load(record.transmittance + (saved * kBlocksPerTile + b) * kLanes) : inside[b];
       if (any(s.blocks[b].transmittance > F16(kMinTransmittance))) live |= 1u << b;
     }
-    const BlockRecord* record = replay(s, in.pairs + begin, count, live);
-    records += static_cast<size_t>(record - s.records);
+    const BlockRecord* block_record = replay(s, in.pairs + begin, count, live);
+    records += static_cast<size_t>(block_record - s.records);
     for (int i = count; i-- > 0;) {
-      record -= __builtin_popcount(s.touched[i]);
-      backward_pair<kColor, kDepth, kAbsolute>(s.splats[i], s.touched[i], record, s.blocks,
+      block_record -= __builtin_popcount(s.touched[i]);
+      backward_pair<kColor, kDepth, kAbsolute>(s.splats[i], s.touched[i], block_record, s.blocks,
                                                gradients[begin + i]);
     }
   }
   return records;
 }
 
-inline size_t raster_tile_backward(const RasterInput& in, const ImageGradient& g, int tile,
-                                   void* scratch, PairGradient* gradients) {
+inline size_t raster_tile_backward(const RasterInput& in, const StageReader& record,
+                                   const ImageGradient& g, int tile, void* scratch,
+                                   PairGradient* gradients) {
   BackwardScratch& s = *static_cast<BackwardScratch*>(scratch);
   const auto run = [&]<bool kAbsolute>() {
     if (g.color && g.depth) {
-      return raster_tile_backward_channels<true, true, kAbsolute>(in, g, tile, s, gradients);
+      return raster_tile_backward_channels<true, true, kAbsolute>(in, record, g, tile, s,
+                                                                  gradients);
     }
     if (g.color) {
-      return raster_tile_backward_channels<true, false, kAbsolute>(in, g, tile, s, gradients);
+      return raster_tile_backward_channels<true, false, kAbsolute>(in, record, g, tile, s,
+                                                                   gradients);
     }
-    return raster_tile_backward_channels<false, true, kAbsolute>(in, g, tile, s, gradients);
+    return raster_tile_backward_channels<false, true, kAbsolute>(in, record, g, tile, s, gradients);
   };
   return g.absolute ? run.operator()<true>() : run.operator()<false>();
 }
@@ -230,7 +228,13 @@ inline void gather_gradients(const Splat* splats, size_t count, const PairRange*
     const Splat& s = splats[i];
     gradients[i] = {{two_ln2 * (s.ux * t[1]), two_ln2 * (s.uy * t[1] + s.vy * t[2])},
                     {two_ln2 * (s.ux * t[10]), two_ln2 * t[11]},
-                    t[0], t[3], t[4], t[5], {t[6], t[7], t[8]}, t[9], {}};
+                    t[0],
+                    t[3],
+                    t[4],
+                    t[5],
+                    {t[6], t[7], t[8]},
+                    t[9],
+                    {}};
   }
 }
 

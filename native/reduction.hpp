@@ -7,9 +7,9 @@ namespace splatpilot::SIMD_LEVEL {
 
 // Halves of 128-bit lanes: (a0 + a2, a1 + a3, b0 + b2, b1 + b3) of each, then the sums of two such.
 #if defined(__AVX512F__)
-#define SP_SHUFFLE_LANES(a, b, i, j, k, l)                                                   \
-  __builtin_shufflevector(a, b, i, j, 16 + k, 16 + l, 4 + i, 4 + j, 20 + k, 20 + l, 8 + i, \
-                          8 + j, 24 + k, 24 + l, 12 + i, 12 + j, 28 + k, 28 + l)
+#define SP_SHUFFLE_LANES(a, b, i, j, k, l)                                                        \
+  __builtin_shufflevector(a, b, i, j, 16 + k, 16 + l, 4 + i, 4 + j, 20 + k, 20 + l, 8 + i, 8 + j, \
+                          24 + k, 24 + l, 12 + i, 12 + j, 28 + k, 28 + l)
 #elif defined(__AVX2__)
 #define SP_SHUFFLE_LANES(a, b, i, j, k, l) \
   __builtin_shufflevector(a, b, i, j, 8 + k, 8 + l, 4 + i, 4 + j, 12 + k, 12 + l)
@@ -51,6 +51,15 @@ SP_INLINE void sum_lanes(const Register a[16], float sums[16]) {
                                     fold_halves(folded[k][2], folded[k][3]));
     std::memcpy(sums + k * kRegisterLanes, &sum, kRegisterBytes);
   }
+}
+
+SP_INLINE void sum_lanes(const F16 a[16], float sums[16]) {
+  Register whole[16];
+  for (int i = 0; i < 16; ++i) {
+    whole[i] = a[i].r[0];
+    for (int k = 1; k < kRegisters; ++k) whole[i] += a[i].r[k];
+  }
+  sum_lanes(whole, sums);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -30,14 +30,13 @@ void zero_rows(float* values, size_t columns, size_t begin, size_t end) {
 size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
                                  SplatGradient* gradients, float* means2d) {
   std::atomic<size_t> composited{0};
-  RasterInput input = raster_input(frame);
-  input.later_stages = frame.later_stages.data();
-  input.transmittance = const_cast<float*>(frame.transmittance.data());
-  input.stages_done = const_cast<uint32_t*>(frame.stages_done.data());
+  const RasterInput input = raster_input(frame);
+  const StageReader record{frame.later_stages.data(), frame.transmittance.data(),
+                           frame.stages_done.data()};
   lap();
   if (pair_gradients_.size() < frame.pairs.size()) pair_gradients_.resize(frame.pairs.size());
   pool_.for_each(frame.stages_done.size(), [&](size_t tile) {
-    composited += kernels_.raster_tile_backward(input, image, static_cast<int>(tile),
+    composited += kernels_.raster_tile_backward(input, record, image, static_cast<int>(tile),
                                                 thread_scratch(), pair_gradients_.data());
   });
   seconds_.raster_backward = lap();

@@ -1,8 +1,9 @@
 #!/bin/sh
-# Builds the native module with AddressSanitizer and UndefinedBehaviorSanitizer and runs the splat
-# tests against it, beside the installed one:
+# Builds the native module with AddressSanitizer and UndefinedBehaviorSanitizer and runs the tests
+# of its kernels against it, each kernel at each SIMD level, beside the installed one; a process per
+# test file, as many at a time as there are cores:
 #
-#     native/sanitize.sh [python] [pytest arguments]
+#     native/sanitize.sh [python] [test files]
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 python=${1:-$root/.venv/bin/python}
@@ -14,19 +15,23 @@ build=$root/build/sanitize
   -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" \
   -DCMAKE_CXX_FLAGS="-O1 -g1 -fsanitize=address,undefined -fno-sanitize-recover=all"
 "$python" -m cmake --build "$build"
-# The interpreter is not instrumented: the run-time library goes first, leaks are Python's own, and
+
+# The tests that run native code; others only wrap what these run.
+if [ $# -eq 0 ]; then
+  for name in rasterization_gradients surfels rasterization rasterization_unscented baked_scene; do
+    set -- "$@" "tests/systems/splats/test_$name.py"
+  done
+  set -- "$@" tests/training/reconstruction/test_losses.py
+fi
 # splatpilot._native comes from the build folder. pytest must not swallow the report (-s).
-cd "$root"
-LD_PRELOAD="$(${CXX:-c++} -print-file-name=libasan.so) $(${CXX:-c++} -print-file-name=libstdc++.so)" \
-ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH="$build" \
-"$python" - "$@" <<'END'
+program='
 import importlib.util
 import sys
 from pathlib import Path
 
 import pytest
 
-library = next(Path(sys.path[1] if sys.path[0] == "" else sys.path[0]).glob("_native*.so"))
+library = next(Path(sys.argv[1]).glob("_native*.so"))
 spec = importlib.util.spec_from_file_location("splatpilot._native", library)
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
@@ -34,6 +39,12 @@ sys.modules["splatpilot._native"] = module
 import splatpilot
 
 splatpilot._native = module
-print("sanitized:", module.__file__)
-sys.exit(pytest.main([*(sys.argv[1:] or ["tests/systems/splats"]), "-s"]))
-END
+print("sanitized:", module.__file__, flush=True)
+sys.exit(pytest.main(["-q", "-s", *sys.argv[2:]]))
+'
+# The interpreter is not instrumented: the run-time library goes first, and leaks are its own.
+cd "$root"
+printf '%s\n' "$@" | xargs -n 1 -P "$(nproc)" env \
+  LD_PRELOAD="$(${CXX:-c++} -print-file-name=libasan.so) $(${CXX:-c++} -print-file-name=libstdc++.so)" \
+  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 "$python" -c "$program" "$build"
+echo "sanitized: every test passed"

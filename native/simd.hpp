@@ -74,11 +74,11 @@ SP_INLINE void store(float* p, const F16& a) {
   SP_EACH_REGISTER(k) std::memcpy(p + k * kRegisterLanes, &a.r[k], kRegisterBytes);
 }
 
-#define SP_BINARY(op)                                         \
+#define SP_BINARY(op)                                     \
   SP_INLINE F16 operator op(const F16& a, const F16& b) { \
-    F16 c;                                           \
-    SP_EACH_REGISTER(k) c.r[k] = a.r[k] op b.r[k];            \
-    return c;                                                 \
+    F16 c;                                                \
+    SP_EACH_REGISTER(k) c.r[k] = a.r[k] op b.r[k];        \
+    return c;                                             \
   }
 SP_BINARY(+)
 SP_BINARY(-)
@@ -195,16 +195,16 @@ SP_INLINE F16 to_float(const I16& a) {
 }
 
 #if defined(__AVX512F__)
-#define SP_COMPARE(name, op, predicate)                   \
-  SP_INLINE Mask16 name(const F16& a, const F16& b) { \
+#define SP_COMPARE(name, op, predicate)                     \
+  SP_INLINE Mask16 name(const F16& a, const F16& b) {       \
     return {_mm512_cmp_ps_mask(a.r[0], b.r[0], predicate)}; \
   }
 #else
-#define SP_COMPARE(name, op, predicate)                   \
+#define SP_COMPARE(name, op, predicate)               \
   SP_INLINE Mask16 name(const F16& a, const F16& b) { \
-    Mask16 m;                                             \
-    SP_EACH_REGISTER(k) m.r[k] = a.r[k] op b.r[k];        \
-    return m;                                             \
+    Mask16 m;                                         \
+    SP_EACH_REGISTER(k) m.r[k] = a.r[k] op b.r[k];    \
+    return m;                                         \
   }
 #endif
 SP_COMPARE(operator>, >, _CMP_GT_OQ)
@@ -231,6 +231,20 @@ SP_INLINE F16 zero_unless(const Mask16& m, const F16& a) {
   I16 b = bits_of(a);
   SP_EACH_REGISTER(k) b.r[k] &= m.r[k];
   c = float_from_bits(b);
+#endif
+  return c;
+}
+
+// Lane by lane, a where m is true, else b.
+SP_INLINE F16 select(const Mask16& m, const F16& a, const F16& b) {
+  F16 c;
+#if defined(__AVX512F__)
+  c.r[0] = _mm512_mask_mov_ps(b.r[0], m.bits, a.r[0]);
+#else
+  SP_EACH_REGISTER(k) {
+    c.r[k] = reinterpret_cast<FloatRegister>((reinterpret_cast<IntRegister>(a.r[k]) & m.r[k]) |
+                                             (reinterpret_cast<IntRegister>(b.r[k]) & ~m.r[k]));
+  }
 #endif
   return c;
 }

@@ -1,100 +1,93 @@
-// Python bindings of the surfel renderer. Arguments are checked in Python, where errors can name
-// tensors; here only what memory safety needs is checked again.
+// Python bindings of the renderer of surfels.
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
 
 #include <algorithm>
 #include <cmath>
 #include <optional>
+#include <tuple>
 
 #include "bindings.hpp"
-#include "surfels.hpp"
 
 namespace splatpilot {
 namespace {
 
 using namespace nb::literals;
 
-template <typename... Shape>
-using Sums = nb::ndarray<float, Shape..., nb::c_contig, nb::device::cpu>;
-using Plane = Output;
-using ConstPlane = std::optional<Floats<nb::ndim<3>>>;
+struct RenderedSurfels {
+  std::shared_ptr<const SurfelFrame> frame;
+};
 
-template <typename Image>
-auto* plane(const Image& image, const Camera& camera, size_t channels) {
-  require(image.shape(0) == static_cast<size_t>(camera.height) &&
-              image.shape(1) == static_cast<size_t>(camera.width) && image.shape(2) == channels,
-          "an image has the wrong shape");
+template <typename Array>
+auto* plane(const Array& image, const Camera& camera, size_t channels) {
+  check_size(image, camera, channels);
   return image.data();
 }
 
-const float* optional_plane(const ConstPlane& image, const Camera& camera, size_t channels) {
+template <typename Array>
+auto* plane(const std::optional<Array>& image, const Camera& camera, size_t channels) {
   return image ? plane(*image, camera, channels) : nullptr;
 }
 
-void render(SurfelRenderer& renderer, Means means, Quats quats, Means scales,
-            Opacities opacities, Colors colors, int sh_degree,
-            Doubles<nb::shape<3, 3>> K, Doubles<nb::shape<4, 4>> X_CW,
-            int width, int height, double near_plane, double far_plane, double radius_clip,
-            Plane color, Plane normal, Plane depth, Plane alpha, Plane median,
-            std::optional<Plane> distort, bool record) {
-  const GaussianArrays surfels = gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip,
-                                    kBlobVariance);
-  const SurfelImages<float> images{
-      plane(color, camera, 3), plane(normal, camera, 3), plane(depth, camera, 1),
-      plane(alpha, camera, 1), plane(median, camera, 1),
-      distort ? plane(*distort, camera, 1) : nullptr};
-  const nb::gil_scoped_release release;
-  const std::scoped_lock lock(renderer.mutex());
-  renderer.render(surfels, camera, images, record);
+RenderedSurfels render(Renderer& renderer, const Means& means, const Quats& quats,
+                       const Means& scales, const Opacities& opacities, const Colors& colors,
+                       int sh_degree, const Intrinsics& K, const Pose& X_CW, int width, int height,
+                       double near_plane, double far_plane, double radius_clip, const Output& color,
+                       const Output& normal, const Output& depth, const Output& alpha,
+                       const Output& median, const std::optional<Output>& distort, bool keep) {
+  const GaussianArrays surfels =
+      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
+  const Camera camera =
+      camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, kBlobVariance);
+  const SurfelImages<float> images{plane(color, camera, 3),  plane(normal, camera, 3),
+                                   plane(depth, camera, 1),  plane(alpha, camera, 1),
+                                   plane(median, camera, 1), plane(distort, camera, 1)};
+  const Exclusive use(renderer);
+  return {renderer.render_surfels(surfels, camera, images, keep)};
 }
 
-// Adds to the arrays of gradients; returns that of the camera as (5, 3): R, t and the centre.
-nb::ndarray<nb::numpy, double> backward(
-    SurfelRenderer& renderer, Means means, Quats quats, Means scales,
-    Opacities opacities, Colors colors, int sh_degree, ConstPlane color,
-    ConstPlane normal, ConstPlane depth, ConstPlane alpha, ConstPlane median, ConstPlane distort,
-    Sums<nb::ndim<2>> by_means, Sums<nb::ndim<2>> by_quats,
-    Sums<nb::ndim<2>> by_scales, Sums<nb::ndim<1>> by_opacities, Plane by_colors) {
-  const GaussianArrays surfels = gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  require(by_means.size() == means.size() && by_quats.size() == quats.size() &&
-              by_scales.size() == scales.size() && by_opacities.size() == opacities.size() &&
-              by_colors.size() == colors.size(),
-          "arrays of gradients have the wrong shape");
-  const auto by_camera_rows = new_array<double>({5, 3});
-  double* values = by_camera_rows.data();
+OwnedArray<double, 5, 3> backward(
+    Renderer& renderer, const RenderedSurfels& rendered, const Means& means, const Quats& quats,
+    const Means& scales, const Opacities& opacities, const Colors& colors, int sh_degree,
+    const std::optional<Pixels>& v_color, const std::optional<Pixels>& v_normal,
+    const std::optional<Pixels>& v_depth, const std::optional<Pixels>& v_alpha,
+    const std::optional<Pixels>& v_median, const std::optional<Pixels>& v_distort,
+    const Rows3& v_means, const Rows4& v_quats, const Rows3& v_scales,
+    const Writable<nb::ndim<1>>& v_opacities, const ColorRows& v_colors) {
+  const Frame& frame = rendered.frame->bounds;
+  require(frame.kept, "the frame was not kept for a backward pass");
+  const GaussianArrays surfels =
+      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
+  require(surfels.count == frame.gaussians, "these are not the surfels of the frame");
+  require_rows(surfels, v_means, v_quats, v_scales, v_opacities, v_colors);
+  const Camera& camera = frame.camera;
+  const SurfelImages<const float> gradients{
+      plane(v_color, camera, 3), plane(v_normal, camera, 3), plane(v_depth, camera, 1),
+      plane(v_alpha, camera, 1), plane(v_median, camera, 1), plane(v_distort, camera, 1)};
+  CameraGradient by_camera;
   {
-    const nb::gil_scoped_release release;
-    const std::scoped_lock lock(renderer.mutex());
-    const auto frame = renderer.frame();
-    require(frame && frame->gaussians == surfels.count, "not the surfels of the last frame");
-    const Camera& camera = frame->camera;
-    const SurfelImages<const float> gradients{
-        optional_plane(color, camera, 3), optional_plane(normal, camera, 3),
-        optional_plane(depth, camera, 1), optional_plane(alpha, camera, 1),
-        optional_plane(median, camera, 1), optional_plane(distort, camera, 1)};
-    const CameraGradient by_camera = renderer.backward(
-        surfels, gradients,
-        {by_means.data(), by_quats.data(), by_scales.data(), by_opacities.data(),
-         by_colors.data()});
-    std::copy_n(by_camera.R, 9, values);
-    std::copy_n(by_camera.t, 3, values + 9);
-    std::copy_n(by_camera.centre, 3, values + 12);
+    const Exclusive use(renderer);
+    by_camera = renderer.surfels_backward(
+        *rendered.frame, surfels, gradients,
+        {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data()});
   }
-  return by_camera_rows;
+  const auto rows = new_array<double, 5, 3>();
+  std::copy_n(by_camera.R, 9, rows.data());
+  std::copy_n(by_camera.t, 3, rows.data() + 9);
+  std::copy_n(by_camera.centre, 3, rows.data() + 12);
+  return rows;
 }
 
-// ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of the last
-// frame, in the order of the input.
-nb::tuple projected(SurfelRenderer& renderer) {
-  const std::scoped_lock lock(renderer.mutex());
-  const size_t n = renderer.splat_count();
-  const auto ids = new_array<int64_t>({n});
-  const auto radii = new_array<int32_t>({n, 2});
-  const auto means = new_array<float>({n, 2}), normals = new_array<float>({n, 3});
-  const auto depths = new_array<float>({n});
-  renderer.for_each_surfel([&](size_t i, const Splat& bounds, const Surfel& s) {
+auto projected(Renderer& renderer, const RenderedSurfels& rendered) {
+  const SurfelFrame& frame = *rendered.frame;
+  const size_t n = frame.bounds.splat_count();
+  const auto ids = new_array<int64_t, -1>(n);
+  const auto radii = new_array<int32_t, -1, 2>(n);
+  const auto means = new_array<float, -1, 2>(n);
+  const auto depths = new_array<float, -1>(n);
+  const auto normals = new_array<float, -1, 3>(n);
+  const auto write = [&](size_t i, const Splat& bounds) {
+    const Surfel& s = frame.surfels[static_cast<size_t>(&bounds - frame.bounds.splats.data())];
     ids.data()[i] = bounds.index;
     const float radius = disc_of(bounds).radius;
     const float reach_x = std::abs(bounds.mean_x - s.mean[0]) + bounds.extent_x;
@@ -104,32 +97,33 @@ nb::tuple projected(SurfelRenderer& renderer) {
     std::copy_n(s.mean, 2, means.data() + 2 * i);
     depths.data()[i] = s.depth;
     std::copy_n(s.normal, 3, normals.data() + 3 * i);
-  });
-  return nb::make_tuple(ids, radii, means, depths, normals);
+  };
+  {
+    const Exclusive use(renderer);
+    renderer.for_each_splat(frame.bounds, write);
+  }
+  return std::make_tuple(ids, radii, means, depths, normals);
 }
 
 }  // namespace
 
 void bind_surfels(nb::module_& m) {
-  nb::class_<SurfelRenderer, Renderer>(m, "SurfelRenderer", "A Renderer of surfels.")
-      .def(
-          "__init__",
-          [](SurfelRenderer* self, int threads, const std::string& simd) {
-            require(threads >= 1 && threads <= 1024, "threads must lie between 1 and 1024");
-            new (self) SurfelRenderer(threads, simd);
-          },
-          "threads"_a, "simd"_a = "")
-      .def_prop_ro("pair_count", &SurfelRenderer::pair_count,
-                   "(surfel, tile) pairs of the last frame.")
-      .def("projected", &projected)
-      .def("render", &render, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a,
-           "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a, "near_plane"_a, "far_plane"_a,
-           "radius_clip"_a, "color"_a, "normal"_a, "depth"_a, "alpha"_a, "median"_a,
-           "distort"_a.none(), "record"_a)
-      .def("backward", &backward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a,
-           "sh_degree"_a, "color"_a.none(), "normal"_a.none(), "depth"_a.none(), "alpha"_a.none(),
-           "median"_a.none(), "distort"_a.none(), "by_means"_a, "by_quats"_a, "by_scales"_a,
-           "by_opacities"_a, "by_colors"_a);
+  nb::class_<RenderedSurfels>(m, "SurfelFrame", "What remains of a rendered image of surfels.");
+  m.def("render_surfels", &render, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a, "scales"_a,
+        "opacities"_a, "colors"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
+        "near_plane"_a, "far_plane"_a, "radius_clip"_a, "color"_a, "normal"_a, "depth"_a, "alpha"_a,
+        "median"_a, "distort"_a.none(), "keep"_a,
+        "Writes images; with keep, a backward pass can start from the frame.");
+  m.def(
+      "surfels_backward", &backward, "renderer"_a, "frame"_a, nb::kw_only(), "means"_a, "quats"_a,
+      "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a, "v_color"_a.none(), "v_normal"_a.none(),
+      "v_depth"_a.none(), "v_alpha"_a.none(), "v_median"_a.none(), "v_distort"_a.none(),
+      "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
+      "Adds to the gradients of the frame's surfels. Returns (5, 3) those of the camera: by R_CW,\n"
+      "by t_CW and by the camera's centre.");
+  m.def("projected_surfels", &projected, "renderer"_a, "frame"_a,
+        "ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of a\n"
+        "frame's surfels, in the order of the input.");
 }
 
 }  // namespace splatpilot

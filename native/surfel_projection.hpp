@@ -4,7 +4,6 @@
 
 #include "doubles.hpp"
 #include "project_arrays.hpp"
-#include "surfel_lanes.hpp"
 #include "surfel_types.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
@@ -15,16 +14,6 @@ struct DoubleVector16 {
 
 SP_INLINE Vector16 to_float(const DoubleVector16& a) {
   return {to_float(a.x), to_float(a.y), to_float(a.z)};
-}
-
-template <typename Vector>
-SP_INLINE Vector cross(const Vector& a, const Vector& b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
-
-SP_INLINE Vector16 scaled(const Vector16& a, const F16& s) { return {a.x * s, a.y * s, a.z * s}; }
-SP_INLINE Vector16 sum(const Vector16& a, const Vector16& b) {
-  return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
 
 SP_INLINE DoubleVector16 to_camera(const Camera& camera, const DoubleVector16& d_W) {
@@ -55,7 +44,7 @@ struct SurfelPlane {
   F16 facing;                // n . p
   F16 inverse_facing;
   Vector16 u, v, w;
-  F16 mean[2], rest[2];      // the centre's pixel is their sum [px]
+  F16 mean[2], rest[2];  // the centre's pixel is their sum [px]
   Mask16 edge_on;
 };
 
@@ -65,9 +54,9 @@ SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians
   DoubleVector16 t_W[2];
   surfel_tangents(in.quat, t_W);
   const DoubleVector16 t[2] = {to_camera(camera, t_W[0]), to_camera(camera, t_W[1])};
-  const DoubleVector16 p = to_camera(camera, {from_centre(camera, in.mean.x, 0),
-                                              from_centre(camera, in.mean.y, 1),
-                                              from_centre(camera, in.mean.z, 2)});
+  const DoubleVector16 p =
+      to_camera(camera, {from_centre(camera, in.mean.x, 0), from_centre(camera, in.mean.y, 1),
+                         from_centre(camera, in.mean.z, 2)});
   const DoubleVector16 n = cross(t[0], t[1]);
   SurfelPlane s;
   s.p = to_float(p);
@@ -78,9 +67,9 @@ SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians
   s.facing = to_float(n.x * p.x + (n.y * p.y + n.z * p.z));
   s.edge_on = s.facing * s.facing <= F16(kEdgeOn * kEdgeOn) * dot(s.p, s.p);
   s.inverse_facing = F16(1.0f) / select(s.edge_on, F16(1.0f), s.facing);
-  s.u = scaled(to_float(cross(t[1], p)), s.inverse_facing / in.scale[0]);
-  s.v = scaled(to_float(cross(p, t[0])), s.inverse_facing / in.scale[1]);
-  s.w = scaled(s.t[2], s.inverse_facing);
+  s.u = (s.inverse_facing / in.scale[0]) * to_float(cross(t[1], p));
+  s.v = (s.inverse_facing / in.scale[1]) * to_float(cross(p, t[0]));
+  s.w = s.inverse_facing * s.t[2];
   const D16 inverse_z = D16(1.0) / p.z;
   const D16 mean[2] = {D16(camera.fx) * (p.x * inverse_z) + D16(camera.cx),
                        D16(camera.fy) * (p.y * inverse_z) + D16(camera.cy)};
@@ -183,8 +172,8 @@ inline size_t cull_surfels(const GaussianArrays& g, const Camera& camera, size_t
     const F16 largest_scale = max(load(soa[3]), load(soa[4]));
     Mask16 visible = in_depth_range(camera, p_C.z);
     for (int side = 0; side < 4; ++side) {
-      visible = visible & (dot(camera.side_normal[side], p_C) + F16(reach[side]) * largest_scale >
-                           F16(0.0f));
+      visible = visible &
+                (dot(camera.side_normal[side], p_C) + F16(reach[side]) * largest_scale > F16(0.0f));
     }
     for (uint32_t bits = lane_bits(visible) & ((1u << lanes) - 1); bits; bits &= bits - 1) {
       candidates[count++] = static_cast<uint32_t>(first) + __builtin_ctz(bits);
@@ -208,8 +197,7 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
     SplatPack pack;
     F16 disc[3], color[3];
-    uint32_t bits =
-        lane_bits(surfel_bounds(camera, s, in.scale, log2_opacity, pack, disc[2]));
+    uint32_t bits = lane_bits(surfel_bounds(camera, s, in.scale, log2_opacity, pack, disc[2]));
     if (candidate_count - first < kLanes) bits &= (1u << (candidate_count - first)) - 1;
     if (!bits) continue;
     gather_colors(g, indices, bits, d_W, color);
@@ -227,11 +215,25 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
       rows[i][2] = -(rows[i][0] * s.rest[0] + rows[i][1] * s.rest[1]);
     }
     rows[2][2] = select(s.edge_on, -one, rows[2][2] + one / s.p.z);
-    const F16 fields[kSurfelFields] = {
-        s.mean[0],  s.mean[1],  rows[0][0],         rows[0][1],         rows[0][2],
-        rows[1][0], rows[1][1], rows[1][2],         rows[2][0],         rows[2][1],
-        rows[2][2], s.p.z,      log2_opacity,       color[0],           color[1],
-        color[2],   towards * s.t_W[2].x, towards * s.t_W[2].y, towards * s.t_W[2].z};
+    const F16 fields[kSurfelFields] = {s.mean[0],
+                                       s.mean[1],
+                                       rows[0][0],
+                                       rows[0][1],
+                                       rows[0][2],
+                                       rows[1][0],
+                                       rows[1][1],
+                                       rows[1][2],
+                                       rows[2][0],
+                                       rows[2][1],
+                                       rows[2][2],
+                                       s.p.z,
+                                       log2_opacity,
+                                       color[0],
+                                       color[1],
+                                       color[2],
+                                       towards * s.t_W[2].x,
+                                       towards * s.t_W[2].y,
+                                       towards * s.t_W[2].z};
     alignas(64) float soa[kSurfelFields][kLanes];
     for (int f = 0; f < kSurfelFields; ++f) store(soa[f], fields[f]);
     size_t next = count;

@@ -22,8 +22,8 @@ SP_INLINE Vector16 zero_unless(const Mask16& m, const Vector16& a) {
 // its rotation matrix.
 SP_INLINE void quaternion_gradient(const F16 raw[4], const Vector16& a, const Vector16& b,
                                    F16 gradient[4]) {
-  const F16 inverse_norm = F16(1.0f) / sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] +
-                                            raw[3] * raw[3]);
+  const F16 inverse_norm =
+      F16(1.0f) / sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] + raw[3] * raw[3]);
   const F16 two = F16(2.0f);
   const F16 w = raw[0] * inverse_norm, x = raw[1] * inverse_norm, y = raw[2] * inverse_norm,
             z = raw[3] * inverse_norm;
@@ -54,23 +54,22 @@ SP_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& 
     A[k] = {scale[k] * (s.t[k].x - s.p.x * inverse_z * s.t[k].z),
             scale[k] * (s.t[k].y - s.p.y * inverse_z * s.t[k].z), zero};
   }
-  const Vector16 by_u0 = sum(scaled(A[0], g[0]), scaled(A[1], g[1]));
-  const Vector16 by_v0 = sum(scaled(A[0], g[2]), scaled(A[1], g[3]));
-  const Vector16 by_w = sum(scaled(A[0], g[4]), scaled(A[1], g[5]));
+  const Vector16 by_u0 = g[0] * A[0] + g[1] * A[1];
+  const Vector16 by_v0 = g[2] * A[0] + g[3] * A[1];
+  const Vector16 by_w = g[4] * A[0] + g[5] * A[1];
   // Derivatives with respect to the logarithms of common factors; w . A[k] is -scale t.z / p.z.
   const F16 by_log_u = g[0], by_log_v = g[3];
-  const F16 by_log_w =
-      -((g[4] * scale[0] * s.t[0].z + g[5] * scale[1] * s.t[1].z) * inverse_z);
+  const F16 by_log_w = -((g[4] * scale[0] * s.t[0].z + g[5] * scale[1] * s.t[1].z) * inverse_z);
   const F16 u_factor = s.inverse_facing * inverse_s0, v_factor = s.inverse_facing * inverse_s1;
-  const Vector16 by_u = scaled(by_u0, u_factor);  // of t1 x p
-  const Vector16 by_v = scaled(by_v0, v_factor);  // of p x t0
+  const Vector16 by_u = u_factor * by_u0;  // of t1 x p
+  const Vector16 by_v = v_factor * by_v0;  // of p x t0
   const F16 by_facing = -((by_log_u + by_log_v + by_log_w) * s.inverse_facing);
-  const Vector16 by_n = sum(scaled(by_w, s.inverse_facing), scaled(s.p, by_facing));
+  const Vector16 by_n = s.inverse_facing * by_w + by_facing * s.p;
 
   PlaneGradient out;
-  out.p = sum(scaled(s.t[2], by_facing), sum(cross(by_u, s.t[1]), cross(s.t[0], by_v)));
-  out.t[0] = sum(cross(by_v, s.p), cross(s.t[1], by_n));
-  out.t[1] = sum(cross(s.p, by_u), cross(by_n, s.t[0]));
+  out.p = by_facing * s.t[2] + (cross(by_u, s.t[1]) + cross(s.t[0], by_v));
+  out.t[0] = cross(by_v, s.p) + cross(s.t[1], by_n);
+  out.t[1] = cross(s.p, by_u) + cross(by_n, s.t[0]);
   out.scale[0] = -(by_log_u * inverse_s0);
   out.scale[1] = -(by_log_v * inverse_s1);
   // No ray meets a surfel seen edge-on.
@@ -82,7 +81,7 @@ SP_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& 
   }
 
   const F16 by_x = g[6] * F16(camera.fx) * inverse_z, by_y = g[7] * F16(camera.fy) * inverse_z;
-  out.p = sum(out.p, {by_x, by_y, g[8] - (by_x * s.p.x + by_y * s.p.y) * inverse_z});
+  out.p = out.p + Vector16{by_x, by_y, g[8] - (by_x * s.p.x + by_y * s.p.y) * inverse_z};
   return out;
 }
 
@@ -123,8 +122,8 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     const F16 one = F16(1.0f), zero = F16(0.0f);
     const F16 towards = select(s.facing > zero, -one, one);
     const Vector16 by_normal = {towards * g[13], towards * g[14], towards * g[15]};
-    const Vector16 by_t0 = sum(to_world(camera, by.t[0]), cross(t_W[1], by_normal));
-    const Vector16 by_t1 = sum(to_world(camera, by.t[1]), cross(by_normal, t_W[0]));
+    const Vector16 by_t0 = to_world(camera, by.t[0]) + cross(t_W[1], by_normal);
+    const Vector16 by_t1 = to_world(camera, by.t[1]) + cross(by_normal, t_W[0]);
     F16 by_color[3] = {g[10], g[11], g[12]};
     if (input.sh_degree >= 0) {
       // Colours held at zero do not follow their coefficients.
@@ -134,10 +133,10 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     }
     const Vector16 by_d =
         colors_backward(input, indices, static_cast<int>(lanes), d_W, by_color, out.colors);
-    const Vector16 by_p = sum(to_world(camera, by.p), by_d);
+    const Vector16 by_p = to_world(camera, by.p) + by_d;
 
-    F16 rows[10] = {by_p.x, by_p.y, by_p.z, zero, zero, zero, zero, by.scale[0], by.scale[1],
-                    g[9] / max(in.opacity, F16(1e-30f))};
+    F16 rows[10] = {by_p.x, by_p.y, by_p.z,      zero,        zero,
+                    zero,   zero,   by.scale[0], by.scale[1], g[9] / max(in.opacity, F16(1e-30f))};
     quaternion_gradient(in.quat, by_t0, by_t1, rows + 3);
     alignas(64) float fields[10][kLanes];
     for (int f = 0; f < 10; ++f) store(fields[f], rows[f]);
@@ -159,8 +158,8 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     const F16 by_centre[3] = {-by_d.x, -by_d.y, -by_d.z};
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) {
-        by_camera->R[3 * i + j] += masked_sum(
-            by_p_C[i] * p_W[j] + (by_t0_C[i] * t0_W[j] + by_t1_C[i] * t1_W[j]), bits);
+        by_camera->R[3 * i + j] +=
+            masked_sum(by_p_C[i] * p_W[j] + (by_t0_C[i] * t0_W[j] + by_t1_C[i] * t1_W[j]), bits);
       }
       by_camera->t[i] += masked_sum(by_p_C[i], bits);
       by_camera->centre[i] += masked_sum(by_centre[i], bits);

@@ -3,7 +3,6 @@
 
 #include "mathematics.hpp"
 #include "raster.hpp"
-#include "surfel_lanes.hpp"
 #include "surfel_types.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
@@ -13,10 +12,9 @@ struct alignas(64) StagedSurfels {
   uint64_t touching[kBlocksPerTile][kStageWords];
 };
 
-SP_INLINE void stage_surfels(const SurfelRasterInput& in, uint32_t begin, uint32_t end, float left,
+SP_INLINE void stage_surfels(const SurfelRasterInput& in, size_t begin, int count, float left,
                              float top, StagedSurfels& staged) {
   alignas(64) int32_t blocks[kStageSize];
-  const int count = static_cast<int>(end - begin);
   for (int i = 0; i < count; ++i) {
     const Pair* pair = in.pairs + begin + i;
     if (i + kPrefetchAhead < count) __builtin_prefetch(in.surfels + pair[kPrefetchAhead].splat);
@@ -29,34 +27,20 @@ SP_INLINE void stage_surfels(const SurfelRasterInput& in, uint32_t begin, uint32
   transpose_blocks(blocks, count, staged.touching);
 }
 
-// The pixel centres of block b of a tile.
-struct BlockLanes {
-  F16 x, y;
-};
-
-SP_INLINE BlockLanes block_lanes(int b) {
-  alignas(64) float x[kLanes], y[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    x[lane] = static_cast<float>(kBlockSize * (b % 4) + lane % kBlockSize) + 0.5f;
-    y[lane] = static_cast<float>(kBlockSize * (b / 4) + lane / kBlockSize) + 0.5f;
-  }
-  return {load(x), load(y)};
-}
-
 // How a surfel appears in 16 pixels.
 struct SurfelSample {
   F16 dx, dy;
-  F16 U, V;      // u . d and v . d of the surfel
-  F16 u, v;      // where the ray meets the plane, in standard deviations
-  F16 z;         // at which depth
-  Mask16 hit;    // whether that counts, or else the blob
+  F16 U, V;    // u . d and v . d of the surfel
+  F16 u, v;    // where the ray meets the plane, in standard deviations
+  F16 z;       // at which depth
+  Mask16 hit;  // whether that counts, or else the blob
   F16 r2, depth;
-  F16 alpha;     // 0 below the cut
+  F16 alpha;  // 0 below the cut
 };
 
 // alpha = o exp(-r2 / 2): r2 is the lesser of u^2 + v^2 on the surfel's plane and of the blob's
 // |d|^2 / kBlobVariance (the larger of the two Gaussians; Huang et al. 2024, equation 11).
-SP_INLINE SurfelSample sample_surfel(const Surfel& s, const BlockLanes& pixel,
+SP_INLINE SurfelSample sample_surfel(const Surfel& s, const LaneCentres& pixel,
                                      const F16& near_plane) {
   SurfelSample a;
   a.dx = pixel.x - F16(s.mean[0]);
@@ -85,9 +69,9 @@ struct SurfelBlockState {
 // Composites the staged surfels, of which the first has the index `first` in the tile; returns
 // whether any pixel is still open.
 template <bool kDistort, bool kRecord>
-SP_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b, float first,
-                                 const F16& near_plane, SurfelBlockState& state) {
-  const BlockLanes pixel = block_lanes(b);
+SP_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b,
+                                 const LaneCentres& pixel, float first, const F16& near_plane,
+                                 SurfelBlockState& state) {
   SurfelBlockState s = state;
   bool open = true;
   for (int word = 0; word < words && open; ++word) {
@@ -123,23 +107,11 @@ SP_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b, 
   return open;
 }
 
-// Calls move(lane, pixel) for the pixels of a block that are on the image.
-template <typename Move>
-SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Move& move) {
-  const int columns = width - left < kBlockSize ? width - left : kBlockSize;
-  const int rows = height - top < kBlockSize ? height - top : kBlockSize;
-  for (int row = 0; row < rows; ++row) {
-    const size_t pixel = static_cast<size_t>(top + row) * static_cast<size_t>(width) +
-                         static_cast<size_t>(left);
-    for (int i = 0; i < columns; ++i) move(kBlockSize * row + i, pixel + static_cast<size_t>(i));
-  }
-}
-
 SP_INLINE void write_surfel_block(const SurfelImages<float>& out, const SurfelBlockState& s,
                                   int width, int height, int left, int top) {
   alignas(64) float lanes[10][kLanes];
-  const F16* packs[10] = {s.color, s.color + 1, s.color + 2, s.normal, s.normal + 1,
-                          s.normal + 2, &s.depth, &s.alpha, &s.median, &s.distort};
+  const F16* packs[10] = {s.color,      s.color + 1, s.color + 2, s.normal,  s.normal + 1,
+                          s.normal + 2, &s.depth,    &s.alpha,    &s.median, &s.distort};
   for (int f = 0; f < 10; ++f) store(lanes[f], *packs[f]);
   for_each_pixel(width, height, left, top, [&](int lane, size_t pixel) {
     for (int c = 0; c < 3; ++c) out.color[3 * pixel + c] = lanes[c][lane];
@@ -153,34 +125,31 @@ SP_INLINE void write_surfel_block(const SurfelImages<float>& out, const SurfelBl
 }
 
 template <bool kDistort, bool kRecord>
-void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& out, int tile) {
+void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& out,
+                       SurfelBlockRecord* records, int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const F16 zero = F16(0.0f), one = F16(1.0f), near_plane = F16(in.near_plane);
+  const LaneCentres centres = lane_centres();
   SurfelBlockState state[kBlocksPerTile];
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
-    const BlockLanes pixel = block_lanes(b);
-    const Mask16 on_image = (pixel.x < F16(static_cast<float>(in.width - left))) &
-                            (pixel.y < F16(static_cast<float>(in.height - top)));
-    const F16 open = zero_unless(on_image, one);
-    state[b] = {open, {zero, zero, zero}, {zero, zero, zero}, zero, zero, zero, zero,
-                one,  zero,               -one};
-    if (any(on_image)) inside |= 1u << b;
+    const F16 open = ones_inside(in.width, in.height, centres, left, top, b);
+    state[b] = {open, {zero, zero, zero}, {zero, zero, zero}, zero, zero, zero, zero, one, zero,
+                -one};
+    if (any(open > zero)) inside |= 1u << b;
   }
 
   StagedSurfels staged;
   uint32_t live = inside;
-  const uint32_t start = in.tile_offsets[tile], end = in.tile_offsets[tile + 1];
-  for (uint32_t begin = start; begin < end && live; begin += kStageSize) {
+  const size_t start = in.tile_offsets[tile], end = in.tile_offsets[tile + 1];
+  for (size_t begin = start; begin < end && live; begin += kStageSize) {
     const int count = end - begin < kStageSize ? static_cast<int>(end - begin) : kStageSize;
-    stage_surfels(in, begin, begin + count, static_cast<float>(left), static_cast<float>(top),
-                  staged);
+    stage_surfels(in, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
-      const bool open =
-          composite_surfels<kDistort, kRecord>(staged, (count + 63) / 64, b,
-                                               static_cast<float>(begin - start), near_plane,
-                                               state[b]);
+      const bool open = composite_surfels<kDistort, kRecord>(
+          staged, (count + 63) / 64, b, block_centres(centres, b),
+          static_cast<float>(begin - start), near_plane, state[b]);
       if (!open) live &= ~(1u << b);
     }
   }
@@ -190,7 +159,7 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
     write_surfel_block(out, s, in.width, in.height, left + kBlockSize * (b % 4),
                        top + kBlockSize * (b / 4));
     if constexpr (kRecord) {
-      SurfelBlockRecord& record = in.records[kBlocksPerTile * tile + b];
+      SurfelBlockRecord& record = records[kBlocksPerTile * tile + b];
       store(record.transmittance, s.last_transmittance);
       store(record.passed, s.passed);
       store(record.median, s.median_index);
@@ -200,13 +169,14 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
   }
 }
 
-inline void raster_surfels(const SurfelRasterInput& in, const SurfelImages<float>& out, int tile) {
+inline void raster_surfels(const SurfelRasterInput& in, const SurfelImages<float>& out,
+                           SurfelBlockRecord* records, int tile) {
   if (out.distort) {
-    in.records ? raster_surfels_of<true, true>(in, out, tile)
-               : raster_surfels_of<true, false>(in, out, tile);
+    records ? raster_surfels_of<true, true>(in, out, records, tile)
+            : raster_surfels_of<true, false>(in, out, records, tile);
   } else {
-    in.records ? raster_surfels_of<false, true>(in, out, tile)
-               : raster_surfels_of<false, false>(in, out, tile);
+    records ? raster_surfels_of<false, true>(in, out, records, tile)
+            : raster_surfels_of<false, false>(in, out, records, tile);
   }
 }
 

@@ -2,6 +2,7 @@
 // touches, so that the sums over pixels are taken once per surfel and tile.
 #pragma once
 
+#include "reduction.hpp"
 #include "surfel_raster.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
@@ -10,9 +11,9 @@ namespace splatpilot::SIMD_LEVEL {
 struct BackwardBlock {
   F16 color[3], normal[3], depth, alpha, median, distort;
   F16 passed, median_index, all_alpha, all_depth;
-  F16 transmittance;                // behind the surfel at hand
-  F16 behind;                       // sum over surfels behind it of weight * gradient of weight
-  F16 alpha_behind, depth_behind;   // sums of weights and of weighted depths
+  F16 transmittance;               // behind the surfel at hand
+  F16 behind;                      // sum over surfels behind it of weight * gradient of weight
+  F16 alpha_behind, depth_behind;  // sums of weights and of weighted depths
 };
 
 SP_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
@@ -48,7 +49,7 @@ SP_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
 
 // Adds what 16 pixels give to the gradient of a surfel; fields as in SurfelGradient.
 template <bool kDistort>
-SP_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, const F16& index,
+SP_INLINE void accumulate_surfel(const Surfel& surfel, const LaneCentres& pixel, const F16& index,
                                  const F16& near_plane, BackwardBlock& block, F16 sums[16]) {
   const F16 zero = F16(0.0f), one = F16(1.0f);
   const SurfelSample a = sample_surfel(surfel, pixel, near_plane);
@@ -84,8 +85,7 @@ SP_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, 
   const F16 by_v = -(zero_unless(a.hit, by_exponent * a.v));
   // u = z U and v = z V with U, V and q = 1 / z linear in the pixel, so dL/dq is
   // -z^2 (dL/dz + U dL/du + V dL/dv).
-  const F16 by_q =
-      -(zero_unless(a.hit, a.z * (a.z * by_depth + (a.u * by_u + a.v * by_v))));
+  const F16 by_q = -(zero_unless(a.hit, a.z * (a.z * by_depth + (a.u * by_u + a.v * by_v))));
   const F16 by_U = zero_unless(a.hit, a.z * by_u), by_V = zero_unless(a.hit, a.z * by_v);
   // Masked, since a product of zero and an infinity is none.
   const F16 U = zero_unless(a.hit, a.U), V = zero_unless(a.hit, a.V);
@@ -109,23 +109,24 @@ SP_INLINE void accumulate_surfel(const Surfel& surfel, const BlockLanes& pixel, 
 }
 
 template <bool kDistort>
-void raster_surfels_backward_of(const SurfelRasterInput& in, const SurfelImages<const float>& g,
-                                int tile, const uint32_t* slots, SurfelGradient* out) {
+void raster_surfels_backward_of(const SurfelRasterInput& in, const SurfelBlockRecord* records,
+                                const SurfelImages<const float>& g, int tile, SurfelGradient* out) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const F16 near_plane = F16(in.near_plane), zero = F16(0.0f);
+  const LaneCentres centres = lane_centres();
   BackwardBlock blocks[kBlocksPerTile];
   float passed[kBlocksPerTile] = {};
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const int x = left + kBlockSize * (b % 4), y = top + kBlockSize * (b / 4);
     if (x >= in.width || y >= in.height) continue;
-    const SurfelBlockRecord& record = in.records[kBlocksPerTile * tile + b];
+    const SurfelBlockRecord& record = records[kBlocksPerTile * tile + b];
     blocks[b] = backward_block(in, g, record, x, y);
     for (int i = 0; i < kLanes; ++i) {
       if (record.passed[i] > passed[b]) passed[b] = record.passed[i];
     }
   }
-  const uint32_t start = in.tile_offsets[tile];
-  for (uint32_t i = in.tile_offsets[tile + 1]; i-- > start;) {
+  const size_t start = in.tile_offsets[tile];
+  for (size_t i = in.tile_offsets[tile + 1]; i-- > start;) {
     const Pair& pair = in.pairs[i];
     if (i >= start + kPrefetchAhead) {
       __builtin_prefetch(in.surfels + in.pairs[i - kPrefetchAhead].splat);
@@ -139,18 +140,20 @@ void raster_surfels_backward_of(const SurfelRasterInput& in, const SurfelImages<
     for (uint32_t bits = pair.blocks; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
       if (index >= passed[b]) continue;
-      accumulate_surfel<kDistort>(surfel, block_lanes(b), F16(index), near_plane, blocks[b], sums);
+      accumulate_surfel<kDistort>(surfel, block_centres(centres, b), F16(index), near_plane,
+                                  blocks[b], sums);
     }
-    store(reinterpret_cast<float*>(out + slots[i]), lane_sums(sums));
+    sum_lanes(sums, reinterpret_cast<float*>(out + i));
   }
 }
 
-inline void raster_surfels_backward(const SurfelRasterInput& in, const SurfelImages<const float>& g,
-                                    int tile, const uint32_t* slots, SurfelGradient* out) {
+inline void raster_surfels_backward(const SurfelRasterInput& in, const SurfelBlockRecord* records,
+                                    const SurfelImages<const float>& g, int tile,
+                                    SurfelGradient* out) {
   if (g.distort) {
-    raster_surfels_backward_of<true>(in, g, tile, slots, out);
+    raster_surfels_backward_of<true>(in, records, g, tile, out);
   } else {
-    raster_surfels_backward_of<false>(in, g, tile, slots, out);
+    raster_surfels_backward_of<false>(in, records, g, tile, out);
   }
 }
 

@@ -23,7 +23,7 @@ struct Surfel {
   float depth;             // of the centre [m]
   float log2_opacity;
   float color[3];
-  float normal[3];      // in the world, towards the camera
+  float normal[3];  // in the world, towards the camera
 };
 constexpr int kSurfelFields = sizeof(Surfel) / sizeof(float);
 
@@ -56,11 +56,10 @@ struct alignas(64) SurfelBlockRecord {
 
 struct SurfelRasterInput {
   const Surfel* surfels;
-  const Pair* pairs;             // grouped by tile, in depth order
-  const uint32_t* tile_offsets;  // (tiles + 1,)
+  const Pair* pairs;           // grouped by tile, in depth order
+  const size_t* tile_offsets;  // (tiles + 1,)
   int width, height, tiles_x;
-  float near_plane;              // rays that meet a surfel nearer than this miss it [m]
-  SurfelBlockRecord* records;          // (tiles, 16), null when no backward pass follows
+  float near_plane;  // rays that meet a surfel nearer than this miss it [m]
 };
 
 // Derivatives of the loss, summed over the pixels of a tile, with respect to fields of a Surfel
@@ -83,27 +82,21 @@ struct CameraGradient {
 };
 
 struct SurfelKernels {
-  const char* name;
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat* bounds,
                     Surfel*, uint32_t* depth_bits);
   BinKernel bin;
-  void (*raster_tile)(const SurfelRasterInput&, const SurfelImages<float>&, int tile);
-  // Writes the gradient of pair i of the tile to out[slots[i]].
-  void (*raster_tile_backward)(const SurfelRasterInput&, const SurfelImages<const float>& gradients,
-                               int tile, const uint32_t* slots, SurfelGradient* out);
+  // `records` (tiles, 16) are null when no backward pass follows.
+  void (*raster_tile)(const SurfelRasterInput&, const SurfelImages<float>&,
+                      SurfelBlockRecord* records, int tile);
+  // Writes the gradients of a tile's pairs.
+  void (*raster_tile_backward)(const SurfelRasterInput&, const SurfelBlockRecord* records,
+                               const SurfelImages<const float>& gradients, int tile,
+                               SurfelGradient*);
   // From gradients of `count` surfels, whose places in the input are `indices`, to those of the
   // input and of the camera.
   void (*project_backward)(const GaussianArrays&, const Camera&, const uint32_t* indices,
                            const SurfelGradient*, size_t count, const InputGradients&,
                            CameraGradient*);
 };
-
-#if defined(__x86_64__)
-const SurfelKernels& surfel_kernels_v2();
-const SurfelKernels& surfel_kernels_v3();
-const SurfelKernels& surfel_kernels_v4();
-#else
-const SurfelKernels& surfel_kernels_generic();
-#endif
 
 }  // namespace splatpilot

@@ -1,96 +1,83 @@
-#include "surfels.hpp"
-
+// Frames of surfels, and the way back.
 #include <algorithm>
 #include <cstring>
-#include <stdexcept>
 
-#include "dispatch.hpp"
+#include "renderer.hpp"
 
 namespace splatpilot {
 namespace {
 
-const SurfelKernels& surfel_kernels(const Kernels& level) {
-#if defined(__x86_64__)
-  for (const auto table : {surfel_kernels_v2, surfel_kernels_v3, surfel_kernels_v4}) {
-    if (std::strcmp(table().name, level.name) == 0) return table();
-  }
-  throw std::logic_error("no surfel kernels for this SIMD level");
-#else
-  return surfel_kernels_generic();
-#endif
+SurfelRasterInput raster_input(const SurfelFrame& frame) {
+  const Frame& bounds = frame.bounds;
+  return {frame.surfels.data(),    bounds.pairs.data(),  bounds.tile_offsets.data(),
+          bounds.camera.width,     bounds.camera.height, bounds.tiles_x(),
+          bounds.camera.near_plane};
 }
 
 }  // namespace
 
-SurfelRenderer::SurfelRenderer(int threads, const std::string& simd_level)
-    : Renderer(threads, simd_level), surfel_kernels_(surfel_kernels(kernels())) {}
-
-SurfelRasterInput SurfelRenderer::raster_input() {
-  const int tiles_x = (frame_->camera.width + kTileSize - 1) / kTileSize;
-  return {surfels_.data(), frame_->pairs.data(), frame_->tile_offsets.data(), frame_->camera.width, frame_->camera.height,
-          tiles_x,         frame_->camera.near_plane, recorded_ ? records_.data() : nullptr};
+std::shared_ptr<const SurfelFrame> Renderer::render_surfels(const GaussianArrays& surfels,
+                                                            const Camera& camera,
+                                                            const SurfelImages<float>& images,
+                                                            bool keep) {
+  const SurfelKernels& kernels = *kernels_.surfels;
+  const std::shared_ptr<SurfelFrame> frame = surfel_frames_.take();
+  Frame& bounds = frame->bounds;
+  start(bounds, camera, keep);
+  if (frame->surfels.size() < surfels.count) frame->surfels.resize(surfels.count);
+  project(bounds, surfels.count,
+          [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
+            return kernels.project(surfels, camera, begin, end, splats,
+                                   frame->surfels.data() + begin, depth_bits);
+          });
+  sort(bounds);
+  bin(bounds, kernels.bin);
+  const size_t blocks = bounds.tiles() * kBlocksPerTile;
+  if (keep && frame->records.size() < blocks) frame->records.resize(blocks);
+  const SurfelRasterInput input = raster_input(*frame);
+  pool_.for_each(bounds.tiles(), [&](size_t tile) {
+    kernels.raster_tile(input, images, keep ? frame->records.data() : nullptr,
+                        static_cast<int>(tile));
+  });
+  seconds_.raster = lap();
+  return frame;
 }
 
-void SurfelRenderer::render(const GaussianArrays& gaussians, const Camera& camera,
-                            const SurfelImages<float>& images, bool record) {
-  start_frame(camera);
-  recorded_ = record;
-  if (surfels_.size() < gaussians.count) surfels_.resize(gaussians.count);
-  project(gaussians.count, [&](size_t begin, size_t end, Splat* bounds, uint32_t* depth_bits) {
-    return surfel_kernels_.project(gaussians, camera, begin, end, bounds, surfels_.data() + begin,
-                                   depth_bits);
+// As for Gaussians, the sums do not depend on the threads.
+CameraGradient Renderer::surfels_backward(const SurfelFrame& frame, const GaussianArrays& surfels,
+                                          const SurfelImages<const float>& gradients,
+                                          const InputGradients& out) {
+  const SurfelKernels& kernels = *kernels_.surfels;
+  const Frame& bounds = frame.bounds;
+  lap();
+  if (surfel_pair_gradients_.size() < bounds.pairs.size()) {
+    surfel_pair_gradients_.resize(bounds.pairs.size());
+  }
+  const SurfelRasterInput input = raster_input(frame);
+  pool_.for_each(bounds.tiles(), [&](size_t tile) {
+    kernels.raster_tile_backward(input, frame.records.data(), gradients, static_cast<int>(tile),
+                                 surfel_pair_gradients_.data());
   });
-  sort();
-  const int tiles_x = (camera.width + kTileSize - 1) / kTileSize;
-  const int tiles_y = (camera.height + kTileSize - 1) / kTileSize;
-  const size_t tiles = static_cast<size_t>(tiles_x) * static_cast<size_t>(tiles_y);
-  bin(surfel_kernels_.bin, tiles_x, tiles_y, false);
-  if (record && records_.size() < tiles * kBlocksPerTile) records_.resize(tiles * kBlocksPerTile);
-  const SurfelRasterInput input = raster_input();
-  pool_.for_each(tiles, [&](size_t tile) {
-    surfel_kernels_.raster_tile(input, images, static_cast<int>(tile));
-  });
-}
+  seconds_.raster_backward = lap();
 
-// Each tile writes the gradients of its pairs to slots in which the pairs of a surfel follow one
-// another in the order of tiles; sums over slots then depend on nothing but the frame.
-CameraGradient SurfelRenderer::backward(const GaussianArrays& gaussians,
-                                        const SurfelImages<const float>& gradients,
-                                        const InputGradients& out) {
-  if (!recorded_) throw std::invalid_argument("the last frame was rendered without a record");
-  pair_offsets_.assign(frame_->splats.size() + 1, 0);
-  for (const Pair& pair : frame_->pairs) ++pair_offsets_[pair.splat + 1];
-  for (size_t i = 0; i < frame_->splats.size(); ++i) pair_offsets_[i + 1] += pair_offsets_[i];
-  pair_slots_.resize(frame_->pairs.size());
-  pair_gradients_.resize(frame_->pairs.size());
-  for (size_t i = 0; i < frame_->pairs.size(); ++i) pair_slots_[i] = pair_offsets_[frame_->pairs[i].splat]++;
-  // The offsets have moved on by one splat.
-
-  const SurfelRasterInput input = raster_input();
-  pool_.for_each(frame_->tile_offsets.size() - 1, [&](size_t tile) {
-    surfel_kernels_.raster_tile_backward(input, gradients, static_cast<int>(tile),
-                                         pair_slots_.data(), pair_gradients_.data());
-  });
-
-  surfel_gradients_.resize(frame_->splats.size());
-  std::vector<CameraGradient> by_chunk(frame_->chunk_counts.size());
-  pool_.for_each(frame_->chunk_counts.size(), [&](size_t chunk) {
-    const size_t first = chunk * kChunkSize, count = frame_->chunk_counts[chunk];
+  std::vector<CameraGradient> by_chunk(bounds.chunk_counts.size());
+  pool_.for_each(by_chunk.size(), [&](size_t chunk) {
+    const size_t first = chunk * kChunkSize, count = bounds.chunk_counts[chunk];
     std::vector<uint32_t> indices(count);
-    for (size_t k = 0; k < count; ++k) {
-      const size_t i = first + k;
-      indices[k] = frame_->splats[i].index;
+    std::vector<SurfelGradient> sums(count);
+    for (size_t i = 0; i < count; ++i) {
+      indices[i] = bounds.splats[first + i].index;
+      const PairRange& range = bounds.ranges[first + i];
       float total[16] = {};
-      for (uint32_t slot = i > 0 ? pair_offsets_[i - 1] : 0; slot < pair_offsets_[i]; ++slot) {
+      for (uint32_t k = range.begin; k < range.end; ++k) {
         float one[16];
-        std::memcpy(one, &pair_gradients_[slot], sizeof(one));
+        std::memcpy(one, &surfel_pair_gradients_[bounds.slots[k]], sizeof(one));
         for (int f = 0; f < 16; ++f) total[f] += one[f];
       }
-      std::memcpy(static_cast<void*>(&surfel_gradients_[i]), total, sizeof(total));
+      std::memcpy(static_cast<void*>(&sums[i]), total, sizeof(total));
     }
-    surfel_kernels_.project_backward(gaussians, frame_->camera, indices.data(),
-                                     surfel_gradients_.data() + first, count, out,
-                                     &by_chunk[chunk]);
+    kernels.project_backward(surfels, bounds.camera, indices.data(), sums.data(), count, out,
+                             &by_chunk[chunk]);
   });
   CameraGradient by_camera{};
   for (const CameraGradient& part : by_chunk) {
@@ -98,6 +85,7 @@ CameraGradient SurfelRenderer::backward(const GaussianArrays& gaussians,
     for (int k = 0; k < 3; ++k) by_camera.t[k] += part.t[k];
     for (int k = 0; k < 3; ++k) by_camera.centre[k] += part.centre[k];
   }
+  seconds_.project_backward = lap();
   return by_camera;
 }
 

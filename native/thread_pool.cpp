@@ -1,5 +1,10 @@
 #include "thread_pool.hpp"
 
+#include <stdexcept>
+#include <string>
+#include <system_error>
+#include <utility>
+
 namespace splatpilot {
 namespace {
 
@@ -27,10 +32,19 @@ uint32_t wait_for_change(const std::atomic<uint32_t>& value, uint32_t old) {
 }  // namespace
 
 ThreadPool::ThreadPool(int threads) {
-  for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { work(); });
+  try {
+    for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { work(); });
+  } catch (const std::system_error& error) {
+    const int started = this->threads();
+    stop();
+    throw std::runtime_error("only " + std::to_string(started) + " of " + std::to_string(threads) +
+                             " threads could be started: " + error.what());
+  }
 }
 
-ThreadPool::~ThreadPool() {
+ThreadPool::~ThreadPool() { stop(); }
+
+void ThreadPool::stop() {
   stop_.store(true);
   loop_.fetch_add(1);
   loop_.notify_all();
@@ -51,11 +65,18 @@ void ThreadPool::run(size_t tasks, Call call, const void* body) {
   take_tasks();
   open_.store(false);
   for (uint32_t active = active_.load(); active != 0;) active = wait_for_change(active_, active);
+  if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
 }
 
 void ThreadPool::take_tasks() {
-  for (size_t task; (task = next_task_.fetch_add(1, std::memory_order_relaxed)) < tasks_;) {
-    call_(body_, task);
+  try {
+    for (size_t task; (task = next_task_.fetch_add(1, std::memory_order_relaxed)) < tasks_;) {
+      call_(body_, task);
+    }
+  } catch (...) {
+    next_task_.store(tasks_);
+    const std::scoped_lock lock(failure_mutex_);
+    if (!failure_) failure_ = std::current_exception();
   }
 }
 

@@ -3,6 +3,8 @@
 
 #include <atomic>
 #include <cstdint>
+#include <exception>
+#include <mutex>
 #include <thread>
 #include <vector>
 
@@ -22,14 +24,16 @@ class ThreadPool {
   int threads() const { return static_cast<int>(workers_.size()) + 1; }
 
   // Calls body(task) once for each task in [0, tasks), in any order on any thread, and returns when
-  // all are done. The body must not throw.
+  // all are done. If a body throws, tasks that have not begun are left out, and the first exception
+  // is thrown here when no thread is inside the loop any more.
   template <typename Body>
   void for_each(size_t tasks, const Body& body) {
     if (workers_.empty() || tasks < 2) {
       for (size_t task = 0; task < tasks; ++task) body(task);
       return;
     }
-    run(tasks, [](const void* b, size_t task) { (*static_cast<const Body*>(b))(task); }, &body);
+    run(
+        tasks, [](const void* b, size_t task) { (*static_cast<const Body*>(b))(task); }, &body);
   }
 
  private:
@@ -37,16 +41,19 @@ class ThreadPool {
   void run(size_t tasks, Call call, const void* body);
   void work();
   void take_tasks();
+  void stop();
 
   std::vector<std::thread> workers_;
   Call call_ = nullptr;
   const void* body_ = nullptr;
   size_t tasks_ = 0;
   std::atomic<size_t> next_task_{0};
-  std::atomic<bool> open_{false};      // whether the current loop still takes workers
-  std::atomic<uint32_t> active_{0};    // workers inside the current loop
-  std::atomic<uint32_t> loop_{0};      // counts loops; workers wait for it to change
+  std::atomic<bool> open_{false};    // whether the current loop still takes workers
+  std::atomic<uint32_t> active_{0};  // workers inside the current loop
+  std::atomic<uint32_t> loop_{0};    // counts loops; workers wait for it to change
   std::atomic<bool> stop_{false};
+  std::mutex failure_mutex_;
+  std::exception_ptr failure_;  // the first of the current loop
 };
 
 }  // namespace splatpilot

@@ -86,9 +86,8 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
     if (count + most > capacity) break;
     for (int row = rows.first; row <= rows.last; ++row) {
       for (int column = columns.first; column <= columns.last; ++column) {
-        const uint32_t blocks =
-            Footprint::blocks(s, grid, static_cast<float>(column * kTileSize),
-                              static_cast<float>(row * kTileSize));
+        const uint32_t blocks = Footprint::blocks(s, grid, static_cast<float>(column * kTileSize),
+                                                  static_cast<float>(row * kTileSize));
         const uint32_t tile = static_cast<uint32_t>(row * tiles_x + column);
         pairs[count] = {tile, {order[i], blocks}};
         count += blocks != 0;

@@ -7,14 +7,14 @@
 
 namespace splatpilot {
 
-constexpr int kTileSize = 16;        // [px]
-constexpr int kBlockSize = 4;        // [px]; one block is 16 pixels, the width of a pack
-constexpr int kBlocksPerTile = 16;   // 4 x 4, one bit each of Pair::blocks
-constexpr int kStageSize = 256;      // splats of a tile held at a time
-constexpr int kChunkSize = 2048;     // Gaussians projected by one task
-constexpr int kPrefetchAhead = 8;    // splats are read in an order that caches cannot guess
+constexpr int kTileSize = 16;       // [px]
+constexpr int kBlockSize = 4;       // [px]; one block is 16 pixels, the width of a pack
+constexpr int kBlocksPerTile = 16;  // 4 x 4, one bit each of Pair::blocks
+constexpr int kStageSize = 256;     // splats of a tile held at a time
+constexpr int kChunkSize = 2048;    // Gaussians projected by one task
+constexpr int kPrefetchAhead = 8;   // splats are read in an order that caches cannot guess
 constexpr float kMinSquaredNorm = 1e-30f, kMaxSquaredNorm = 1e30f;  // of quaternions
-constexpr int kBoundSize = 64;       // baked Gaussians that share one bounding box
+constexpr int kBoundSize = 64;  // baked Gaussians that share one bounding box
 
 constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
@@ -28,12 +28,12 @@ constexpr float kExponentScale = 0.849321800288f;
 
 // A pinhole camera, prepared for projection.
 struct Camera {
-  int width, height;               // [px]
-  float fx, fy, cx, cy;            // [px]
-  float near_plane, far_plane;     // [m]
-  float radius_clip, eps2d;        // [px], [px^2]
-  bool antialiased;                // opacities fall as the blur spreads small Gaussians
-  float R_CW[9];                   // row-major
+  int width, height;            // [px]
+  float fx, fy, cx, cy;         // [px]
+  float near_plane, far_plane;  // [m]
+  float radius_clip, eps2d;     // [px], [px^2]
+  bool antialiased;             // opacities fall as the blur spreads small Gaussians
+  float R_CW[9];                // row-major
   // The centre in two parts, so that p_W - centre keeps its digits far from the world's origin.
   float centre_high[3], centre_low[3];
   float min_slope_x, max_slope_x, min_slope_y, max_slope_y;  // where x/z, y/z are held in J
@@ -50,9 +50,9 @@ struct alignas(64) Splat {
   float ux, uy, vy;          // u = ux dx + uy dy, v = vy dy, with d = pixel - mean
   float log2_opacity;
   float color[3];
-  float depth;               // z in the camera frame [m]
-  float slope_x, slope_y;    // s01 / s11 and s01 / s00 of the 2D covariance
-  uint32_t index;            // of the Gaussian in the input
+  float depth;             // z in the camera frame [m]
+  float slope_x, slope_y;  // s01 / s11 and s01 / s00 of the 2D covariance
+  uint32_t index;          // of the Gaussian in the input
   uint32_t unused;
 };
 static_assert(sizeof(Splat) == 64);
@@ -80,11 +80,11 @@ struct GaussianArrays {
 struct BakedArrays {
   size_t groups;
   // mean 3, lower-triangular factor of the covariance 6 (rows: 00; 10 11; 20 21 22), log2 opacity
-  const float* geometry;    // (groups, 10, 16)
-  const float* colors;      // (groups, 3 K, 16)
-  int sh_degree;            // 0: colours are final
-  const float* bounds;      // (groups of 16 boxes, 7, 16): centre 3, half size 3,
-                            // largest scale; one box per kBoundSize Gaussians
+  const float* geometry;  // (groups, 10, 16)
+  const float* colors;    // (groups, 3 K, 16)
+  int sh_degree;          // 0: colours are final
+  const float* bounds;    // (groups of 16 boxes, 7, 16): centre 3, half size 3,
+                          // largest scale; one box per kBoundSize Gaussians
 };
 
 // Where tiles write. Strides are in floats; a null pointer means "not wanted".
@@ -98,30 +98,36 @@ struct Image {
   float background[3];
 };
 
+// What a backward pass starts from: transmittance (16 blocks of 16 pixels) where the second and
+// later stages of a tile start, from entry later_stages[tile] on; and how many stages were
+// composited before every pixel was finished. Written by the forward pass, or read: then with
+// constant Float and Count.
+template <typename Float, typename Count>
+struct StageRecord {
+  const size_t* later_stages;  // (tiles + 1,)
+  Float* transmittance;
+  Count* stages_done;  // (tiles,)
+};
+using StageWriter = StageRecord<float, uint32_t>;
+using StageReader = StageRecord<const float, const uint32_t>;
+
 struct RasterInput {
   const Splat* splats;
-  const Pair* pairs;              // grouped by tile, in depth order
-  const uint32_t* tile_offsets;   // (tiles + 1,)
+  const Pair* pairs;           // grouped by tile, in depth order
+  const size_t* tile_offsets;  // (tiles + 1,)
   int width, height, tiles_x;
-  Image image;
-  // What a backward pass starts from, or null: transmittance (16 blocks of 16 pixels) where the
-  // second and later stages of a tile start, from entry later_stages[tile] on; and how many stages
-  // were composited before every pixel was finished.
-  const uint32_t* later_stages;   // (tiles + 1,)
-  float* transmittance;
-  uint32_t* stages_done;          // (tiles,)
 };
 
 // The loss's derivatives by what was rendered; strides as in Image.
 struct ImageGradient {
   const float* color;
   const float* depth;
-  int stride;                     // of color and depth
+  int stride;  // of color and depth
   const float* alpha;
-  const float* expected_depth;    // the rendered depth, if it was divided by alpha, else null
+  const float* expected_depth;  // the rendered depth, if it was divided by alpha, else null
   const float* rendered_alpha;
   float background[3];
-  bool absolute;                  // absolute screen-space gradients are wanted
+  bool absolute;  // absolute screen-space gradients are wanted
 };
 
 // Sums over pixels for one (splat, tile), h = alpha dL/dalpha: h, h u, h v, h u^2, h u v, h v^2,
@@ -174,8 +180,14 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
                              int tiles_x, int tiles_y, TilePair*, size_t capacity,
                              size_t* pair_count, uint32_t* tile_counts);
 
+struct SurfelKernels;
+struct LossKernels;
+
+// Of one SIMD level.
 struct Kernels {
   const char* name;
+  const SurfelKernels* surfels;
+  const LossKernels* losses;
   // Projects Gaussians [begin, end); writes visible ones and the bits of their depths in input
   // order; returns how many.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,
@@ -183,11 +195,12 @@ struct Kernels {
   size_t (*project_baked)(const BakedArrays&, const Camera&, size_t begin, size_t end, Splat*,
                           uint32_t* depth_bits);
   BinKernel bin;
-  void (*raster_tile)(const RasterInput&, int tile);
+  // With `record`, a backward pass can follow.
+  void (*raster_tile)(const RasterInput&, const Image&, const StageWriter* record, int tile);
   // Writes the gradients of a tile's pairs and returns how many (splat, block) it composited;
   // `scratch` has kBackwardScratchBytes, aligned to 64.
-  size_t (*raster_tile_backward)(const RasterInput&, const ImageGradient&, int tile, void* scratch,
-                               PairGradient*);
+  size_t (*raster_tile_backward)(const RasterInput&, const StageReader&, const ImageGradient&,
+                                 int tile, void* scratch, PairGradient*);
   // Adds up the pairs of `count` splats.
   void (*gather_gradients)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
                            const PairGradient*, SplatGradient*);
@@ -205,13 +218,5 @@ struct Kernels {
   float (*multiply_add)(size_t rounds);
 };
 constexpr int kFmaChains = 12;
-
-#if defined(__x86_64__)
-const Kernels& kernels_v2();
-const Kernels& kernels_v3();
-const Kernels& kernels_v4();
-#else
-const Kernels& kernels_generic();
-#endif
 
 }  // namespace splatpilot

@@ -1,3 +1,120 @@
-from typing import Any
+"""Splat kernels for CPUs."""
 
-def __getattr__(name: str) -> Any: ...
+from typing import Annotated
+
+import numpy
+from numpy.typing import NDArray
+
+
+def simd_levels() -> list[str]:
+    """Names of the SIMD levels this machine can run, widest first."""
+
+def first_nonfinite(renderer: Renderer, values: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)]) -> int:
+    """Index of the first NaN or infinity, or -1."""
+
+def scene_is_valid(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)]) -> bool:
+    """
+    Whether every number can be rendered; may be false for scales below 1.2e-38.
+    """
+
+def first_zero_quaternion(quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)]) -> int:
+    """
+    Index of the first quaternion too short or too long to be normalised, or -1.
+    """
+
+class Frame:
+    """What remains of a rendered image."""
+
+    @property
+    def splat_count(self) -> int:
+        """Gaussians that were visible."""
+
+    @property
+    def pair_count(self) -> int:
+        """Pairs of a Gaussian and a tile that it touches."""
+
+class Renderer:
+    """
+    Threads and scratch memory, which have no influence on what is rendered.
+    """
+
+    def __init__(self, threads: int, simd: str = '') -> None: ...
+
+    @property
+    def simd(self) -> str: ...
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds that each stage of the last frame took."""
+
+def projected(renderer: Renderer, frame: Frame, opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)] | None) -> tuple[Annotated[NDArray[numpy.int64], dict(shape=(None,))], Annotated[NDArray[numpy.int32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None,))], Annotated[NDArray[numpy.float32], dict(shape=(None, 3))], Annotated[NDArray[numpy.float32], dict(shape=(None,))]]:
+    """
+    ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) and opacities (n,) of
+    a frame's splats.
+    """
+
+def render(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float, antialiased: bool, expected_depth: bool, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
+    """
+    Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With
+    keep, a backward pass can start from the frame.
+    """
+
+class BakedScene:
+    """A static scene in the order and form frames need."""
+
+    def __init__(self, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int) -> None: ...
+
+def render_baked(scene: BakedScene, renderer: Renderer, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, eps2d: float, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')]) -> None:
+    """Writes colour, expected depth and alpha."""
+
+def photometric_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], ssim_weight: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, simd: str = '') -> float:
+    """
+    (1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.
+    """
+
+def log_depth_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], depth: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], weights: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, epsilon: float, far: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')] | None, simd: str = '') -> float:
+    """
+    Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.
+    """
+
+def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], expected_depth: bool, absolute: bool, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu')], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu')]) -> int:
+    """
+    Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were
+    composited. v_image etc. are derivatives of the loss by image etc.
+    """
+
+def project_backward(renderer: Renderer, frame: Frame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu', writable=False)], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu', writable=False)], v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')], overwrite: bool, overwrite_colors: bool) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
+    """
+    Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by
+    R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.
+    """
+
+def multiply_add(renderer: Renderer, rounds: int) -> tuple[float, int]:
+    """Does float multiply-adds; returns a sum and how many they were."""
+
+class SurfelFrame:
+    """What remains of a rendered image of surfels."""
+
+def render_surfels(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], normal: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], median: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], distort: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, keep: bool) -> SurfelFrame:
+    """Writes images; with keep, a backward pass can start from the frame."""
+
+def surfels_backward(renderer: Renderer, frame: SurfelFrame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_normal: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_median: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_distort: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')]) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
+    """
+    Adds to the gradients of the frame's surfels. Returns (5, 3) those of the camera: by R_CW,
+    by t_CW and by the camera's centre.
+    """
+
+def projected_surfels(renderer: Renderer, frame: SurfelFrame) -> tuple[Annotated[NDArray[numpy.int64], dict(shape=(None,))], Annotated[NDArray[numpy.int32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None,))], Annotated[NDArray[numpy.float32], dict(shape=(None, 3))]]:
+    """
+    ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of a
+    frame's surfels, in the order of the input.
+    """
+
+def render_projected(renderer: Renderer, *, means2d: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C', device='cpu', writable=False)], covariances: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], depths: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], width: int, height: int, radius_clip: float, expected_depth: bool, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
+    """As render, of Gaussians that are projected."""
+
+def splat_factors(renderer: Renderer, frame: Frame) -> Annotated[NDArray[numpy.float32], dict(shape=(None, 3))]:
+    """
+    (n, 3) ux, uy, vy of a frame's splats: u = ux dx + uy dy and v = vy dy make the
+    exponent, in base 2, -u^2 - v^2.
+    """

@@ -24,18 +24,26 @@ class RenderedView(NamedTuple):
     alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
 
 
-def create_renderer(threads: int, simd: str = "") -> _native.Renderer:
-    """The native threads and scratch memory.
+def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
+    """CPU threads, and memory that one image after another is rendered in.
+
+    Whatever renders several images should do so with one renderer: the first image asks the system
+    for memory, and later ones use it again. Python threads that share one take turns. What is
+    rendered depends neither on the threads nor on earlier images.
 
     `simd` (default: the environment variable SPLATPILOT_SIMD, else the widest that the machine has)
     is one of `splatpilot._native.simd_levels()`.
 
     Raises:
         ValueError: `threads` is not a positive integer, or this machine lacks the SIMD level.
+        OSError: the system does not let this process start so many threads.
     """
     if not 1 <= int(threads) <= 1024:
         raise ValueError(f"threads is {threads}; it must lie between 1 and 1024")
-    return _native.Renderer(int(threads), simd or os.environ.get("SPLATPILOT_SIMD", ""))
+    try:
+        return _native.Renderer(int(threads), simd or os.environ.get("SPLATPILOT_SIMD", ""))
+    except RuntimeError as error:
+        raise OSError(f"{error}; ask for fewer threads") from error
 
 
 def check_camera(K: "ArrayLike", width: int, height: int, near: float, far: float) -> np.ndarray:
@@ -75,14 +83,10 @@ class BakedScene:
             ValueError: see `create_renderer`.
         """
         self._renderer = create_renderer(threads, simd)
-        coefficients = scene.sh.shape[1]
+        names = ("means", "quats", "scales", "opacities", "sh")
+        arrays = {n: np.ascontiguousarray(getattr(scene, n), dtype=np.float32) for n in names}
         self._scene = _native.BakedScene(
-            np.ascontiguousarray(scene.means, dtype=np.float32),
-            np.ascontiguousarray(scene.quats, dtype=np.float32),
-            np.ascontiguousarray(scene.scales, dtype=np.float32),
-            np.ascontiguousarray(scene.opacities, dtype=np.float32),
-            np.ascontiguousarray(scene.sh, dtype=np.float32),
-            {1: 0, 4: 1, 9: 2, 16: 3}[coefficients],
+            **arrays, sh_degree={1: 0, 4: 1, 9: 2, 16: 3}[scene.sh.shape[1]]
         )
 
     def render(
@@ -118,18 +122,19 @@ class BakedScene:
         color = np.empty((height, width, 3), dtype=np.float32)
         depth = np.empty((height, width, 1), dtype=np.float32)
         alpha = np.empty((height, width, 1), dtype=np.float32)
-        self._scene.render(
+        _native.render_baked(
+            self._scene,
             self._renderer,
-            K,
-            X_CW,
-            width,
-            height,
-            near,
-            far,
-            EPS2D,
-            background,
-            color,
-            depth,
-            alpha,
+            K=K,
+            X_CW=X_CW,
+            width=width,
+            height=height,
+            near_plane=near,
+            far_plane=far,
+            eps2d=EPS2D,
+            background=background,
+            color=color,
+            depth=depth,
+            alpha=alpha,
         )
         return RenderedView(color, depth[..., 0], alpha[..., 0])

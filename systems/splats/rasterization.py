@@ -1,7 +1,6 @@
 """Gaussian splatting with gsplat's interface: native kernels on the CPU, gsplat on CUDA."""
 
 import math
-import threading
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
 from splatpilot.systems.splats.rasterization_autograd import (
     Composite,
+    Drawing,
     Project,
     Views,
     joined,
@@ -35,8 +35,6 @@ from splatpilot.systems.splats.rasterization_unscented import (
 )
 
 RASTERIZE_MODES = ("classic", "antialiased")
-
-_scratch = threading.local()  # one native renderer per thread and setting, for its memory only
 
 
 def rasterize(
@@ -63,8 +61,7 @@ def rasterize(
     radial_coeffs: Tensor | None = None,
     tangential_coeffs: Tensor | None = None,
     max_angle: float = math.pi / 2,
-    threads: int = 1,
-    simd: str = "",
+    renderer: _native.Renderer | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders N Gaussians into C cameras (Kerbl et al. 2023, with gsplat's conventions).
 
@@ -111,8 +108,8 @@ def rasterize(
             of a fisheye, zero if None.
         tangential_coeffs: (C, 2) p1 p2 of a pinhole.
         max_angle: Fisheye: Gaussians farther from the optical axis are left out, <= pi/2 [rad].
-        threads: CPU threads; the result does not depend on it.
-        simd: See `create_renderer`.
+        renderer: Of `create_renderer`: CPU threads, which do not influence the result, SIMD level
+            and memory for one image after another; None: one thread, for this call alone.
 
     Returns:
         render_colors (C, H, W, X), X = 3, 1 or 4 by `render_mode`; render_alphas (C, H, W, 1);
@@ -161,7 +158,7 @@ def rasterize(
     if torch.is_grad_enabled() and Ks.requires_grad and not unscented:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
 
-    renderer = _renderer(threads, simd)
+    renderer = create_renderer() if renderer is None else renderer
     arrays = {name: to_numpy(tensor) for name, tensor in tensors.items()}
     check_values(arrays, renderer)
     for name, value in (("eps2d", eps2d), ("radius_clip", radius_clip)):
@@ -188,24 +185,22 @@ def rasterize(
     wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
     if unscented:
         cameras = camera_projections(camera_model, Ks, radial_coeffs, tangential_coeffs, max_angle)
-        image, alpha, means2d = render_unscented(
-            views, scene, backgrounds, cameras, wants_gradients
-        )
-    elif wants_gradients:
-        means2d = Project.apply(views, *scene)
-        image, alpha = Composite.apply(views, means2d, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
+        drawing, splats = render_unscented(views, scene, cameras, wants_gradients)
     else:
-        image, alpha = views.render(arrays, keep=False)
-        means2d = views.means2d()
-    return image, alpha, _meta(views, means2d)
+        drawing = views.draw(arrays, keep=wants_gradients)
+        splats = Project.apply(views, drawing, *scene) if wants_gradients else None
+    if splats is None:
+        return drawing.image, drawing.alpha, _meta(drawing, drawing.means2d())
+    image, alpha = Composite.apply(views, drawing, *splats, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
+    return image, alpha, _meta(drawing, splats[0])
 
 
-def _meta(views: Views, means2d: Tensor) -> dict[str, Any]:
+def _meta(drawing: Drawing, means2d: Tensor) -> dict[str, Any]:
     ids, radii, _, depths, conics, opacities = (
-        joined(parts) for parts in zip(*views.projected, strict=True)
+        joined(parts) for parts in zip(*drawing.projected, strict=True)
     )
-    counts = [len(p[0]) for p in views.projected]
-    return pair_meta(counts, views.width, views.height) | {
+    counts = [len(p[0]) for p in drawing.projected]
+    return pair_meta(counts, *drawing.image.shape[2:0:-1]) | {
         "gaussian_ids": ids,
         "radii": radii,
         "means2d": means2d,
@@ -213,15 +208,3 @@ def _meta(views: Views, means2d: Tensor) -> dict[str, Any]:
         "conics": conics,
         "opacities": opacities,
     }
-
-
-def last_stages(threads: int = 1, simd: str = "") -> dict[str, float]:
-    """Seconds that the native stages of this Python thread's last image and gradient took."""
-    return _renderer(threads, simd).seconds
-
-
-def _renderer(threads: int, simd: str) -> _native.Renderer:
-    renderers = _scratch.__dict__.setdefault("renderers", {})
-    if (threads, simd) not in renderers:
-        renderers[threads, simd] = create_renderer(threads, simd)
-    return renderers[threads, simd]

@@ -1,14 +1,14 @@
 """The CPU rasteriser as two autograd functions with the image-plane means between them.
 
-`Project` takes the scene to `means2d`, and has the native renderer draw the whole image on the way;
-`Composite` takes `means2d` to that image. So the screen-space gradients that densification needs
+The native renderer draws the whole image at once. `Project` then takes the scene to `means2d`, and
+`Composite` takes `means2d` to the image. So the screen-space gradients that densification needs
 are the gradient of an ordinary intermediate tensor.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,15 +17,29 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatpilot import _native
+from splatpilot.systems.splats.rasterization_checks import SCENE
 
 SPLAT_GRADIENT = (
     16  # floats a splat: mean 2, |mean| 2, ln opacity, shape 3, colour 3, depth; 4 idle
 )
 
 
-@dataclass
+class Drawing(NamedTuple):
+    """Images of C cameras with M visible (camera, Gaussian) pairs, and what remains of them."""
+
+    image: Tensor  # (C, H, W, X)
+    alpha: Tensor  # (C, H, W, 1)
+    frames: list[_native.Frame]
+    projected: list[tuple[NDArray[Any], ...]]  # of each camera, see `_native.projected`
+
+    def means2d(self) -> Tensor:
+        """(M, 2) [px]."""
+        return joined([of_camera[2] for of_camera in self.projected])
+
+
+@dataclass(frozen=True)
 class Views:
-    """C cameras, how to render them, and what remains of having done so."""
+    """C cameras and how to render them."""
 
     renderer: _native.Renderer
     intrinsics: list[NDArray[np.float64]]  # C x (3, 3) [px]
@@ -43,65 +57,73 @@ class Views:
     channels: int
     expected_depth: bool
     absgrad: bool
-    rendered: tuple[Tensor, Tensor] | None = None  # image and alpha, from Project to Composite
-    projected: list[tuple] = field(default_factory=list)  # of each camera, see Renderer.projected
-    frames: list[Any] = field(default_factory=list)
-    splat_gradients: Tensor | None = None  # (M, 16), from Composite to Project
 
-    def render(
-        self, gaussians: dict[str, NDArray[np.float32]], keep: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Image (C, H, W, channels) and alpha (C, H, W, 1).
-
-        `keep` holds on to what the backward pass needs.
-        """
-        image = torch.empty((len(self.poses), self.height, self.width, self.channels))
-        alpha = torch.empty((len(self.poses), self.height, self.width, 1))
+    def draw(self, gaussians: dict[str, NDArray[np.float32]], keep: bool) -> Drawing:
+        """Renders; with `keep`, a backward pass can start from the frames."""
+        drawing = self.blank()
         for c in range(len(self.poses)):
-            self.renderer.render(
-                *self.scene_arguments(gaussians, c),
-                self.intrinsics[c],
-                self.poses[c],
-                self.width,
-                self.height,
-                self.near_plane,
-                self.far_plane,
-                self.radius_clip,
-                self.eps2d,
-                self.antialiased,
-                self.expected_depth,
-                self.backgrounds[c],
-                image[c].numpy(),
-                alpha[c].numpy(),
-                keep,
+            frame = _native.render(
+                self.renderer,
+                **scene_arguments(gaussians, self.sh_degree, c),
+                K=self.intrinsics[c],
+                X_CW=self.poses[c],
+                near_plane=self.near_plane,
+                far_plane=self.far_plane,
+                eps2d=self.eps2d,
+                antialiased=self.antialiased,
+                **self.image_arguments(drawing, c),
+                keep=keep,
             )
             given = None if self.antialiased else gaussians["opacities"]
-            self.projected.append(self.renderer.projected(given))
-            if keep:
-                self.frames.append(_native.kept_frame(self.renderer))
-        return image, alpha
+            drawing.projected.append(_native.projected(self.renderer, frame, given))
+            drawing.frames.append(frame)
+        return drawing
 
-    def scene_arguments(self, gaussians: dict[str, NDArray[np.float32]], camera: int) -> tuple:
-        geometry = tuple(gaussians[n] for n in ("means", "quats", "scales", "opacities"))
-        degree = -1 if self.sh_degree is None else self.sh_degree
-        return *geometry, self.color_rows(gaussians["colors"], camera), degree
+    def blank(self) -> Drawing:
+        """Images that are not initialised."""
+        size = (len(self.poses), self.height, self.width)
+        return Drawing(torch.empty((*size, self.channels)), torch.empty((*size, 1)), [], [])
 
-    def color_rows(self, colors: NDArray[np.float32], camera: int) -> NDArray[np.float32]:
-        """(N, K, 3) colours or coefficients of one camera; a view."""
-        rows = colors[camera] if self.per_camera_colors else colors
-        return rows if self.sh_degree is not None else rows[:, None, :]
-
-    def means2d(self) -> Tensor:
-        """(M, 2) [px] of the visible pairs."""
-        return joined([of_camera[2] for of_camera in self.projected])
-
-    def splats_of(self) -> list[slice]:
-        """Which rows of the M visible pairs belong to each camera."""
-        ends = np.cumsum([0] + [frame.splat_count for frame in self.frames])
-        return [slice(*pair) for pair in pairwise(ends)]
+    def image_arguments(self, drawing: Drawing, camera: int) -> dict[str, Any]:
+        """What every native rendering of one camera takes."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "radius_clip": self.radius_clip,
+            "expected_depth": self.expected_depth,
+            "background": self.backgrounds[camera],
+            "image": drawing.image[camera].numpy(),
+            "alpha": drawing.alpha[camera].numpy(),
+        }
 
 
-def to_numpy(tensor: Tensor) -> NDArray[np.float32]:
+def scene_arguments(
+    gaussians: dict[str, NDArray[np.float32]], sh_degree: int | None, camera: int
+) -> dict[str, Any]:
+    """What native functions take of Gaussians or surfels, for one camera."""
+    colors = gaussians["colors"] if sh_degree is not None else gaussians["colors"][..., None, :]
+    return {
+        **{name: gaussians[name] for name in SCENE},
+        "colors": colors[camera] if colors.ndim == 4 else colors,  # (N, K, 3), a view
+        "sh_degree": -1 if sh_degree is None else sh_degree,
+    }
+
+
+def gradient_arguments(
+    gradients: dict[str, NDArray[np.float32]], sh_degree: int | None, camera: int
+) -> dict[str, Any]:
+    """Where native functions write the gradients of `scene_arguments`."""
+    arguments = scene_arguments(gradients, sh_degree, camera)
+    return {f"v_{name}": arguments[name] for name in SCENE}
+
+
+def rows_of_cameras(frames: Sequence[_native.Frame]) -> list[slice]:
+    """Which rows of the M visible pairs belong to each camera."""
+    ends = np.cumsum([0] + [frame.splat_count for frame in frames])
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def to_numpy(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
@@ -109,57 +131,82 @@ def joined(parts: Sequence[NDArray]) -> Tensor:
     return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts))
 
 
+def splat_outputs(drawing: Drawing) -> tuple[Tensor, Tensor]:
+    """`means2d` (M, 2), and what stands for the rest of the splats.
+
+    The latter, (M, 16), has no values that mean anything: it is there for its gradient.
+    """
+    means2d = drawing.means2d()
+    return means2d, torch.full((1, 1), torch.nan).expand(len(means2d), SPLAT_GRADIENT)
+
+
+def splat_gradients(
+    count: int, v_means2d: Tensor | None, v_splats: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """The gradients of the `splat_outputs` of M = `count` pairs, zeros where None."""
+    if v_means2d is None:
+        v_means2d = torch.zeros(count, 2)
+    if v_splats is None:
+        v_splats = torch.zeros(count, SPLAT_GRADIENT)
+    return v_means2d.contiguous(), v_splats.contiguous()
+
+
 class Project(torch.autograd.Function):
-    """(means, quats, scales, opacities, colors, viewmats) -> means2d (M, 2) [px]."""
+    """(means, quats, scales, opacities, colors, viewmats) -> see `splat_outputs`."""
 
     @staticmethod
-    def forward(ctx, views: Views, *inputs: Tensor) -> Tensor:
-        ctx.views = views
+    def forward(ctx, views: Views, drawing: Drawing, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.views, ctx.frames = views, drawing.frames
         ctx.save_for_backward(*inputs)
-        views.rendered = views.render(_scene(inputs), keep=True)
-        return views.means2d()
+        ctx.set_materialize_grads(False)
+        return splat_outputs(drawing)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_means2d: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx, v_means2d: Tensor | None, v_splats: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
         views: Views = ctx.views
         inputs = ctx.saved_tensors
         *scene_gradients, v_viewmats = [
             torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs
         ]
         v_viewmats.zero_()
-        scene, gradients = _scene(inputs), _scene(scene_gradients)
-        v_means2d = v_means2d.contiguous()
-        v_splats, views.splat_gradients = views.splat_gradients, None
-        if v_splats is None:
-            v_splats = torch.zeros(len(v_means2d), SPLAT_GRADIENT)
-        for c, rows in enumerate(views.splats_of()):
-            sums = _native.project_backward(
+        scene, gradients = scene_arrays(inputs), scene_arrays(scene_gradients)
+        rows_of = rows_of_cameras(ctx.frames)
+        v_means2d, v_splats = splat_gradients(rows_of[-1].stop, v_means2d, v_splats)
+        for c, rows in enumerate(rows_of):
+            by_camera = _native.project_backward(
                 views.renderer,
-                views.frames[c],
-                *views.scene_arguments(scene, c),
-                v_splats[rows].numpy(),
-                v_means2d[rows].numpy(),
-                *views.scene_arguments(gradients, c)[:5],
-                c == 0,
-                c == 0 or views.per_camera_colors,
+                ctx.frames[c],
+                **scene_arguments(scene, views.sh_degree, c),
+                v_splats=v_splats[rows].numpy(),
+                v_means2d=v_means2d[rows].numpy(),
+                **gradient_arguments(gradients, views.sh_degree, c),
+                overwrite=c == 0,
+                overwrite_colors=c == 0 or views.per_camera_colors,
             )
-            v_viewmats[c, :3] = torch.from_numpy(_pose_gradient(np.array(sums), views.poses[c]))
-        return None, *scene_gradients, v_viewmats
+            v_viewmats[c, :3] = torch.from_numpy(_pose_gradient(by_camera, views.poses[c]))
+        return None, None, *scene_gradients, v_viewmats
 
 
 class Composite(torch.autograd.Function):
-    """(means2d, backgrounds or None) -> image (C, H, W, X), alpha (C, H, W, 1)."""
+    """(means2d, splats, backgrounds or None) -> image (C, H, W, X), alpha (C, H, W, 1).
+
+    means2d and splats are those of `splat_outputs`.
+    """
 
     @staticmethod
-    def forward(ctx, views: Views, means2d: Tensor, backgrounds: Tensor | None):
-        ctx.views = views
-        # Not to stay in `views`: an output that its own node refers to is never freed.
-        assert views.rendered is not None
-        image, alpha = views.rendered
-        views.rendered = None
-        ctx.save_for_backward(means2d, image, alpha)
-        return image, alpha
+    def forward(
+        ctx,
+        views: Views,
+        drawing: Drawing,
+        means2d: Tensor,
+        splats: Tensor,
+        backgrounds: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        # The frames alone: an output that its own node refers to is never freed.
+        ctx.views, ctx.frames = views, drawing.frames
+        ctx.save_for_backward(means2d, drawing.image, drawing.alpha)
+        return drawing.image, drawing.alpha
 
     @staticmethod
     @once_differentiable
@@ -167,35 +214,34 @@ class Composite(torch.autograd.Function):
         views: Views = ctx.views
         means2d, image, alpha = ctx.saved_tensors
         v_image, v_alpha = v_image.contiguous(), v_alpha.contiguous()
-        v_means2d = v_backgrounds = None
-        if ctx.needs_input_grad[1]:
+        v_means2d = v_splats = v_backgrounds = None
+        if ctx.needs_input_grad[2]:
             v_splats = torch.empty(len(means2d), SPLAT_GRADIENT)
             v_means2d = torch.empty(len(means2d), 2)
-            for c, rows in enumerate(views.splats_of()):
+            for c, rows in enumerate(rows_of_cameras(ctx.frames)):
                 _native.raster_backward(
                     views.renderer,
-                    views.frames[c],
-                    v_image[c].numpy(),
-                    v_alpha[c].numpy(),
-                    image[c].numpy(),
-                    alpha[c].numpy(),
-                    views.backgrounds[c],
-                    views.expected_depth,
-                    views.absgrad,
-                    v_splats[rows].numpy(),
-                    v_means2d[rows].numpy(),
+                    ctx.frames[c],
+                    v_image=v_image[c].numpy(),
+                    v_alpha=v_alpha[c].numpy(),
+                    image=image[c].numpy(),
+                    alpha=alpha[c].numpy(),
+                    background=views.backgrounds[c],
+                    expected_depth=views.expected_depth,
+                    absolute=views.absgrad,
+                    v_splats=v_splats[rows].numpy(),
+                    v_means2d=v_means2d[rows].numpy(),
                 )
-            views.splat_gradients = v_splats
             if views.absgrad:
                 means2d.absgrad = v_splats[:, 2:4].clone()
-        if ctx.needs_input_grad[2] and views.channels > 1:
+        if ctx.needs_input_grad[4] and views.channels > 1:
             v_backgrounds = (v_image[..., :3] * (1 - alpha)).sum((1, 2))
-        return None, v_means2d, v_backgrounds
+        return None, None, v_means2d, v_splats, v_backgrounds
 
 
-def _scene(tensors) -> dict[str, NDArray[np.float32]]:
-    names = ("means", "quats", "scales", "opacities", "colors")
-    return {name: to_numpy(tensor) for name, tensor in zip(names, tensors, strict=False)}
+def scene_arrays(tensors: Sequence[Tensor]) -> dict[str, NDArray[np.float32]]:
+    """The first five, in the order of SCENE."""
+    return {name: to_numpy(tensor) for name, tensor in zip(SCENE, tensors, strict=False)}
 
 
 def _pose_gradient(sums: NDArray[np.float64], X_CW: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -203,7 +249,9 @@ def _pose_gradient(sums: NDArray[np.float64], X_CW: NDArray[np.float64]) -> NDAr
 
     p_C = R p_W + t, with p_W = d + centre; spherical harmonics look from centre = -R^-1 t.
     """
-    v_R, v_p, v_direction = sums[:9].reshape(3, 3), sums[9:12], sums[12:]
+    v_R = sums[:3]
+    v_p: NDArray[np.float64] = sums[3]
+    v_direction: NDArray[np.float64] = sums[4]
     R, t = X_CW[:3, :3], X_CW[:3, 3]
     v_t = v_p + np.linalg.solve(R.T, v_direction)
     return np.column_stack([v_R - np.outer(v_t, np.linalg.solve(R, t)), v_t])

@@ -74,14 +74,15 @@ def check_values(
 
     Of scales, the first `scale_axes` matter.
     """
-    scene = [arrays[name] for name in SCENE]
-    fine = _native.scene_is_valid(renderer, *scene[:4], scene[4].reshape(-1))
+    scene = {name: arrays[name] for name in SCENE}
+    scene["colors"] = scene["colors"].reshape(-1)
+    fine = _native.scene_is_valid(renderer, **scene)
     if not fine:
         arrays = arrays | {"scales": np.ascontiguousarray(arrays["scales"][:, :scale_axes])}
     for name, array in arrays.items():
         if fine and name in SCENE:
             continue
-        first = _native.first_nonfinite(array.reshape(-1), renderer)
+        first = _native.first_nonfinite(renderer, array.reshape(-1))
         if first >= 0:
             raise _bad_value(name, array, first, "be finite")
     if not fine:

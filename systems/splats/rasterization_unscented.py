@@ -21,9 +21,10 @@ from splatpilot.systems.splats.camera_models import (
     unscented_projection,
 )
 from splatpilot.systems.splats.rasterization_autograd import (
-    SPLAT_GRADIENT,
-    Composite,
+    Drawing,
     Views,
+    splat_gradients,
+    splat_outputs,
     to_numpy,
 )
 from splatpilot.systems.splats.spherical_harmonics import sh_basis_functions
@@ -82,13 +83,11 @@ def _opencv(K: Tensor, radial: Tensor, tangential: Tensor) -> Projection:
 
 
 def render_unscented(
-    views: Views, scene: tuple[Tensor, ...], backgrounds: Tensor | None, cameras: list[Projection],
-    keep: bool,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Image (C, H, W, X), alpha (C, H, W, 1) and means2d (M, 2) of `rasterize`'s arguments.
+    views: Views, scene: tuple[Tensor, ...], cameras: list[Projection], keep: bool
+) -> tuple[Drawing, tuple[Tensor, Tensor] | None]:
+    """Draws `scene`: (means, quats, scales, opacities, colors, viewmats).
 
-    `scene` is (means, quats, scales, opacities, colors, viewmats); `keep` prepares for a backward
-    pass. Fills in `views.projected`.
+    With `keep`, the second is `splat_outputs`, differentiable; else None.
     """
     parts, ids = [], []
     for c, project in enumerate(cameras):
@@ -96,13 +95,8 @@ def render_unscented(
         ids.append(of_camera.numpy())
         parts.append(part)
     joined = [torch.cat(columns) for columns in zip(*parts, strict=True)]
-    if keep:
-        means2d = PlaceSplats.apply(views, ids, *joined)
-        image, alpha = Composite.apply(views, means2d, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
-    else:
-        image, alpha, _ = _render(views, ids, joined, keep=False)
-        means2d = views.means2d()
-    return image, alpha, means2d  # pyright: ignore[reportReturnType]
+    drawing, visible = _draw(views, ids, joined, keep)
+    return drawing, PlaceSplats.apply(views, drawing, visible, *joined) if keep else None  # pyright: ignore[reportReturnType]
 
 
 def _project(
@@ -160,63 +154,53 @@ def _determinant(covariances: Tensor) -> Tensor:
     return xx * yy - xy * xy
 
 
-def _render(
+def _draw(
     views: Views, ids: list[NDArray[np.int64]], projected: list[Tensor], keep: bool
-) -> tuple[Tensor, Tensor, tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """Image, alpha, and of the M visible splats: rows of `projected` and factors (M, 3)."""
-    image = torch.empty((len(ids), views.height, views.width, views.channels))
-    alpha = torch.empty((len(ids), views.height, views.width, 1))
+) -> tuple[Drawing, NDArray[np.int64]]:
+    """Also returns which rows of `projected` are the M visible splats."""
+    drawing = views.blank()
     means2d, covariances, depths, opacities, colors = (to_numpy(t) for t in projected)
-    visible, factors, first = [], [], 0
+    visible, first = [], 0
     for c, of_camera in enumerate(ids):
         rows = slice(first, first + len(of_camera))
-        factors.append(
-            _native.render_projected(
-                views.renderer,
-                means2d[rows],
-                covariances[rows],
-                depths[rows],
-                opacities[rows],
-                colors[rows],
-                views.width,
-                views.height,
-                views.radius_clip,
-                views.expected_depth,
-                views.backgrounds[c],
-                image[c].numpy(),
-                alpha[c].numpy(),
-                keep,
-            )
+        frame = _native.render_projected(
+            views.renderer,
+            means2d=means2d[rows],
+            covariances=covariances[rows],
+            depths=depths[rows],
+            opacities=opacities[rows],
+            colors=colors[rows],
+            **views.image_arguments(drawing, c),
+            keep=keep,
         )
-        seen, *values = views.renderer.projected(opacities[rows])
-        views.projected.append((of_camera[seen], *values))
+        seen, *values = _native.projected(views.renderer, frame, opacities[rows])
+        drawing.projected.append((of_camera[seen], *values))
+        drawing.frames.append(frame)
         visible.append(first + seen)
         first = rows.stop
-        if keep:
-            views.frames.append(_native.kept_frame(views.renderer))
-    return image, alpha, (np.concatenate(visible), np.concatenate(factors))
+    return drawing, np.concatenate(visible)
 
 
 class PlaceSplats(torch.autograd.Function):
-    """Projected (means2d, covariances, depths, opacities, colors) -> visible means2d (M, 2)."""
+    """Projected (means2d, covariances, depths, opacities, colors) -> see `splat_outputs`."""
 
     @staticmethod
-    def forward(ctx, views: Views, ids: list[NDArray[np.int64]], *projected: Tensor) -> Tensor:
-        ctx.views = views
-        image, alpha, ctx.visible = _render(views, ids, list(projected), keep=True)
-        views.rendered = (image, alpha)
+    def forward(
+        ctx, views: Views, drawing: Drawing, visible: NDArray[np.int64], *projected: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        ctx.views, ctx.frames, ctx.visible = views, drawing.frames, torch.from_numpy(visible)
         ctx.save_for_backward(*projected)
-        return views.means2d()
+        ctx.set_materialize_grads(False)
+        return splat_outputs(drawing)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_means2d: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        rows, factors = (torch.from_numpy(a) for a in ctx.visible)
-        g, ctx.views.splat_gradients = ctx.views.splat_gradients, None
-        if g is None:
-            g = torch.zeros(len(v_means2d), SPLAT_GRADIENT)
+    def backward(ctx, v_means2d: Tensor | None, v_splats: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        rows = ctx.visible
+        v_means2d, g = splat_gradients(len(rows), v_means2d, v_splats)
+        factors = [_native.splat_factors(ctx.views.renderer, frame) for frame in ctx.frames]
         opacities = ctx.saved_tensors[3]
-        ux, uy, vy = factors.double().unbind(-1)
+        ux, uy, vy = torch.from_numpy(np.concatenate(factors)).double().unbind(-1)
         uu, uv, vv = g[:, 5:8].double().unbind(-1)
         # dL/dS = 2 ln^2 2 W^T M W, with W = (ux uy; 0 vy) and M the sums of h (u, v)^T (u, v).
         v_xy = 2 * ux * (uy * uu + vy * uv)
@@ -224,6 +208,7 @@ class PlaceSplats(torch.autograd.Function):
         v_covariances = 2 * math.log(2) ** 2 * torch.stack([ux * ux * uu, v_xy, v_yy], -1)
         gradients = (v_means2d, v_covariances, g[:, 11], g[:, 4] / opacities[rows], g[:, 8:11])
         return (
+            None,
             None,
             None,
             *[

@@ -22,6 +22,7 @@ from splatpilot.systems.splats.drake_images import (
     render_view,
     surface_labels,
 )
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.weakly import weakly
 
 
@@ -68,7 +69,7 @@ class SplatCamera(LeafSystem):
 
     def __init__(
         self,
-        scene: BakedScene,
+        scene: BakedScene | GaussianScene,
         camera_info: CameraInfo,
         X_BC: RigidTransform | None = None,
         *,
@@ -80,7 +81,8 @@ class SplatCamera(LeafSystem):
     ):
         """
         Args:
-            scene: what there is to see; held by reference, so that many cameras share one.
+            scene: what there is to see. A `BakedScene` is held by reference, so that many cameras
+                share one; a `GaussianScene` is baked for this camera alone.
             camera_info: pinhole intrinsics, width and height.
             X_BC: pose of the camera in the body that carries it; identity when None.
             min_depth, max_depth: range of the depth image [m].
@@ -101,7 +103,7 @@ class SplatCamera(LeafSystem):
                 f"camera focal lengths are {camera_info.focal_x()}, {camera_info.focal_y()} "
                 "pixels; both must be positive"
             )
-        self._scene = scene
+        self._scene = BakedScene(scene) if isinstance(scene, GaussianScene) else scene
         self._camera_info = camera_info
         self._X_BC = RigidTransform() if X_BC is None else X_BC
         self._depth_range = (min_depth, max_depth)

@@ -1,6 +1,6 @@
 """2D Gaussian splatting (surfels; Huang et al. 2024): native on the CPU, gsplat on CUDA."""
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +10,12 @@ from splatpilot import _native
 from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import check_camera, create_renderer
 from splatpilot.systems.splats.depth_normals import depth_to_normals
-from splatpilot.systems.splats.rasterization_autograd import joined
+from splatpilot.systems.splats.rasterization_autograd import (
+    gradient_arguments,
+    joined,
+    scene_arguments,
+    scene_arrays,
+)
 from splatpilot.systems.splats.rasterization_checks import (
     by_name,
     check_device,
@@ -21,6 +26,7 @@ from splatpilot.systems.splats.rasterization_checks import (
 )
 
 DEPTH_MODES = ("expected", "median")
+IMAGES = {"color": 3, "normal": 3, "depth": 1, "alpha": 1, "median": 1, "distort": 1}  # channels
 
 
 def rasterize_surfels(
@@ -42,8 +48,7 @@ def rasterize_surfels(
     render_mode: str = "RGB",
     distloss: bool = False,
     depth_mode: str = "expected",
-    threads: int = 1,
-    simd: str = "",
+    renderer: _native.Renderer | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, dict[str, Any]]:
     """Renders N surfels into C pinhole cameras, with the interface of gsplat.rasterization_2dgs.
 
@@ -66,7 +71,7 @@ def rasterize_surfels(
 
     Args:
         means, quats, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane,
-            radius_clip, sh_degree, backgrounds, render_mode, threads, simd: as for `rasterize`.
+            radius_clip, sh_degree, backgrounds, render_mode, renderer: as for `rasterize`.
         scales: (N, 3) standard deviations [m], positive; the third does not matter.
         distloss: Whether to render the distortion; needs a `render_mode` with depth, as gsplat.
         depth_mode: Of which depth surface normals are: "expected" or "median".
@@ -111,25 +116,28 @@ def rasterize_surfels(
     if Ks.requires_grad:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
     view = _View(
+        renderer=create_renderer() if renderer is None else renderer,
         intrinsics=[
             check_camera(K, width, height, near_plane, far_plane) for K in Ks.detach().numpy()
         ],
+        poses=viewmats.detach().double().numpy(),
         width=width,
         height=height,
         near_plane=near_plane,
         far_plane=far_plane,
         radius_clip=radius_clip,
-        sh_degree=-1 if sh_degree is None else sh_degree,
+        sh_degree=sh_degree,
         distort=distloss,
-        record=torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()),
-        threads=threads,
-        simd=simd,
     )
-    frames = _Frames(view)
     arrays = {k: np.ascontiguousarray(t.detach().numpy()) for k, t in tensors.items()}
     # The third scale is not read; whatever it is, it is no error.
-    check_values(arrays, frames.renderers[0], scale_axes=2)
-    color, normal, depth, alpha, median, distort = _Rasterize.apply(*scene, view, frames)
+    check_values(arrays, view.renderer, scale_axes=2)
+    wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
+    drawing = _draw(view, arrays, keep=wants_gradients)
+    images = drawing.images
+    if wants_gradients:
+        images = _Rasterize.apply(view, drawing, *scene)
+    color, normal, depth, alpha, median, distort = images
 
     parts, surface = [], None
     if "RGB" in render_mode:
@@ -140,113 +148,101 @@ def rasterize_surfels(
         expected = depth / alpha.clamp(min=1e-10)
         parts.append(expected if "ED" in render_mode else depth)
         surface = depth_to_normals(expected if depth_mode == "expected" else median, viewmats, Ks)
-    images = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-    meta = _meta(frames.projected, arrays["opacities"], width, height)
+    image = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+    meta = _meta(drawing.projected, arrays["opacities"], width, height)
     meta["render_distort"] = distort
-    return images, alpha, normal, surface, distort, median, meta
+    return image, alpha, normal, surface, distort, median, meta
 
 
 class _View(NamedTuple):
-    """What a call renders, beside the tensors."""
+    """C cameras and how to render them."""
 
-    intrinsics: list[np.ndarray]  # (3, 3) float64 of each camera
+    renderer: _native.Renderer
+    intrinsics: list[np.ndarray]  # C x (3, 3) float64 [px]
+    poses: np.ndarray  # (C, 4, 4) X_CW, float64
     width: int
     height: int
     near_plane: float
     far_plane: float
     radius_clip: float
-    sh_degree: int  # -1: colours are given
+    sh_degree: int | None
     distort: bool
-    record: bool  # whether gradients may be asked for
-    threads: int
-    simd: str
 
 
-class _Frames:
-    """One native renderer per camera, lent for as long as its frame may be needed."""
+class _Drawing(NamedTuple):
+    """Images of C cameras, and what remains of them."""
 
-    idle: ClassVar[dict[tuple[int, str], list[_native.SurfelRenderer]]] = {}
+    images: tuple[Tensor, ...]  # (C, H, W, channels) in the order of IMAGES
+    frames: list[_native.SurfelFrame]
+    projected: list[tuple]  # of each camera, see `_native.projected_surfels`
 
-    def __init__(self, view: _View):
-        self._idle = self.idle.setdefault((view.threads, view.simd), [])
-        count = len(view.intrinsics) if view.record else 1
-        self.renderers = [self._take(view) for _ in range(count)]
-        self.projected: list[tuple] = []
 
-    def _take(self, view: _View) -> _native.SurfelRenderer:
-        try:
-            return self._idle.pop()
-        except IndexError:
-            level = create_renderer(view.threads, view.simd).simd
-            return _native.SurfelRenderer(view.threads, level)
-
-    def __del__(self):
-        self._idle.extend(getattr(self, "renderers", ()))
+def _draw(view: _View, arrays: dict[str, np.ndarray], keep: bool) -> _Drawing:
+    """Renders; with `keep`, a backward pass can start from the frames."""
+    size = (len(view.poses), view.height, view.width)
+    images = {name: torch.empty((*size, channels)) for name, channels in IMAGES.items()}
+    if not view.distort:
+        images["distort"].zero_()
+    drawing = _Drawing(tuple(images.values()), [], [])
+    for c in range(len(view.poses)):
+        outputs: dict[str, Any] = {name: image[c].numpy() for name, image in images.items()}
+        if not view.distort:
+            outputs["distort"] = None
+        frame = _native.render_surfels(
+            view.renderer,
+            **scene_arguments(arrays, view.sh_degree, c),
+            K=view.intrinsics[c],
+            X_CW=view.poses[c],
+            width=view.width,
+            height=view.height,
+            near_plane=view.near_plane,
+            far_plane=view.far_plane,
+            radius_clip=view.radius_clip,
+            **outputs,
+            keep=keep,
+        )
+        drawing.frames.append(frame)
+        drawing.projected.append(_native.projected_surfels(view.renderer, frame))
+    return drawing
 
 
 class _Rasterize(torch.autograd.Function):
+    """(means, quats, scales, opacities, colors, viewmats) -> images in the order of IMAGES."""
+
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, colors, viewmats, view, frames):
-        tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities)]
-        colors = colors.detach().contiguous()
-        C, H, W = len(viewmats), view.height, view.width
-        images = [torch.empty((C, H, W, channels)) for channels in (3, 3, 1, 1, 1)]
-        distort = torch.empty((C, H, W, 1)) if view.distort else torch.zeros((C, H, W, 1))
-        poses = viewmats.detach().double().numpy()
-        for c in range(C):
-            renderer = frames.renderers[c if view.record else 0]
-            renderer.render(
-                *(t.numpy() for t in tensors),
-                _of_camera(colors, c, view).numpy(),
-                view.sh_degree,
-                view.intrinsics[c],
-                poses[c],
-                W,
-                H,
-                view.near_plane,
-                view.far_plane,
-                view.radius_clip,
-                *(image[c].numpy() for image in images),
-                distort[c].numpy() if view.distort else None,
-                view.record,
-            )
-            frames.projected.append(renderer.projected())
-        ctx.view, ctx.frames = view, frames
-        ctx.save_for_backward(*tensors, colors, viewmats)
+    def forward(ctx, view: _View, drawing: _Drawing, *inputs: Tensor) -> tuple[Tensor, ...]:
+        # The frames alone: an output that its own node refers to is never freed.
+        ctx.view, ctx.frames = view, drawing.frames
+        ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
         if not view.distort:
-            ctx.mark_non_differentiable(distort)
-        return (*images, distort)
+            ctx.mark_non_differentiable(drawing.images[-1])
+        return drawing.images
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients):  # pyright: ignore[reportIncompatibleMethodOverride]
-        *tensors, colors, viewmats = ctx.saved_tensors
-        view, frames = ctx.view, ctx.frames
-        outputs = [torch.zeros_like(t) for t in tensors]
-        by_colors = torch.zeros_like(colors)
-        by_viewmats = torch.zeros_like(viewmats)
-        images = [g if g is None else g.contiguous() for g in gradients]
+    def backward(ctx, *v_images: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        view: _View = ctx.view
+        inputs = ctx.saved_tensors
+        v_inputs = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
+        arrays, gradients = scene_arrays(inputs), scene_arrays(v_inputs)
         if not view.distort:
-            images[5] = None
-        for c, X_CW in enumerate(viewmats.detach().double().numpy()):
-            by_camera = frames.renderers[c].backward(
-                *(t.numpy() for t in tensors),
-                _of_camera(colors, c, view).numpy(),
-                view.sh_degree,
-                *(None if g is None else g[c].numpy() for g in images),
-                *(t.numpy() for t in outputs),
-                _of_camera(by_colors, c, view).numpy(),
+            v_images = (*v_images[:-1], None)
+        given = [None if v is None else v.contiguous() for v in v_images]
+        for c, X_CW in enumerate(view.poses):
+            of_camera: dict[str, Any] = {
+                f"v_{name}": None if v is None else v[c].numpy()
+                for name, v in zip(IMAGES, given, strict=True)
+            }
+            by_camera = _native.surfels_backward(
+                view.renderer,
+                ctx.frames[c],
+                **scene_arguments(arrays, view.sh_degree, c),
+                **of_camera,
+                **gradient_arguments(gradients, view.sh_degree, c),
             )
-            by_viewmats[c] = torch.from_numpy(_viewmat_gradient(by_camera, X_CW))
-        return *outputs, by_colors, by_viewmats, None, None
-
-
-def _of_camera(colors: Tensor, camera: int, view: _View) -> Tensor:
-    """Coefficients (N, K, 3) of one camera, as a view."""
-    if view.sh_degree < 0:
-        colors = colors.unsqueeze(-2)
-    return colors[camera] if colors.ndim == 4 else colors
+            v_inputs[5][c] = torch.from_numpy(_viewmat_gradient(by_camera, X_CW))
+        return None, None, *v_inputs
 
 
 def _viewmat_gradient(by_camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:

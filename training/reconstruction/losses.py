@@ -47,7 +47,7 @@ def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2)
         raise ValueError(f"ssim_weight is {ssim_weight}; it must lie between 0 and 1")
     if _is_native(rendered):
         shape, native = (-1, *rendered.shape[-3:]), _native.photometric_loss
-        loss = _Fused.apply(rendered, native, shape, target, ssim_weight)
+        loss = _Fused.apply(rendered, native, shape, {"target": target, "ssim_weight": ssim_weight})
         return loss  # pyright: ignore[reportReturnType]
     return photometric_loss_torch(rendered, target, ssim_weight)
 
@@ -87,7 +87,8 @@ def log_depth_loss(
         raise ValueError(f"depth range is {epsilon} to {far} m; it must satisfy 0 < epsilon < far")
     if _is_native(rendered):
         native = _native.log_depth_loss
-        loss = _Fused.apply(rendered, native, (-1,), depth, weights, epsilon, far)
+        truth = {"depth": depth, "weights": weights, "epsilon": epsilon, "far": far}
+        loss = _Fused.apply(rendered, native, (-1,), truth)
         return loss  # pyright: ignore[reportReturnType]
     return log_depth_loss_torch(rendered, depth, weights, epsilon, far)
 
@@ -183,14 +184,19 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, rendered: Tensor, loss: Callable[..., float], shape: tuple[int, ...], *data: Any
+        ctx: Any,
+        rendered: Tensor,
+        loss: Callable[..., float],
+        shape: tuple[int, ...],
+        truth: dict[str, Any],
     ) -> Tensor:
         def argument(x: Any) -> Any:
             return x.detach().contiguous().view(shape).numpy() if isinstance(x, Tensor) else x
 
         gradient = torch.empty(rendered.shape) if ctx.needs_input_grad[0] else None
-        simd = os.environ.get("SPLATPILOT_SIMD", "")
-        value = loss(*map(argument, (rendered, *data, gradient)), simd)
+        images = truth | {"rendered": rendered, "gradient": gradient}
+        arguments = {name: argument(x) for name, x in images.items()}
+        value = loss(**arguments, simd=os.environ.get("SPLATPILOT_SIMD", ""))
         ctx.gradient = gradient
         return rendered.new_tensor(value)
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.reconstruction.losses import photometric_loss
 from splatpilot.training.reconstruction.lpips import Lpips
@@ -176,7 +176,7 @@ class SceneRenderer:
     """Renders a scene as what it is: Gaussians ("3dgs") or surfels ("2dgs")."""
 
     def __init__(self, scene: GaussianScene, representation: str, threads: int = 1):
-        self._threads = threads
+        self._renderer = create_renderer(threads)
         self._baked = BakedScene(scene, threads) if representation == "3dgs" else None
         arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
         means, quats, scales, opacities, sh = map(torch.from_numpy, arrays)
@@ -198,7 +198,7 @@ class SceneRenderer:
                 height,
                 background=torch.tensor(np.asarray(background), dtype=torch.float32)[None],
                 depth_mode="ED",
-                threads=self._threads,
+                renderer=self._renderer,
             )
         images = (rendering.color, rendering.depth, rendering.alpha)
         return RenderedView(*(image.numpy() for image in images))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.event_log import event_log
@@ -59,6 +59,7 @@ class Optimization:
         self._config, self._views, self._held_out = config, views, held_out
         self._checkpoint, self._perceptual = checkpoint, perceptual
         self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
+        self._renderer = create_renderer(config.renderer_threads)
         self._background = torch.tensor([background], device=config.device)  # (1, 3)
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
@@ -133,7 +134,7 @@ class Optimization:
             depth_mode=config.depth_mode,
             absgrad=config.absgrad and config.strategy == "default",
             distortion=flat and config.distortion_weight > 0 and part >= _DISTORTION_START,
-            threads=config.renderer_threads,
+            renderer=self._renderer,
         )
         loss = self._loss(rendering, k, part)
         if self._strategy is not None:
@@ -188,7 +189,7 @@ class Optimization:
             views.height,
             background=self._background,
             depth_mode="ED",
-            threads=self._config.renderer_threads,
+            renderer=self._renderer,
         )
 
     def _loss(self, rendering: Rendering, k: int, part: float) -> Tensor:

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
+from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -58,6 +59,7 @@ def render_depth(
         torch.from_numpy(getattr(gaussians, name))
         for name in ("means", "quats", "scales", "opacities", "sh")
     )
+    renderer = create_renderer(threads)
 
     def load(i: int) -> NDArray[np.float32]:
         viewmat = torch.from_numpy(X_WCs[i].inverse().GetAsMatrix4()).float()[None]
@@ -70,7 +72,7 @@ def render_depth(
                 width,
                 height,
                 depth_mode="ED",
-                threads=threads,
+                renderer=renderer,
             )
         return torch.where(rendering.alpha > _SOLID, rendering.depth, 0).numpy()
 

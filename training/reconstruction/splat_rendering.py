@@ -5,6 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
+from splatpilot._native import Renderer
 from splatpilot.systems.splats.rasterization import rasterize
 from splatpilot.systems.splats.surfels import rasterize_surfels
 
@@ -34,7 +35,7 @@ def render(
     depth_mode: str = "D",
     absgrad: bool = False,
     distortion: bool = False,
-    threads: int = 1,
+    renderer: Renderer | None = None,
 ) -> Rendering:
     """Renders colour and depth.
 
@@ -48,14 +49,14 @@ def render(
         depth_mode: "D", accumulated, or "ED", expected.
         absgrad: see `rasterize`.
         distortion: whether surfels render it.
-        threads: of the CPU.
+        renderer: see `rasterize`.
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
         "sh_degree": {1: 0, 4: 1, 9: 2, 16: 3}[gaussians[4].shape[1]],
         "backgrounds": background,
         "render_mode": f"RGB+{depth_mode}",
-        "threads": threads,
+        "renderer": renderer,
     }
     if representation == "3dgs":
         image, alpha, meta = rasterize(*scene, **options, absgrad=absgrad)

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
-from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 LEVELS = _native.simd_levels()
@@ -59,7 +59,7 @@ def test_agrees_with_rasterize(simd, degree):
     scene = random_scene(sh_degree=degree, count=1003)
     background = (0.2, 0.5, 0.9)
     view = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, X_WC, background=background)
-    image, alpha = rasterized(scene, background, simd=simd)
+    image, alpha = rasterized(scene, background, renderer=create_renderer(1, simd))
     assert view.color.shape == (HEIGHT, WIDTH, 3) and view.color.dtype == np.float32
     assert view.depth.shape == view.alpha.shape == (HEIGHT, WIDTH)
     for got, want in (

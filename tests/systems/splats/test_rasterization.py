@@ -13,6 +13,7 @@ from random_scenes import normal_tensor, random_scene
 
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import create_renderer
 
 single_gaussian = reference.single_gaussian
 
@@ -57,7 +58,7 @@ def test_agrees_with_reference_in_every_mode(simd, seed):
             height=height,
             backgrounds=torch.tensor([background]) if with_color else None,
             render_mode=mode,
-            simd=simd,
+            renderer=create_renderer(1, simd),
         )
         images[mode] = image[0]
         assert_agrees(alpha[0, ..., 0], expected.alpha, clear)
@@ -141,7 +142,11 @@ def test_thread_counts_give_equal_bits(simd):
     first = None
     for threads in (1, 2, 3, 2, 1):
         image, alpha, _ = rasterize(
-            **scene, width=131, height=77, render_mode="RGB+D", threads=threads, simd=simd
+            **scene,
+            width=131,
+            height=77,
+            render_mode="RGB+D",
+            renderer=create_renderer(threads, simd),
         )
         first = first or (image, alpha)
         assert torch.equal(image, first[0]) and torch.equal(alpha, first[1])
@@ -160,7 +165,9 @@ def test_scratch_memory_does_not_leak_between_frames():
 def test_single_gaussian_is_the_analytic_bell(simd):
     """An isotropic Gaussian on the axis is o exp(-r^2 / 2 s^2), s^2 = (f scale / z)^2 + eps2d."""
     scene = single_gaussian()
-    image, alpha, _ = rasterize(**scene, width=33, height=33, render_mode="RGB+ED", simd=simd)
+    image, alpha, _ = rasterize(
+        **scene, width=33, height=33, render_mode="RGB+ED", renderer=create_renderer(1, simd)
+    )
     v, u = np.mgrid[0:33, 0:33]
     r2 = (u - 16.0) ** 2 + (v - 16.0) ** 2
     bell = 0.5 * np.exp(-0.5 * r2 / ((100 * 0.1 / 2) ** 2 + 0.3))
@@ -267,7 +274,9 @@ def test_far_plane_and_radius_clip_leave_gaussians_out():
 def test_extreme_scales_stay_finite(scale, simd):
     """Specks still cover their pixel (eps2d), giants fill the image, and nothing is NaN."""
     scene = single_gaussian(scale=scale)
-    image, alpha, _ = rasterize(**scene, width=33, height=33, render_mode="RGB+ED", simd=simd)
+    image, alpha, _ = rasterize(
+        **scene, width=33, height=33, render_mode="RGB+ED", renderer=create_renderer(1, simd)
+    )
     assert torch.isfinite(image).all() and torch.isfinite(alpha).all()
     assert alpha[0, 16, 16, 0] == pytest.approx(0.5, abs=1e-4)
     if scale > 1:
@@ -314,7 +323,11 @@ def test_fuzz_finite_and_bounded(
     scene["means"] *= 10.0**spread
     scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
     image, alpha, _ = rasterize(
-        **scene, width=width, height=height, render_mode=mode, simd=simd, threads=threads
+        **scene,
+        width=width,
+        height=height,
+        render_mode=mode,
+        renderer=create_renderer(threads, simd),
     )
     assert torch.isfinite(image).all()
     assert (alpha >= 0).all() and (alpha <= 1 + 1e-6).all()
@@ -339,7 +352,10 @@ def test_fuzz_agrees_with_reference(seed, spread, log_scale):
 def test_simd_levels_agree_with_each_other():
     """Levels differ by rounding only."""
     scene = random_scene(count=2000, seed=11, size=(131, 77))
-    images = [rasterize(**scene, width=131, height=77, simd=level)[0] for level in LEVELS]
+    images = [
+        rasterize(**scene, width=131, height=77, renderer=create_renderer(1, level))[0]
+        for level in LEVELS
+    ]
     for image in images[1:]:
         error = (image - images[0]).abs()
         assert error.median() < 1e-6 and (error > 1e-3).float().mean() < 1e-3
@@ -348,7 +364,7 @@ def test_simd_levels_agree_with_each_other():
 def test_unavailable_simd_level_is_an_error():
     """A level that does not exist is refused, and the message lists those that do."""
     with pytest.raises(ValueError, match=f"'avx3' is not available.*{LEVELS[0]}"):
-        rasterize(**single_gaussian(), width=8, height=8, simd="avx3")
+        create_renderer(simd="avx3")
 
 
 def _with(name, value):
@@ -395,7 +411,6 @@ def _set(index, value):
         (lambda s: s | {"sh_degree": 4}, r"sh_degree is 4"),
         (lambda s: s | {"sh_degree": 1}, r"colors has shape \(300, 3\).*sh_degree=1"),
         (lambda s: s | {"eps2d": -0.1}, r"eps2d is -0.1"),
-        (lambda s: s | {"threads": 0}, r"threads is 0"),
         (lambda s: s | {"backgrounds": torch.zeros(3)}, r"backgrounds has shape \(3,\)"),
     ],
 )

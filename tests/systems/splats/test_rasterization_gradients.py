@@ -14,6 +14,7 @@ from torch import Tensor
 
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import create_renderer
 
 single_gaussian = reference.single_gaussian
 
@@ -121,7 +122,7 @@ def test_agree_with_reference_in_every_mode(mode, simd):
     """Gradients by scene, pose and background equal autograd's through the float64 reference."""
     scene = random_scene(seed=0)
     scene = with_backgrounds(scene) if mode.startswith("RGB") else scene
-    pairs = compare(scene, mode=mode, simd=simd)
+    pairs = compare(scene, mode=mode, renderer=create_renderer(1, simd))
     assert_agree(pairs)
     assert all(expected.any() for name, (_, expected) in pairs.items() if name != "colors")
 
@@ -132,7 +133,7 @@ def test_antialiased_agrees_with_reference(seed, simd):
     """The compensation of opacities is differentiated too, for needles and specks as well."""
     scene = random_scene(seed=seed)
     scene["scales"] *= 0.4
-    pairs = compare(scene, antialiased=True, simd=simd)
+    pairs = compare(scene, antialiased=True, renderer=create_renderer(1, simd))
     assert_agree(pairs)
 
 
@@ -183,7 +184,9 @@ def test_long_tile_lists_agree_with_reference(simd):
     scene = random_scene(count=2000, seed=6, size=(21, 18))
     scene["opacities"] = 0.02 + 0.03 * scene["opacities"]
     scene["means"] *= 0.3
-    assert_agree(compare(scene, size=(21, 18), least_clear=0.9, simd=simd), p99=1e-3)
+    assert_agree(
+        compare(scene, size=(21, 18), least_clear=0.9, renderer=create_renderer(1, simd)), p99=1e-3
+    )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (16, 16), (17, 33), (97, 1)])
@@ -251,8 +254,7 @@ def test_thread_counts_give_equal_bits(simd):
             sh_degree=1,
             render_mode="RGB+ED",
             absgrad=True,
-            threads=threads,
-            simd=simd,
+            renderer=create_renderer(threads, simd),
         )
         meta["means2d"].retain_grad()
         (image.square().sum() + alpha.sin().sum()).backward()
@@ -407,7 +409,7 @@ def test_extreme_scales_stay_finite(scale, antialiased, simd):
             width=33,
             height=33,
             render_mode="RGB+ED",
-            simd=simd,
+            renderer=create_renderer(1, simd),
             rasterize_mode="antialiased" if antialiased else "classic",
         )
         (image.sum() + alpha.sum()).backward()
@@ -457,8 +459,7 @@ def test_fuzz_finite(
         rasterize_mode="antialiased" if antialiased else "classic",
         eps2d=eps2d,
         absgrad=True,
-        simd=simd,
-        threads=threads,
+        renderer=create_renderer(threads, simd),
     )
     upstream = [normal_tensor(seed, *image.shape), normal_tensor(seed, *alpha.shape)]
     torch.autograd.backward([image, alpha], upstream)
@@ -493,3 +494,32 @@ def test_fitting_recovers_an_image():
         optimizer.step()
         losses.append(loss.item())
     assert losses[0] > 2e-3 and losses[-1] < 0.01 * losses[0], losses[-1]
+
+
+def test_gradients_of_one_walk_do_not_enter_the_next():
+    """Where Gaussians appear does not depend on their scales, also after another walk through the
+    graph that stopped at means2d."""
+    scene = leaves(random_scene(count=50, seed=3))
+    image, _, meta = rasterize(**scene, width=SIZE[0], height=SIZE[1])
+    torch.autograd.grad(image.sum(), meta["means2d"], retain_graph=True)
+    v_means, v_scales = torch.autograd.grad(
+        meta["means2d"].sum(), [scene["means"], scene["scales"]]
+    )
+    assert v_means.any() and not v_scales.any()
+
+
+def test_frames_of_one_renderer_do_not_mix():
+    """Images rendered with one renderer, all before any backward pass, have the gradients that each
+    has alone."""
+    renderer = create_renderer(2)
+
+    def loss(scene, **options):
+        return rasterize(**scene, width=SIZE[0], height=SIZE[1], **options)[0].square().sum()
+
+    scenes = [leaves(random_scene(count=count, seed=count)) for count in (40, 300, 80)]
+    for total in [loss(scene, renderer=renderer) for scene in scenes]:
+        total.backward()
+    for scene in scenes:
+        alone = leaves({name: tensor.detach() for name, tensor in scene.items()})
+        loss(alone).backward()
+        assert all(torch.equal(scene[name].grad, alone[name].grad) for name in ("means", "colors"))

@@ -11,6 +11,7 @@ from random_scenes import normal_tensor
 from torch import Tensor
 
 from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.camera_models import project_fisheye
 
 SIZE = (160, 120)
@@ -257,7 +258,12 @@ def test_same_bits_for_any_number_of_threads():
             n: t.requires_grad_() for n, t in blobs(5000, 0.02, seed=4).items()
         }
         image, alpha, _ = rasterize(
-            **scene, width=160, height=120, render_mode="RGB+ED", threads=threads, **lens("opencv")
+            **scene,
+            width=160,
+            height=120,
+            render_mode="RGB+ED",
+            renderer=create_renderer(threads),
+            **lens("opencv"),
         )
         (image.square().sum() + alpha.sum()).backward()
         results.append([image, alpha, *(t.grad for t in scene.values())])

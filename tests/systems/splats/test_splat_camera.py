@@ -152,3 +152,19 @@ def test_depth_range_must_not_be_empty():
     """A depth range that holds nothing is refused by name and value."""
     with pytest.raises(ValueError, match=r"depth range is \[2.0, 1.0\]"):
         SplatCamera(wall(3), INFO, min_depth=2.0, max_depth=1.0)
+
+
+def test_gaussian_scene_is_baked():
+    """A camera of Gaussians that are not baked sees what one of baked Gaussians sees."""
+    scene = GaussianScene.from_colors(
+        means=[[2.0, 0, 0]],
+        quats=[[1.0, 0, 0, 0]],
+        scales=[[0.1, 0.3, 0.3]],
+        opacities=[0.9],
+        colors=[[1.0, 0.5, 0.0]],
+    )
+    images = [
+        evaluate(SplatCamera(given, INFO, X_BC), "color_image", RigidTransform())
+        for given in (scene, BakedScene(scene))
+    ]
+    assert images[0].any() and np.array_equal(*images)

@@ -15,7 +15,8 @@ from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import rotation_matrices
 
 from splatpilot import _native
-from splatpilot.systems.splats import rasterize, surfels
+from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.depth_normals import depth_to_normals
 from splatpilot.systems.splats.surfels import rasterize_surfels
 
@@ -99,7 +100,9 @@ def test_images_agree_with_reference(simd, seed):
     expected = call_reference(scene, background=(0.1, 0.7, 0.3))
     clear = expected.margin > 1e-4
     assert clear.float().mean() > 0.99
-    images = render(scene, backgrounds=torch.tensor([[0.1, 0.7, 0.3]]), simd=simd)
+    images = render(
+        scene, backgrounds=torch.tensor([[0.1, 0.7, 0.3]]), renderer=create_renderer(1, simd)
+    )
     for name in OUTPUTS:
         wanted = getattr(expected, name)
         error = (images[name].double() - wanted).abs()
@@ -152,7 +155,7 @@ def test_gradients_agree_with_reference(sh_degree):
         other = reference_gradients(scene | ends, clear, sh_degree=sh_degree)
         moved = {k: torch.maximum(m, lengths(other[k] - exact[k])) for k, m in moved.items()}
     for simd in LEVELS:
-        call = partial(render, sh_degree=sh_degree, simd=simd)
+        call = partial(render, sh_degree=sh_degree, renderer=create_renderer(1, simd))
         ours = loss_gradients(call, scene, clear, torch.float32)
         for name in LEARNED:
             error = (ours[name] - exact[name]).abs()
@@ -173,7 +176,10 @@ def test_nearly_edge_on_surfels_keep_their_digits(sine):
     single = reference_gradients(scene, clear, torch.float32)
     for simd in LEVELS:
         ours = loss_gradients(
-            lambda s, simd=simd: render(s, simd=simd), scene, clear, torch.float32
+            lambda s, simd=simd: render(s, renderer=create_renderer(1, simd)),
+            scene,
+            clear,
+            torch.float32,
         )
         for name in ("means", "quats"):
             size = lengths(exact[name])
@@ -379,12 +385,13 @@ def all_bits(scene, **options):
 def test_same_bits_for_any_number_of_threads(simd):
     """Images and gradients do not depend on threads, nor on what was rendered before."""
     scene = random_scene(count=6000, seed=6, size=(150, 110), sh_degree=1)
-    options = {"width": 150, "height": 110, "sh_degree": 1, "simd": simd}
-    single = all_bits(scene, **options)
-    render(random_scene(seed=7), simd=simd)
-    for threads in (1, 2, 4):
-        bits = all_bits(scene, threads=threads, **options)
-        assert all(torch.equal(a, b) for a, b in zip(single, bits, strict=True)), threads
+    options = {"width": 150, "height": 110, "sh_degree": 1}
+    renderer = create_renderer(1, simd)
+    single = all_bits(scene, renderer=renderer, **options)
+    render(random_scene(seed=7), renderer=renderer)
+    for used in (renderer, create_renderer(2, simd), create_renderer(4, simd)):
+        bits = all_bits(scene, renderer=used, **options)
+        assert all(torch.equal(a, b) for a, b in zip(single, bits, strict=True))
 
 
 def test_batch_of_cameras_equals_single_calls():
@@ -412,28 +419,12 @@ def test_backward_twice_gives_the_same():
     """A graph that is retained can be walked again, whatever was rendered in between."""
     scene = random_scene(seed=4)
     scene["means"].requires_grad_()
-    loss = render(scene)["color"].sum()
+    renderer = create_renderer()
+    loss = render(scene, renderer=renderer)["color"].sum()
     (first,) = torch.autograd.grad(loss, scene["means"], retain_graph=True)
-    render(random_scene(seed=5))
+    render(random_scene(seed=5), renderer=renderer)
     (second,) = torch.autograd.grad(loss, scene["means"])
     assert torch.equal(first, second)
-
-
-def test_renderers_are_lent_again():
-    """A call returns its renderers when its graph is gone: their number does not grow."""
-
-    def idle() -> int:
-        return sum(map(len, surfels._Frames.idle.values()))
-
-    scene = random_scene(seed=4, cameras=2)
-    scene["means"].requires_grad_()
-    render(scene)["color"].sum().backward()
-    before = idle()
-    images = render(scene)
-    assert idle() == before - 2
-    images["color"].sum().backward()
-    del images
-    assert idle() == before
 
 
 def test_modes_and_meta():
@@ -478,7 +469,7 @@ def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, 
     scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
     for name in LEARNED:
         scene[name] = scene[name].requires_grad_()
-    images = render(scene, width=width, height=height, simd=simd, threads=threads)
+    images = render(scene, width=width, height=height, renderer=create_renderer(threads, simd))
     assert all(torch.isfinite(image).all() for image in images.values())
     assert (images["alpha"] >= 0).all() and (images["alpha"] <= 1 + 1e-6).all()
     assert (images["color"] >= 0).all() and (images["color"] <= 1 + 1e-5).all()
@@ -527,7 +518,6 @@ def _set(name, index, value):
         (lambda s: s | {"radius_clip": -1.0}, r"radius_clip is -1"),
         (lambda s: s | {"width": 0}, r"image size is 0 x 45"),
         (lambda s: s | {"near_plane": 0.0}, r"0 < near < far"),
-        (lambda s: s | {"threads": 0}, r"threads is 0"),
         (lambda s: s | {"sh_degree": 1}, r"colors has shape \(300, 3\).*sh_degree=1"),
         (lambda s: s | {"Ks": s["Ks"].requires_grad_()}, r"Ks requires a gradient"),
         (lambda s: {k: v.to("meta") if torch.is_tensor(v) else v for k, v in s.items()}, r"meta"),

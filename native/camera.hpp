@@ -1,0 +1,19 @@
+// From what users know of a camera to what the kernels need.
+#pragma once
+
+#include "types.hpp"
+
+namespace splatpilot {
+
+struct CameraParameters {
+  int width, height;
+  double K[9];                   // row-major, [px]; skew is ignored
+  double X_CW[16];               // world to camera, row-major
+  double near_plane, far_plane;  // [m]
+  double radius_clip, eps2d;     // [px], [px^2]
+  bool antialiased;
+};
+
+Camera make_camera(const CameraParameters& parameters);
+
+}  // namespace splatpilot

@@ -1,0 +1,39 @@
+"""The limit on pairs of Gaussian and tile, which no scene that fits into this machine reaches."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+NATIVE = Path(__file__).parents[2] / "native"
+PROGRAM = """
+#include <cstdio>
+#include "pair_count.hpp"
+
+int main() {
+  splatpilot::check_pair_count(0xffffffffull);
+  for (const uint64_t pairs : {0x100000000ull, 0x100000005ull}) {
+    try {
+      splatpilot::check_pair_count(pairs);
+      std::puts("accepted");
+    } catch (const std::length_error& error) {
+      std::puts(error.what());
+    }
+  }
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+def test_more_pairs_than_32_bits_count_are_an_error(tmp_path):
+    """2^32 - 1 pairs are accepted; 2^32 and 2^32 + 5, which wrap around to 0 and 5, are refused."""
+    source = tmp_path / "pair_count.cpp"
+    source.write_text(PROGRAM)
+    compiler = ["c++", "-std=c++20", f"-I{NATIVE}", str(source), "-o", str(tmp_path / "check")]
+    subprocess.run(compiler, check=True)
+    done = subprocess.run([tmp_path / "check"], capture_output=True, text=True, check=True)
+    first, second = done.stdout.splitlines()
+    assert first.startswith("the image has 4294967296 pairs")
+    assert second.startswith("the image has 4294967301 pairs")
+    assert "render a smaller image" in first

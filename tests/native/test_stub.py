@@ -1,0 +1,16 @@
+"""splatpilot/_native.pyi."""
+
+from pathlib import Path
+
+from nanobind.stubgen import StubGen
+
+from splatpilot import _native
+
+STUB = Path(__file__).parents[2] / "splatpilot" / "_native.pyi"
+
+
+def test_stub_is_what_the_module_gives():
+    """Generating the stub again changes nothing: `make stub` was run after the last change."""
+    generator = StubGen(_native)
+    generator.put(_native)
+    assert generator.get() == STUB.read_text()
