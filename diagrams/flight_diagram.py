@@ -8,6 +8,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, Syste
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.diagrams.meshcat import AddMeshcat
 from splatpilot.diagrams.observation import (
     AddObservation,
     AddSensors,
@@ -22,17 +23,8 @@ from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.flatness_controller import FlatnessController
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
-from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer
-from splatpilot.systems.visualization.drawing import (
-    draw_distance_slice,
-    draw_gaussians,
-    draw_goal,
-    draw_vehicle,
-)
-from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 LOG_PERIOD = 0.02  # [s]
@@ -154,7 +146,7 @@ def BuildFlightDiagram(
         log.set_name("hypotheses_log")
 
     if meshcat is not None:
-        _AddMeshcat(builder, scenario, world, meshcat)
+        AddMeshcat(builder, scenario, world, goal_of(scenario, world), meshcat)
 
     if video:
         onboard = cast(SplatCamera, builder.GetSubsystemByName("camera"))
@@ -245,36 +237,3 @@ def _ConnectDecision(
 def goal_of(scenario: Scenario, world: World) -> np.ndarray:
     """The goal p_WG (3,) [m]: the scenario's, or the world's where the scenario leaves it open."""
     return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)
-
-
-def _AddMeshcat(
-    builder: DiagramBuilder, scenario: Scenario, world: World, meshcat: Meshcat
-) -> None:
-    """Draws what stands still, and adds the systems that draw what moves."""
-    field = world.distance_field
-    p_WG = goal_of(scenario, world)
-    margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings that are drawn too.
-    for end in ("top_color", "bottom_color"):
-        meshcat.SetProperty("/Background", end, list(world.background))
-    draw_gaussians(
-        meshcat,
-        "/splatpilot/scene",
-        world.gaussians,
-        field.lower_W - margin,
-        field.upper_W + margin,
-    )
-    draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
-    draw_vehicle(meshcat, "/splatpilot/vehicle", VEHICLE_RADIUS)
-    draw_distance_slice(meshcat, "/splatpilot/distance_slice", field, float(p_WG[2]))
-    meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
-
-    plant, policy = (builder.GetSubsystemByName(name) for name in ("plant", "policy"))
-    plans = policy.HasOutputPort("hypotheses")
-    FlightVisualizer.AddToBuilder(
-        builder,
-        plant.GetOutputPort("state"),
-        meshcat,
-        policy.GetOutputPort("hypotheses") if plans else None,
-    )
-    camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
-    CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
