@@ -78,7 +78,7 @@ std::array<double, 6> lower_factor(const float* quat, const float* scale) {
 
 }  // namespace
 
-BakedScene::BakedScene(const GaussianArrays& g) : size_(g.count) {
+BakedScene::BakedScene(const GaussianArrays& g) {
   const std::vector<uint32_t> order = morton_order(g);
   arrays_.groups = (g.count + kPack - 1) / kPack;
   arrays_.sh_degree = g.sh_degree;

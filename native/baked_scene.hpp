@@ -15,14 +15,12 @@ class BakedScene {
   explicit BakedScene(const GaussianArrays& gaussians);
 
   const BakedArrays& arrays() const { return arrays_; }
-  size_t size() const { return size_; }
 
  private:
   void store_geometry(const GaussianArrays& g, const std::vector<uint32_t>& order);
   void store_colors(const GaussianArrays& g, const std::vector<uint32_t>& order);
   void store_bounds(const GaussianArrays& g, const std::vector<uint32_t>& order);
 
-  size_t size_;
   std::vector<float> geometry_, colors_, bounds_;
   BakedArrays arrays_{};
 };

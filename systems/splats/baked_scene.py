@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from splatpilot import _native
+from splatpilot.systems.splats.spherical_harmonics import degree_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -85,9 +86,7 @@ class BakedScene:
         self._renderer = create_renderer(threads, simd)
         names = ("means", "quats", "scales", "opacities", "sh")
         arrays = {n: np.ascontiguousarray(getattr(scene, n), dtype=np.float32) for n in names}
-        self._scene = _native.BakedScene(
-            **arrays, sh_degree={1: 0, 4: 1, 9: 2, 16: 3}[scene.sh.shape[1]]
-        )
+        self._scene = _native.BakedScene(**arrays, sh_degree=degree_of(scene.sh.shape[1]))
 
     def render(
         self,

@@ -35,20 +35,6 @@ class ProjectedGaussians(NamedTuple):
     valid: Tensor  # (N,) bool: every sigma point has a place on the image
 
 
-def project_pinhole(p_C: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """``u = fx x / z + cx``, ``v = fy y / z + cy``; valid where z > 0.
-
-    Args:
-        p_C: (..., 3) points [m].
-        K: (3, 3) intrinsics [px]; skew is ignored.
-
-    Returns:
-        (..., 2) pixels and (...,) validity.
-    """
-    valid = p_C[..., 2] > 0
-    return _to_pixels(_slopes(p_C, valid), K), valid
-
-
 def project_opencv(
     p_C: Tensor, K: Tensor, radial: Tensor, tangential: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -63,17 +63,6 @@ def sh_basis_functions(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
     return basis
 
 
-def evaluate_sh(sh: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
-    """Returns the sum over the basis, shape (..., 3): a colour is ``max(0, 0.5 + that)``.
-
-    `sh`, shape (..., K, 3) with K in {1, 4, 9, 16}, are coefficients per colour channel, and
-    `directions`, shape (..., 3), unit vectors; their leading dimensions broadcast.
-    """
-    sh = np.asarray(sh, dtype=np.float64)
-    degree = degree_of(sh.shape[-2])
-    return np.einsum("...k,...kc->...c", sh_basis(directions, degree), sh)
-
-
 def degree_of(coefficients: int) -> int:
     """Returns the degree that has so many coefficients: 1, 4, 9, 16 give 0, 1, 2, 3.
 

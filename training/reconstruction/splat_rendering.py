@@ -7,6 +7,7 @@ from torch import Tensor
 
 from splatpilot._native import Renderer
 from splatpilot.systems.splats.rasterization import rasterize
+from splatpilot.systems.splats.spherical_harmonics import degree_of
 from splatpilot.systems.splats.surfels import rasterize_surfels
 
 
@@ -53,7 +54,7 @@ def render(
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
-        "sh_degree": {1: 0, 4: 1, 9: 2, 16: 3}[gaussians[4].shape[1]],
+        "sh_degree": degree_of(gaussians[4].shape[1]),
         "backgrounds": background,
         "render_mode": f"RGB+{depth_mode}",
         "renderer": renderer,

