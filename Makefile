@@ -23,7 +23,7 @@ lint: .venv/installed
 
 # Writes the types of the native module, after a change of its bindings.
 stub: .venv/installed
-	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file splatpilot/_native.pyi
+	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file api/splatpilot/_native.pyi
 
 # The tests of the native kernels on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
 sanitize: .venv/installed

@@ -15,7 +15,7 @@ import pytest
 from splatpilot.diagrams.policies import BENCHMARK_POLICIES
 
 CHECKOUT = Path(__file__).parents[1]
-PACKAGES = "splatpilot", "systems", "diagrams", "training", "analysis"
+PACKAGES = "api", "systems", "diagrams", "training", "analysis"
 MAX_SIZE = 1.2e9
 """[bytes], of an installation that flies."""
 SHORT = "world: {length: 10, width: 6}\ntimeout: 1\n"
@@ -69,7 +69,7 @@ def test_distributions_are_complete(distributions):
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert {"diagrams/scenarios/P02.yaml", "systems/policies/weights/diffaero.npz"} < files
-    in_wheel = {f if f.startswith("splatpilot/") else f"splatpilot/{f}" for f in files}
+    in_wheel = {f"splatpilot/{f.removeprefix('api/splatpilot/')}" for f in files}
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     native = {
         name for name in names if name.startswith("splatpilot/_native.") and name.endswith("so")
@@ -134,3 +134,15 @@ def test_verb_without_its_extra_says_which(run, tmp_path, words, missing, extra)
     assert ended.returncode == 1
     needed = f"{words[0]} needs {missing}; pip install 'splatpilot[{extra}]'"
     assert ended.stderr == f"splatpilot: {needed}\n"
+
+
+def test_checkout_does_not_hide_what_is_installed(environment):
+    """Python that is started in the checkout's root imports the installed package, whole."""
+    program = "import splatpilot.systems.registry as r; print(r.__file__)"
+    answer = subprocess.run(
+        [environment / "bin" / "python", "-c", program],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+    )
+    assert answer.stdout.startswith(str(environment)), answer.stderr

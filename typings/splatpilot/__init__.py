@@ -1,1 +1,1 @@
-../../splatpilot/__init__.py
+../../api/splatpilot/__init__.py

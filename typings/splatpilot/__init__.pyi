@@ -1,1 +1,1 @@
-../../splatpilot/__init__.pyi
+../../api/splatpilot/__init__.pyi

@@ -1,1 +1,1 @@
-../../splatpilot/_native.pyi
+../../api/splatpilot/_native.pyi
