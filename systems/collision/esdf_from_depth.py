@@ -63,7 +63,7 @@ def esdf_from_depth_images(
             f"esdf_from_depth_images: the truncation is {truncation} m; it must be at least 2 "
             f"voxels, {2.0 * voxel_size} m, or surfaces fall through the grid."
         )
-    fusion = _Fusion(lower_W, upper_W, voxel_size, truncation)
+    fusion = DepthFusion(lower_W, upper_W, voxel_size, truncation)
     for depth, X_WC in _pair(depths, X_WCs, "fusing depth"):
         fusion.add(depth, _require_intrinsics(K), X_WC, _require_range(max_range))
     distance, seen = fusion.grids()
@@ -102,7 +102,7 @@ def bounds_of_depth_images(
     return lower - margin, upper + margin
 
 
-class _Fusion:
+class DepthFusion:
     """Weighted averages of truncated signed distances, kept in blocks of _BLOCK^3 voxels."""
 
     def __init__(
@@ -125,7 +125,7 @@ class _Fusion:
         R_CW = X_WC.rotation().matrix().T
         center_C = (self.block_center_W - X_WC.translation()) @ R_CW.T  # (B, 3)
         from_center_C = (self.from_center_W @ R_CW.T).astype(np.float32)
-        visible = self._visible(depth, K, center_C, max_range)
+        visible = self.visible_blocks(depth, K, center_C, max_range)
         cosine = _cosine_of_incidence(depth, K).ravel()
         height, width = depth.shape
         depth = depth.ravel()
@@ -165,7 +165,7 @@ class _Fusion:
         values = values.reshape(bx * _BLOCK, by * _BLOCK, bz * _BLOCK)
         return np.ascontiguousarray(values[:nx, :ny, :nz])
 
-    def _visible(
+    def visible_blocks(
         self, depth: np.ndarray, K: np.ndarray, center_C: np.ndarray, max_range: float
     ) -> np.ndarray:
         """The indices of the blocks that may hold a voxel the image sees.

@@ -60,7 +60,7 @@ def esdf_from_gaussians(
         raise ValueError(
             f"esdf_from_gaussians: observed has shape {observed.shape}; the grid has {shape}."
         )
-    density = _density(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)
+    density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)
     offset = _surface_offset(density, threshold, voxel_size)
     occupied = offset <= 0.0
     # Farther out the slope may reach over the rim of the Gaussians' support.
@@ -69,7 +69,7 @@ def esdf_from_gaussians(
     return esdf_from_occupancy(occupied, unknown, lower_W, voxel_size, offset)
 
 
-def _density(
+def density_on_grid(
     scene: GaussianScene, lower_W: np.ndarray, shape: tuple[int, int, int], voxel_size: float
 ) -> np.ndarray:
     """The Gaussians' density at the voxel centres, (nx, ny, nz) float32."""

@@ -124,8 +124,8 @@ def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch, voxel_size
     box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
     skipping = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
     monkeypatch.setattr(
-        esdf_from_depth._Fusion,
-        "_visible",
+        esdf_from_depth.DepthFusion,
+        "visible_blocks",
         lambda self, depth, K, center_C, max_range: np.arange(len(center_C)),
     )
     complete = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)

@@ -6,7 +6,7 @@ from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.esdf_from_gaussians import _density, esdf_from_gaussians
+from splatpilot.systems.collision.esdf_from_gaussians import density_on_grid, esdf_from_gaussians
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 VOXEL = 0.1
@@ -47,7 +47,7 @@ def test_density_is_the_sum_of_all_gaussians():
         covariance = R @ np.diag(np.square(scale, dtype=float) + (VOXEL / 2) ** 2) @ R.T
         squared = np.einsum("...i,ij,...j", p - mean, np.linalg.inv(covariance), p - mean)
         expected += np.where(squared < 3.5**2, opacity * np.exp(-0.5 * squared), 0.0)
-    density = _density(scene, np.zeros(3), shape, VOXEL)
+    density = density_on_grid(scene, np.zeros(3), shape, VOXEL)
     # A voxel on the rim of a Gaussian's support may fall on either side of it.
     error = np.abs(density - expected)
     assert np.count_nonzero(error > 1e-5) <= 3
