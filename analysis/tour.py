@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction import run as reconstruction
+from splatpilot.analysis.reconstruction.measure_scene import measure_scene
+from splatpilot.analysis.reconstruction.scene_measures import METRICS
 from splatpilot.diagrams import fly
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import SceneConfig
@@ -35,21 +37,34 @@ def run(
     What is there from a run before is used again: an interrupted tour goes on.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: see `render_capture.run`, `reconstruction.run` and
-            `fly.run`; or if `scene` was made of another capture.
+        FileNotFoundError, ValueError, OSError: see `render_capture.run`, `make_scene` and
+            `fly.run`.
     """
     capture = out / "capture"
     scene = out / "scene" if scene is None else scene
     render_capture.run(world=world, out=capture, config=config.render, seed=seed)
-    if (scene / "scene.yaml").is_file():
-        made_of = read_scene_metadata(scene).capture
-        if Path(made_of) != capture.absolute():
-            raise ValueError(
-                f"{scene}: was made of {made_of or 'another capture'}, not of {capture}; name "
-                "another folder with --scene"
-            )
-        print(f"{scene}: is reconstructed already")
-    else:
-        reconstruction.run(capture=capture, out=scene, config=config.reconstruct)
+    make_scene(capture, scene, config.reconstruct)
     config.flight.world = SceneConfig(path=str(scene.absolute()))
     return fly.run(scenario=config.flight, out=out / "flight")
+
+
+def make_scene(capture: Path, scene: Path, config: ReconstructConfig) -> None:
+    """Reconstructs and measures a capture, or leaves a scene that was made of it as it is.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: see `reconstruction.run`; or if `scene` was made of
+            another capture.
+    """
+    if not (scene / "scene.yaml").is_file():
+        reconstruction.run(capture=capture, out=scene, config=config)
+        return
+    made_of = read_scene_metadata(scene).capture
+    if Path(made_of) != capture.absolute():
+        raise ValueError(
+            f"{scene}: was made of {made_of or 'another capture'}, not of {capture}; name another "
+            "folder with --scene"
+        )
+    if (scene / METRICS).is_file():
+        print(f"{scene}: is reconstructed already")
+    else:
+        print(measure_scene(scene))

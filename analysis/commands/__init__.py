@@ -14,6 +14,7 @@ from splatpilot.analysis.commands import (
     fly,
     measure,
     merge,
+    places,
     reconstruct,
     replay,
     tour,
@@ -31,6 +32,7 @@ COMMANDS = (
     ablate,
     fidelity,
     capture,
+    places,
     tour,
     train,
 )

@@ -67,7 +67,9 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         world = scene
         if config.draw_ends and attempt % 10 == 9:
             again = int(rng.integers(2**31))
-            p_WS, p_WG, _ = draw_start_and_goal(scene.esdf, VEHICLE_RADIUS, again)
+            p_WS, p_WG, _ = draw_start_and_goal(
+                scene.esdf, VEHICLE_RADIUS, again, least=config.least_way
+            )
             scene = world = replace(scene, p_WS=p_WS, p_WG=p_WG)
         solids = _draw_solids(config, world, rng)
         if len(solids) < config.least:

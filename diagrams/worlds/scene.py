@@ -1,5 +1,6 @@
 """Scenes on disk as worlds: found by name, with start and goal drawn from the seed if wanted."""
 
+import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,14 +25,20 @@ class SceneSource:
     source: str = ""
     # Whether start and goal are drawn from the seed; otherwise they are the scene's own.
     draw_ends: bool = False
+    # [m] Least length of the shortest way between ends that are drawn.
+    least_way: float = 0.0
 
     def validate(self) -> None:
         """
         Raises:
-            ValueError: if no path is given.
+            ValueError: if no path is given, or the least way is negative or infinite.
         """
         if not self.path:
             raise ValueError("world.path is empty; name a scene folder or a PLY file")
+        if not 0 <= self.least_way < math.inf:
+            raise ValueError(
+                f"world.least_way is {self.least_way} m; it must be finite and at least 0"
+            )
 
 
 @dataclass
@@ -68,5 +75,5 @@ def read_scene_world(config: SceneSource, seed: int) -> World:
     world = read_scene(find_scene(config))
     if not config.draw_ends:
         return world
-    p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed)
+    p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed, least=config.least_way)
     return replace(world, p_WS=p_WS, p_WG=p_WG)

@@ -37,18 +37,25 @@ def choose_start_and_goal(
 
 
 def draw_start_and_goal(
-    esdf: Esdf, radius: float, seed: int, margin: float = 0.2, longest: float = 40.0
+    esdf: Esdf,
+    radius: float,
+    seed: int,
+    margin: float = 0.2,
+    longest: float = 40.0,
+    least: float = 0.0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     As `choose_start_and_goal`, but anywhere: the start is drawn from the largest connected part of
     free space, the goal from those nodes whose shortest path from it is at least 60 % of the
-    longest there is, up to `longest` [m]. The same seed gives the same bits.
+    longest there is, up to `longest` [m], and at least `least` [m]. The same seed gives the same
+    bits.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius`.
+        ValueError: if no free space holds a sphere of `radius`, or no way is as long as `least`.
     """
     rng = np.random.default_rng(seed)
+    reach = 0.0
     for graph, p_WN in _free_graphs(esdf, radius, margin):
         _, label = connected_components(graph, directed=False)
         part = np.flatnonzero(label == np.bincount(label).argmax())
@@ -56,10 +63,16 @@ def draw_start_and_goal(
         for _ in range(20):
             start = int(rng.choice(part))
             lengths = dijkstra(graph, directed=False, indices=start, limit=longest)
-            far = np.flatnonzero(np.isfinite(lengths) & (lengths >= 0.6 * min(reach, longest)))
+            wanted = max(0.6 * min(reach, longest), least)
+            far = np.flatnonzero(np.isfinite(lengths) & (lengths >= wanted))
             if len(far) and reach > 0:
                 goal = int(rng.choice(far))
                 return p_WN[start], p_WN[goal], float(lengths[goal])
+    if reach > 0:
+        raise ValueError(
+            f"no start was drawn from which a way of {least:g} m can be flown; the longest way found "
+            f"is {reach:.1f} m: ask for less with world.least_way, or capture more of the place"
+        )
     raise _no_room(esdf, radius)
 
 

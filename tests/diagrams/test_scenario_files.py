@@ -3,7 +3,7 @@
 import pytest
 
 from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
+from splatpilot.diagrams.scenario_files import benchmark_scenarios, other_scenarios, scenario_file
 from splatpilot.systems.configuration import dump_config, load_config, parse_config
 
 
@@ -17,13 +17,20 @@ def test_names_and_paths_are_found(tmp_path):
     assert scenario_file("mine.yaml").name == "mine.yaml"
 
 
+def test_scenarios_outside_the_benchmark_have_names_too():
+    """The benchmark has seventeen; others come with the program and are found by name."""
+    assert len(benchmark_scenarios()) == 17
+    assert not set(benchmark_scenarios()) & set(other_scenarios())
+    assert scenario_file("alley_splat").is_file()
+
+
 def test_unknown_scenario_lists_those_there_are():
     """An id that does not exist is an error with the ids that do."""
     with pytest.raises(ValueError, match=r"no scenario 'P99'.*P01, P02"):
         scenario_file("P99")
 
 
-@pytest.mark.parametrize("name", benchmark_scenarios())
+@pytest.mark.parametrize("name", benchmark_scenarios() | other_scenarios())
 def test_scenario_that_was_written_is_the_same(name):
     """Written to YAML and read again, a scenario has the same world, of the same type."""
     scenario = load_config(Scenario(), scenario_file(name))

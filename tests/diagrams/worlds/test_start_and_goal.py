@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 
 RADIUS = 0.354
@@ -77,3 +77,15 @@ def test_same_field_same_choice():
     first, second = (choose_start_and_goal(esdf, RADIUS) for _ in range(2))
     np.testing.assert_array_equal(first[0], second[0])
     np.testing.assert_array_equal(first[1], second[1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drawn_ends_are_as_far_apart_as_asked(seed):
+    """In an L the drawn way is at least as long as asked, which may be more than 60 % of the longest;
+    more than there is is refused, with what there is."""
+    esdf = corridors(ALONG_X, ALONG_Y)
+    _, _, longest = choose_start_and_goal(esdf, RADIUS)
+    _, _, length = draw_start_and_goal(esdf, RADIUS, seed, least=0.8 * longest)
+    assert 0.8 * longest <= length <= longest + 1e-9
+    with pytest.raises(ValueError, match=r"way of 50 m can be flown.*ask for less"):
+        draw_start_and_goal(esdf, RADIUS, seed, least=50.0)

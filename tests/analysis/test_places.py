@@ -1,0 +1,71 @@
+"""The places of the photorealistic scenarios."""
+
+import pytest
+import trimesh
+
+from splatpilot.analysis import places
+from splatpilot.analysis.places import BENCHMARK_PLACES, PLACES, Place, PlacesConfig
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios, other_scenarios
+from splatpilot.diagrams.worlds.scene import SceneSource
+from splatpilot.systems.configuration import load_config
+
+
+def scenes_of(files):
+    worlds = [load_config(Scenario(), file).world for file in files.values()]
+    return {world.path for world in worlds if isinstance(world, SceneSource)}
+
+
+def test_scenarios_fly_in_the_places():
+    """The benchmark's scenes are the benchmark's places, the others' are places too, and what a
+    scenario says of an absent one names the command that makes it."""
+    assert scenes_of(benchmark_scenarios()) == set(BENCHMARK_PLACES)
+    assert scenes_of(other_scenarios()) <= set(PLACES)
+    for file in (benchmark_scenarios() | other_scenarios()).values():
+        world = load_config(Scenario(), file).world
+        if isinstance(world, SceneSource):
+            assert f"splatpilot places {world.path}" in world.source
+
+
+def test_a_place_is_made_and_then_left_as_it_is(opengl, tmp_path, capsys, monkeypatch):
+    """From a mesh in the folder of data comes a measured scene; run again, it stays, and without
+    its measures it is measured again."""
+    mesh = trimesh.creation.box((7.0, 5.0, 3.0))
+    mesh.invert()
+    (tmp_path / "data/worlds").mkdir(parents=True)
+    mesh.export(tmp_path / "data/worlds/room.obj", include_normals=True)
+    monkeypatch.setitem(PLACES, "room", Place("worlds/room.obj", heights=(-0.5, 0.5)))
+    config = PlacesConfig()
+    config.tour.render.width, config.tour.render.height = 64, 48
+    config.tour.render.path = [[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
+    config.tour.render.yaws = [0.0, 90.0, 180.0, -90.0]
+    reconstruct = config.tour.reconstruct
+    reconstruct.iterations, reconstruct.image_width = 20, 0
+    reconstruct.initial_gaussians = 2000
+    arguments = {"names": ["room"], "data": tmp_path / "data", "scenes": tmp_path / "scenes"}
+    places.run(**arguments, config=config)
+    room = tmp_path / "scenes/room"
+    written = (room / "gaussians.ply").read_bytes()
+    assert (room / "metrics.json").is_file() and (tmp_path / "scenes/captures/room").is_dir()
+
+    (room / "metrics.json").unlink()
+    capsys.readouterr()
+    places.run(**arguments, config=config)
+    assert "is rendered already" in capsys.readouterr().out
+    assert (room / "metrics.json").is_file()
+    places.run(**arguments, config=config)
+    assert "is reconstructed already" in capsys.readouterr().out
+    assert (room / "gaussians.ply").read_bytes() == written
+
+
+def test_what_is_missing_is_named_before_anything_is_made(tmp_path):
+    """An unknown place, no folder of data, and a file that is not there are told first."""
+    scenes = tmp_path / "scenes"
+    for names, data, error, words in (
+        (["nowhere"], tmp_path, ValueError, "no place 'nowhere'; there are hospital"),
+        (["forest_splat", "hospital"], None, ValueError, "tartanair/hospital is needed; name"),
+        (["bookstore"], tmp_path, FileNotFoundError, "worlds/bookstore.gltf: does not exist"),
+    ):
+        with pytest.raises(error, match=words):
+            places.run(names=names, data=data, scenes=scenes, config=PlacesConfig())
+    assert not scenes.exists()
