@@ -5,28 +5,49 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatpilot.analysis.tour import TourConfig, make_scene
+from splatpilot.systems.configuration import load_config
 from splatpilot.training.captures import render_capture
+from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 DATA = "SPLATPILOT_DATA"
 """Environment variable that names the folder of captures and meshes."""
 
 
+@dataclass
+class PlaceConfig:
+    """How a scene is made: rendered, unless it was captured, and reconstructed, as on a tour."""
+
+    render: RenderConfig = field(default_factory=lambda: TourConfig().render)
+    reconstruct: ReconstructConfig = field(default_factory=lambda: TourConfig().reconstruct)
+
+
 @dataclass(frozen=True)
 class Place:
-    """What a scene is made of: a capture or a mesh, below the folder of data, or a scenario."""
+    """What a scene is made of, and how."""
 
-    source: str
-    apart: float = 4.0  # [m] between visited places, of what is rendered
-    heights: tuple[float, float] = (1.0, 2.2)  # [m] of the camera, of what is rendered
-    seed: int = 0  # of a scenario
+    source: str  # a capture or a mesh, below the folder of data, or a scenario
+    settings: tuple[str, ...] = ()  # of `PlaceConfig`, as --set takes them
 
 
 PLACES = {
-    "hospital": Place("tartanair/hospital"),
-    "bookstore": Place("worlds/bookstore.gltf", apart=3.0),
-    "warehouse": Place("worlds/warehouse.gltf"),
-    "hospital_building": Place("worlds/hospital_building.gltf", apart=3.0, heights=(1.0, 2.0)),
+    "hospital": Place(
+        "tartanair/hospital",
+        ("reconstruct.initial_gaussians=60000", "reconstruct.voxel_size=0.05"),
+    ),
+    "bookstore": Place("worlds/bookstore.gltf", ("render.up=z",)),
+    "warehouse": Place("worlds/warehouse.gltf", ("render.up=z",)),
+    "hospital_building": Place(
+        "worlds/hospital_building.gltf",
+        (
+            "render.up=z",
+            "render.highest=2.0",
+            "render.apart=6",
+            "render.spacing=1.4",
+            "reconstruct.initial_gaussians=180000",
+            "reconstruct.max_gaussians=180000",
+        ),
+    ),
     "forest_splat": Place("P02"),
     "alley_splat": Place("P09"),
 }
@@ -35,15 +56,9 @@ PLACES = {
 BENCHMARK_PLACES = tuple(name for name in PLACES if name != "alley_splat")
 
 
-@dataclass
-class PlacesConfig:
-    """How scenes are made."""
-
-    tour: TourConfig = field(default_factory=TourConfig)  # of what is rendered
-    captured: ReconstructConfig = field(default_factory=ReconstructConfig)  # of captures
-
-
-def run(*, names: Sequence[str], data: Path | None, scenes: Path, config: PlacesConfig) -> None:
+def run(
+    *, names: Sequence[str], data: Path | None, scenes: Path, overrides: Sequence[str] = ()
+) -> None:
     """Makes the scene folders `scenes/NAME`, one after the other.
 
     What is rendered is kept in `scenes/captures/NAME`. What is there from a run before is used
@@ -52,30 +67,29 @@ def run(*, names: Sequence[str], data: Path | None, scenes: Path, config: Places
     Args:
         names: of `PLACES`; the benchmark's if empty.
         data: folder of captures and meshes; None will do for generated worlds.
-        scenes: where scenes are looked for by scenarios.
-        config: how.
+        scenes: where scenarios look for scenes.
+        overrides: FIELD=VALUE of `PlaceConfig`, for all of them.
 
     Raises:
-        ValueError: if a name is unknown, or data are needed and None is given.
+        ValueError: if a name or a setting is unknown, or data are needed and None is given.
         FileNotFoundError, ValueError, OSError: see `render_capture.run` and `tour.make_scene`.
     """
     names = list(names) or list(BENCHMARK_PLACES)
     for name in names:
         if name not in PLACES:
             raise ValueError(f"there is no place {name!r}; there are {', '.join(PLACES)}")
-    sources = {name: _source(PLACES[name], data) for name in names}
-    for name, source in sources.items():
+    sources = [_source(PLACES[name], data) for name in names]
+    configs = [
+        load_config(PlaceConfig(), overrides=[*PLACES[name].settings, *overrides]) for name in names
+    ]
+    for name, source, config in zip(names, sources, configs, strict=True):
         print(f"== {name}, from {source}")
-        place, scene = PLACES[name], scenes / name
         if isinstance(source, Path) and source.is_dir():
-            make_scene(source, scene, config.captured)
-            continue
-        render = config.tour.render
-        render.up, render.apart = "z", place.apart
-        render.lowest, render.highest = place.heights
-        capture = scenes / "captures" / name
-        render_capture.run(world=source, out=capture, config=render, seed=place.seed)
-        make_scene(capture, scene, config.tour.reconstruct)
+            capture = source
+        else:
+            capture = scenes / "captures" / name
+            render_capture.run(world=source, out=capture, config=config.render)
+        make_scene(capture, scenes / name, config.reconstruct)
 
 
 def _source(place: Place, data: Path | None) -> str | Path:

@@ -22,13 +22,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     places.add_argument(
         "--out", type=Path, help="folder of scenes (default: $SPLATPILOT_SCENES, or scenes)"
     )
-    add_overrides(places, "tour.reconstruct.iterations=3000")
+    add_overrides(places, "reconstruct.iterations=3000")
 
 
 def _places(options: argparse.Namespace) -> None:
     from splatpilot.analysis import places
     from splatpilot.diagrams.worlds.scene import SCENES
-    from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     data = options.data or (Path(os.environ[places.DATA]) if places.DATA in os.environ else None)
@@ -36,5 +35,5 @@ def _places(options: argparse.Namespace) -> None:
         names=options.names,
         data=data,
         scenes=options.out or Path(os.environ.get(SCENES, "scenes")),
-        config=load_config(places.PlacesConfig(), overrides=options.overrides),
+        overrides=options.overrides,
     )

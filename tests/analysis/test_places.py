@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from splatpilot.analysis import places
-from splatpilot.analysis.places import BENCHMARK_PLACES, PLACES, Place, PlacesConfig
+from splatpilot.analysis.places import BENCHMARK_PLACES, PLACES, Place, PlaceConfig
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, other_scenarios
 from splatpilot.diagrams.worlds.scene import SceneSource
@@ -21,6 +21,8 @@ def test_scenarios_fly_in_the_places():
     scenario says of an absent one names the command that makes it."""
     assert scenes_of(benchmark_scenarios()) == set(BENCHMARK_PLACES)
     assert scenes_of(other_scenarios()) <= set(PLACES)
+    for place in PLACES.values():
+        load_config(PlaceConfig(), overrides=list(place.settings)).reconstruct.validate()
     for file in (benchmark_scenarios() | other_scenarios()).values():
         world = load_config(Scenario(), file).world
         if isinstance(world, SceneSource):
@@ -34,26 +36,33 @@ def test_a_place_is_made_and_then_left_as_it_is(opengl, tmp_path, capsys, monkey
     mesh.invert()
     (tmp_path / "data/worlds").mkdir(parents=True)
     mesh.export(tmp_path / "data/worlds/room.obj", include_normals=True)
-    monkeypatch.setitem(PLACES, "room", Place("worlds/room.obj", heights=(-0.5, 0.5)))
-    config = PlacesConfig()
-    config.tour.render.width, config.tour.render.height = 64, 48
-    config.tour.render.path = [[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
-    config.tour.render.yaws = [0.0, 90.0, 180.0, -90.0]
-    reconstruct = config.tour.reconstruct
-    reconstruct.iterations, reconstruct.image_width = 20, 0
-    reconstruct.initial_gaussians = 2000
-    arguments = {"names": ["room"], "data": tmp_path / "data", "scenes": tmp_path / "scenes"}
-    places.run(**arguments, config=config)
+    settings = (
+        "render.up=z",
+        "render.width=64",
+        "render.height=48",
+        "render.path=[[-2, 0, 0], [2, 0, 0]]",
+        "render.yaws=[0, 90, 180, -90]",
+        "reconstruct.image_width=0",
+        "reconstruct.initial_gaussians=2000",
+    )
+    monkeypatch.setitem(PLACES, "room", Place("worlds/room.obj", settings))
+    arguments = {
+        "names": ["room"],
+        "data": tmp_path / "data",
+        "scenes": tmp_path / "scenes",
+        "overrides": ["reconstruct.iterations=20"],
+    }
+    places.run(**arguments)
     room = tmp_path / "scenes/room"
     written = (room / "gaussians.ply").read_bytes()
     assert (room / "metrics.json").is_file() and (tmp_path / "scenes/captures/room").is_dir()
 
     (room / "metrics.json").unlink()
     capsys.readouterr()
-    places.run(**arguments, config=config)
+    places.run(**arguments)
     assert "is rendered already" in capsys.readouterr().out
     assert (room / "metrics.json").is_file()
-    places.run(**arguments, config=config)
+    places.run(**arguments)
     assert "is reconstructed already" in capsys.readouterr().out
     assert (room / "gaussians.ply").read_bytes() == written
 
@@ -67,5 +76,5 @@ def test_what_is_missing_is_named_before_anything_is_made(tmp_path):
         (["bookstore"], tmp_path, FileNotFoundError, "worlds/bookstore.gltf: does not exist"),
     ):
         with pytest.raises(error, match=words):
-            places.run(names=names, data=data, scenes=scenes, config=PlacesConfig())
+            places.run(names=names, data=data, scenes=scenes)
     assert not scenes.exists()
