@@ -70,7 +70,7 @@ def draw_start_and_goal(
                 return p_WN[start], p_WN[goal], float(lengths[goal])
     if reach > 0:
         raise ValueError(
-            f"no start was drawn from which a way of {least:g} m can be flown; the longest found is "
+            f"no start was drawn from which a way of {least:g} m can be flown; the longest is "
             f"{reach:.1f} m: ask for less with world.least_way, or capture more of the place"
         )
     raise _no_room(esdf, radius)

@@ -81,8 +81,8 @@ def test_same_field_same_choice():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drawn_ends_are_as_far_apart_as_asked(seed):
-    """In an L the drawn way is as long as asked, also if that is more than 60 % of the longest; more
-    than there is is refused, with what there is."""
+    """In an L the drawn way is as long as asked, also if that is more than 60 % of the longest; to
+    ask for more than there is is an error with what there is."""
     esdf = corridors(ALONG_X, ALONG_Y)
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
     _, _, length = draw_start_and_goal(esdf, RADIUS, seed, least=0.8 * longest)
