@@ -81,7 +81,9 @@ def depth_errors(frames: Sequence[DepthFrame], reach: float) -> dict[str, DepthE
         frames: of any sizes.
         reach: [m], the farthest that the camera sees.
     """
-    depth, truth = (np.concatenate([image.ravel() for image in k]) for k in zip(*frames, strict=True))
+    depth, truth = (
+        np.concatenate([image.ravel() for image in k]) for k in zip(*frames, strict=True)
+    )
     edge = np.concatenate([at_edges(frame.truth, reach).ravel() for frame in frames])
     parts = {"all": np.full(len(edge), True), "at edges": edge, "elsewhere": ~edge}
     return {name: DepthErrors.of(depth[on], truth[on], reach) for name, on in parts.items()}

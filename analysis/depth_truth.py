@@ -72,7 +72,9 @@ class TrueDepth:
         distances, _ = self._shapes.near(p_WC)
         return np.concatenate(
             [
-                self._shapes.depth(p_WC, R_WC, PinholeGrid(rays, 0.0), distances, distances.shape[1])
+                self._shapes.depth(
+                    p_WC, R_WC, PinholeGrid(rays, 0.0), distances, distances.shape[1]
+                )
                 for rays in torch.tensor(slopes_C, dtype=torch.float32).split(_RAYS)
             ],
             axis=1,
