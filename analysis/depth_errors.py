@@ -56,7 +56,7 @@ class DepthErrors:
         Beyond `reach` [m] the camera says infinity. What is farther counts as being there, so that
         a surface at the end of the reach is no error and one in front of the sky is.
         """
-        known = np.isfinite(truth) | np.isinf(truth)
+        known = ~np.isnan(truth)
         left_out = 1 - known.mean() if len(truth) else np.nan
         depth, truth = depth[known], np.minimum(truth[known], reach)
         error = np.minimum(depth, reach) - truth

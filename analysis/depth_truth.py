@@ -50,21 +50,24 @@ class TrueDepth:
         self._scenery = BakedScene(merge(scenery)) if scenery else None
 
     def image(self, camera: OnboardCamera, X_WC: RigidTransform) -> NDArray[np.floating]:
-        """Planar depth (H, W) [m] along the middles of the pixels, exact to 1 mm; infinite where
-        nothing is, NaN where unknown."""
+        """Planar depth (H, W) [m] along the middles of the pixels, exact to 1 mm within the camera's
+        reach; infinite where nothing is, NaN where unknown."""
         slopes_C = camera.ray_slopes()
-        depth = self._cast(slopes_C.reshape(-1, 3), X_WC).reshape(slopes_C.shape[:2])
+        depth = self._cast(slopes_C.reshape(-1, 3), X_WC, camera.max_depth)
+        depth = depth.reshape(slopes_C.shape[:2])
         R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
         with np.errstate(invalid="ignore"):
             p_WQ = p_WC + depth[..., None] * (slopes_C @ R_WC.T)
             outside = ~((p_WQ >= self._lower_W) & (p_WQ <= self._upper_W)).all(axis=-1)
             unknown = np.isfinite(depth) & (p_WQ[..., 2] > self._upper_W[2])
         if self._scenery is not None:
-            view = render_view(self._scenery, camera.camera_info(), X_WC, 0.01, 1e10)
+            info, reach = camera.camera_info(), camera.max_depth
+            view = render_view(self._scenery, info, X_WC, near=0.01, far=reach)
             unknown |= outside & (view.alpha > _VEIL)
         return np.where(unknown, np.nan, depth)
 
-    def _cast(self, slopes_C: NDArray, X_WC: RigidTransform) -> NDArray:
+    def _cast(self, slopes_C: NDArray, X_WC: RigidTransform, reach: float) -> NDArray:
+        """Depth (N,) [m] along rays (N, 3) of depth 1 to what begins within `reach` [m]."""
         p_WC, R_WC = (
             torch.tensor(x, dtype=torch.float32)[None]
             for x in (X_WC.translation(), X_WC.rotation().matrix())

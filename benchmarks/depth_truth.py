@@ -23,9 +23,16 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 CAMERAS = [OnboardCamera(64, 36), OnboardCamera(320, 240)]
 COLUMNS = (
-    ("pixels", "left out", "bias < 4 m", "p5", "p95")
-    + ("too near", "too far", "> 0.5 m too near", "holes")
-)  # fmt: skip
+    "pixels",
+    "left out",
+    "bias < 4 m",
+    "p5",
+    "p95",
+    "too near",
+    "too far",
+    "> 0.5 m too near",
+    "holes",
+)
 
 
 def show(name: str, frames: list[list[DepthFrame]]) -> None:

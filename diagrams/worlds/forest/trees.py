@@ -67,7 +67,7 @@ def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
                     spacing = marks.around * coarse, marks.along * coarse
                     layers["marks"].append((tube(p_A, p_B, radius, spacing, rng), i))
             coarse = 2.5 * (1 + 0.4 * away[i])
-            spacing = min(0.12 * coarse, 1.2 * radius), 0.26 * coarse
+            spacing = min(0.12 * coarse, widest(radius, _INSET * coarse)), 0.26 * coarse
             crowned = tube(top[i], tip[i], radius, spacing, rng, taper=0.2)
             layers["fissures"].append((crowned, i))
         for layer, tubes in layers.items():
