@@ -39,7 +39,7 @@ SHAPES = {
 @pytest.mark.parametrize("kind", SHAPES)
 def test_outlines_are_those_of_the_solid(kind):
     """From all around, the area in which there is depth is the solid's own: nothing hangs over its
-    edges by more than a centimetre, two millimetres of thin things, nor is it smaller by that."""
+    edges by more than 12 mm, 2 mm of a wire, nor is it smaller by that."""
     shape, material = SHAPES[kind]
     bounds = np.full(3, -9.0), np.full(3, 9.0)
     blueprint = Blueprint(kind, *bounds, [Solid(shape, material)], *bounds, light=lambda _: _Even())
@@ -57,7 +57,7 @@ def test_outlines_are_those_of_the_solid(kind):
         solid += int(inside.sum())
         rim += int((inside[1:] ^ inside[:-1]).sum() + (inside[:, 1:] ^ inside[:, :-1]).sum())
     overhang = (drawn - solid) / rim * AWAY / FOCAL
-    assert abs(overhang) < (0.002 if kind == "wire" else 0.01)
+    assert abs(overhang) < (0.002 if kind == "wire" else 0.012)
 
 
 def _is_seen(shape: Shape, X_WC: RigidTransform) -> NDArray[np.bool_]:
