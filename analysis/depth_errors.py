@@ -102,4 +102,4 @@ def at_edges(truth: NDArray, reach: float) -> NDArray[np.bool_]:
         largest = np.maximum(np.maximum(w[2:], w[:-2]), w[1:-1])
         found[1:-1] |= bend > RELATIVE_TOLERANCE * largest
     square = np.full((2 * _EDGE_REACH + 1,) * 2, True)
-    return binary_dilation(edge, square)
+    return np.asarray(binary_dilation(edge, square), dtype=bool)

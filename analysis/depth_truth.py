@@ -1,6 +1,7 @@
 """The true depth of what is flown in: of generated worlds along flights, and of captures."""
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -111,7 +112,7 @@ def frames_along_flight(
         for row in rows:
             X_WB = pose_from_state(flight.states[row])
             camera.GetInputPort("body_pose").FixValue(context, X_WB)
-            image: ImageDepth32F = camera.GetOutputPort("depth_image_32f").Eval(context)
+            image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
             X_WC = X_WB @ config.X_BC()
             frames[-1].append(DepthFrame(image.data[..., 0].copy(), truth.image(config, X_WC)))
     return frames

@@ -19,7 +19,7 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
 from splatpilot.diagrams.worlds.solids.textures import OAK, mix, ramp, smoothstep
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
-SUNK = 0.008
+SUNK = 0.006
 """[m], depth of the closed layer under the ground: what lies on it is seen in front of it."""
 
 

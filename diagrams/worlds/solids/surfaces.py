@@ -21,11 +21,11 @@ THICKNESS = 0.001
 """[m], standard deviation of a splat across its surface."""
 
 RIM = 1.6
-"""How many standard deviations of its outermost patches a closed layer ends beyond their centres:
-there it lets half of the light through."""
+"""How many standard deviations beyond the centres of its outermost patches a closed layer ends. One
+layer lets half of the light through at 1.4, the two that meet at an edge a little farther out."""
 
 _BULGE = 2.0
-"""The same of flat patches around a curved surface, where those of both sides overlap."""
+"""The same of flat patches around a curved surface, of which many overlap along its outline."""
 
 _RINGS = 0.5, 4.0, 9.0, 16.0, 28.0  # [m], from the volume to the outer edges of rings of ground
 GROUND_REACH = _RINGS[-1]
@@ -127,12 +127,12 @@ def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLi
 
 def widest(radius: float, inset: float) -> float:
     """Spacing [m] of patches that lie `inset` [m] inside a surface of a radius [m] of curvature for
-    its outline to be where they let half of the light through; at most 0.3 radii count."""
+    its outline to be where they let half of the light through; more than 0.3 radii are too many."""
     return float(np.sqrt(2 * radius * min(inset, 0.3 * radius)) / (_BULGE * COVERAGE))
 
 
 def inset(surfels: Surfels, across: NDArray[np.float64], radius: ArrayLike) -> Surfels:
-    """Moves flat patches on a curved surface so far inwards that they do not bulge its outline.
+    """Moves flat patches on a curved surface so far inwards that they do not widen its outline.
 
     Args:
         across: (N,) [m], their standard deviations in the direction of the curvature.

@@ -105,7 +105,7 @@ _CORNERS = ((0.4, 0.7), (-0.4, -0.7))
 
 def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Coordinates uv (N, 2) [m] of a jittered lattice that divides the face evenly, and standard
-    deviations (N, 2) [m] with which it leaves no holes."""
+    deviations (N, 2) [m] with which it leaves no holes and ends where the face does."""
     size, spacings = np.array(face.size), np.full(2, spacing)
     if _bulges(face):
         spacings[0] = _finest(face, spacing)

@@ -70,4 +70,5 @@ def _is_seen(shape: Shape, X_WC: RigidTransform) -> NDArray[np.bool_]:
     for _ in range(40):
         distance = type(shape).distances(p_WQ, *shape.parameters())
         p_WQ += np.minimum(distance, 1.0)[:, None] * rays_W
-    return (distance < 1e-3).reshape(SIZE, SIZE)
+    near = type(shape).distances(p_WQ, *shape.parameters()) < 1e-3
+    return near.reshape(SIZE, SIZE)
