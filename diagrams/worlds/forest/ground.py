@@ -1,6 +1,7 @@
 """What cameras see of a forest floor and of what lies on it."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.forest.layout import ForestLayout
 from splatpilot.diagrams.worlds.forest.light import ForestLight
@@ -9,6 +10,7 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     Surfels,
     ground_rings,
+    inset,
     merge,
     on_ground,
     sphere,
@@ -17,9 +19,8 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
 from splatpilot.diagrams.worlds.solids.textures import OAK, mix, ramp, smoothstep
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
-SUNK = 0.06
-"""[m], depth of the closed layer under leaves and twigs, so that these are drawn in front of it
-at grazing angles too."""
+SUNK = 0.006
+"""[m], depth of the closed layer under the ground: what lies on it is seen in front of it."""
 
 
 def floor(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
@@ -29,7 +30,7 @@ def floor(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) ->
     for spacing, p in zip(spacings, ground_rings(layout, spacings, rng), strict=True):
         extent = COVERAGE * spacing * rng.uniform(0.8, 1.25, (len(p), 2))
         angle = rng.uniform(0, np.pi, len(p))
-        parts.append(on_ground(p, angle, extent, -SUNK - 0.1 * (spacing - 0.18)))
+        parts.append(on_ground(p, angle, extent, -SUNK))
     surfels = Surfels.concatenate(parts)
     albedo, _ = textures.forest_floor(surfels.p[:, :2])
     albedo = albedo * rng.uniform(0.8, 1.2, (len(albedo), 1))
@@ -48,12 +49,12 @@ def litter(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
     _, mossy = textures.forest_floor(p)
     p = p[rng.uniform(size=len(p)) > 0.8 * mossy]
     extent = rng.uniform(0.6, 1.3, (len(p), 1)) * (0.045, 0.026)
-    leaves = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, rng.uniform(0.012, 0.025, len(p)))
+    leaves = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, rng.uniform(0.025, 0.04, len(p)))
     scenes = [_on_floor(layout, light, leaves, textures.fallen_leaf(p), 0.93)]
 
     p = strew(1.6)
     extent = np.column_stack([rng.uniform(0.05, 0.16, len(p)), np.full(len(p), 0.007)])
-    twigs = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.022)
+    twigs = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.035)
     albedo = ramp([(0.20, 0.15, 0.11), (0.50, 0.43, 0.35)], rng.uniform(size=len(p)))
     scenes.append(_on_floor(layout, light, twigs, albedo, 0.9))
 
@@ -61,7 +62,7 @@ def litter(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
     _, mossy = textures.forest_floor(p)
     p = p[rng.uniform(size=len(p)) < mossy]
     extent = rng.uniform(0.7, 1.3, (len(p), 1)) * (0.055, 0.017)
-    blades = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.022)
+    blades = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.035)
     albedo = textures.moss(blades.p * 3) * rng.uniform(0.6, 1.9, (len(p), 1))
     scenes.append(_on_floor(layout, light, blades, albedo, 0.85))
     scenes.append(_ferns(layout, light, strew(0.10), rng))
@@ -100,19 +101,25 @@ def rocks_and_logs(
     """Covers boulders and fallen trunks, mossy on top; the list is empty if there are none."""
     scenes = []
     if len(layout.rocks):
-        surfels = Surfels.concatenate([sphere(rock[:3], rock[3], 0.06) for rock in layout.rocks])
+        surfels = Surfels.concatenate([_ball(rock[:3], rock[3]) for rock in layout.rocks])
         scenes.append(_grow_moss(light, surfels, textures.stone(surfels.p)))
     if len(layout.logs):
         parts = []
         for log in layout.logs:
-            parts.append(tube(log[:3], log[3:6], log[6], (0.06, 0.11), rng))
+            side = tube(log[:3], log[3:6], log[6], (0.05, 0.11), rng)
+            parts.append(inset(side, side.extent[:, 1], log[6]))
             for p_E, inwards in ((log[:3], log[3:6] - log[:3]), (log[3:6], log[:3] - log[3:6])):
-                cap = sphere(p_E, log[6], 0.06)
+                cap = _ball(p_E, log[6])
                 parts.append(cap[cap.n @ inwards < 0])
         surfels = Surfels.concatenate(parts)
         rotten = textures.bark(OAK, surfels.p) * (0.82, 0.68, 0.54)
         scenes.append(_grow_moss(light, surfels, rotten))
     return scenes
+
+
+def _ball(p_C: NDArray, radius: float) -> Surfels:
+    patches = sphere(p_C, radius, 0.05)
+    return inset(patches, patches.extent[:, 0], radius)
 
 
 def _grow_moss(light, surfels, albedo) -> GaussianScene:

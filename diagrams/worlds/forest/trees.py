@@ -10,12 +10,22 @@ from splatpilot.diagrams.worlds.forest.light import ForestLight
 from splatpilot.diagrams.worlds.forest.surroundings import paint_leaves
 from splatpilot.diagrams.worlds.solids import textures
 from splatpilot.diagrams.worlds.solids.light import Daylight
-from splatpilot.diagrams.worlds.solids.surfaces import Surfels, merge, perpendicular, tube
+from splatpilot.diagrams.worlds.solids.surfaces import (
+    Surfels,
+    inset,
+    merge,
+    perpendicular,
+    tube,
+    widest,
+)
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE, mix, smoothstep
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
-SUNK = 0.02
-"""[m], depth of the closed layer of a trunk under its surface: fissures, and no bias in depth."""
+_INSET = 0.012
+"""[m], how deep the closed layer may lie inside a trunk, where patches are finest: fissures."""
+
+_SINGLE = 0.5
+"""How far single patches bulge over those of a closed layer."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +61,14 @@ def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
             # Finest where the camera flies; crowns hide what is above the ceiling.
             for p_A, p_B, coarse in ((foot[i], middle[i], 1.0), (middle[i], top[i], 1.45)):
                 coarse *= 1 + 0.4 * away[i]
-                spacing = min(0.12 * coarse, 1.2 * radius), 0.26 * coarse
-                layers["fissures"].append((tube(p_A, p_B, radius - SUNK, spacing, rng), i))
+                spacing = min(0.12 * coarse, widest(radius, _INSET * coarse)), 0.32 * coarse
+                layers["fissures"].append((tube(p_A, p_B, radius, spacing, rng), i))
                 if away[i] < 4:
                     spacing = marks.around * coarse, marks.along * coarse
                     layers["marks"].append((tube(p_A, p_B, radius, spacing, rng), i))
             coarse = 2.5 * (1 + 0.4 * away[i])
-            spacing = min(0.12 * coarse, 1.2 * radius), 0.26 * coarse
-            crowned = tube(top[i], tip[i], radius - SUNK, spacing, rng, taper=0.2)
+            spacing = min(0.12 * coarse, widest(radius, _INSET * coarse)), 0.26 * coarse
+            crowned = tube(top[i], tip[i], radius, spacing, rng, taper=0.2)
             layers["fissures"].append((crowned, i))
         for layer, tubes in layers.items():
             if not tubes:
@@ -72,6 +82,8 @@ def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
                 surfels = _roughen(surfels, marks, rng)
                 opacity = rng.uniform(0.75, 0.97, len(surfels))
             surfels, tree = surfels[keep], tree[keep]
+            across = surfels.extent[:, 1] * (1.0 if layer == "fissures" else _SINGLE)
+            surfels = inset(surfels, across, trees.radius[tree])
             albedo = _bark(layout, light, species, layer, surfels, tree)
             scenes.append(light.paint(surfels, albedo, opacity[keep]))
     return merge(scenes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -17,8 +17,15 @@ COVERAGE = 0.62
 """Standard deviation over spacing at which a single layer of splats leaves no holes: midway between
 four neighbours, 0.71 spacings away, each still covers half of what lies behind it."""
 
-THICKNESS = 0.002
+THICKNESS = 0.001
 """[m], standard deviation of a splat across its surface."""
+
+RIM = 1.6
+"""How many standard deviations beyond the centres of its outermost patches a closed layer ends. One
+layer lets half of the light through at 1.4, the two that meet at an edge a little farther out."""
+
+_BULGE = 2.0
+"""The same of flat patches around a curved surface, of which many overlap along its outline."""
 
 _RINGS = 0.5, 4.0, 9.0, 16.0, 28.0  # [m], from the volume to the outer edges of rings of ground
 GROUND_REACH = _RINGS[-1]
@@ -116,6 +123,25 @@ def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLi
         t=np.column_stack([np.cos(angle), np.sin(angle), zeros]),
         extent=np.broadcast_to(extent, (N, 2)),
     )
+
+
+def widest(radius: float, inset: float) -> float:
+    """Spacing [m] of patches that lie `inset` [m] inside a surface of a radius [m] of curvature for
+    its outline to be where they let half of the light through; more than 0.3 radii are too many."""
+    return float(np.sqrt(2 * radius * min(inset, 0.3 * radius)) / (_BULGE * COVERAGE))
+
+
+def inset(surfels: Surfels, across: NDArray[np.float64], radius: ArrayLike) -> Surfels:
+    """Moves flat patches on a curved surface so far inwards that they do not widen its outline.
+
+    Args:
+        across: (N,) [m], their standard deviations in the direction of the curvature.
+        radius: [m], of curvature, a number or (N,).
+    """
+    radius = np.asarray(radius, dtype=np.float64)
+    bulge = np.minimum(_BULGE * across, 0.8 * radius)
+    depth = radius - np.sqrt(radius**2 - bulge**2)
+    return replace(surfels, p=surfels.p - depth[:, None] * surfels.n)
 
 
 def tube(

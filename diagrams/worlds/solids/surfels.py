@@ -11,9 +11,12 @@ from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     GROUND_REACH,
+    RIM,
     Surfels,
     ground_rings,
+    inset,
     to_gaussians,
+    widest,
 )
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import HalfSpace
@@ -24,9 +27,8 @@ Array = NDArray[np.float64]
 RAISED = 0.004
 """[m], height of marks over the closed layer."""
 
-SUNK = 0.04
-"""[m], depth of the closed layer of the ground under its surface. Seen at a slant, the near half of
-each patch is drawn first, which brings the ground nearer than it is."""
+INSET = 0.006
+"""[m], how deep the closed layer of a curved surface may lie inside it."""
 
 _BURIED = 0.05
 """[m], depth inside another solid at which a patch cannot be seen any more."""
@@ -65,18 +67,20 @@ def _patches(
             continue
         uv, extent = uv[facing], extent[facing]
         p, n, t = face.at(uv)
-        depth = SUNK if is_ground else 0.0
         # Means of the pattern at two places: thin lines tint all the patches they cross instead of
         # dotting some.
         near = [uv + corner * extent for corner in _CORNERS]
-        layers.append((Surfels(p - depth * n, n, t, extent), 0.99, face, near))
+        layer = Surfels(p, n, t, extent)
+        if _bulges(face):
+            layer = inset(layer, extent[:, 0], face.curved[0])
+        layers.append((layer, 0.99, face, near))
         for marks in () if face.round else material.marks:
             low, high = np.zeros(2), np.array(face.size)
             if is_ground:
                 low, high = np.full(2, GROUND_REACH - 0.5), high - (GROUND_REACH - 0.5)
             uv, extent = _place_marks(marks, low, high, rng)
             p, n, t = face.at(uv)
-            raised = Surfels(p + (RAISED - depth / 2) * n, n, t, extent)
+            raised = Surfels(p + RAISED * n, n, t, extent)
             layers.append((raised, 0.93, face, [uv]))
     if not layers:
         zero = np.zeros((0, 3))
@@ -101,16 +105,29 @@ _CORNERS = ((0.4, 0.7), (-0.4, -0.7))
 
 def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Coordinates uv (N, 2) [m] of a jittered lattice that divides the face evenly, and standard
-    deviations (N, 2) [m] with which it leaves no holes."""
-    size = np.array(face.size)
-    n = np.maximum(np.ceil(size / spacing - 1e-6).astype(int), 1)
-    if np.isfinite(face.curved[0]):
-        n[0] = max(n[0], 6)
+    deviations (N, 2) [m] with which it leaves no holes and ends where the face does."""
+    size, spacings = np.array(face.size), np.full(2, spacing)
+    if _bulges(face):
+        spacings[0] = _finest(face, spacing)
+    n = np.maximum(np.ceil(size / spacings - 1e-6).astype(int), 1)
     step = size / n
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
     uv = np.stack([i + 0.5, j + 0.5], axis=-1).reshape(-1, 2)
     uv = (uv + rng.uniform(-0.2, 0.2, uv.shape)) * step
-    return uv, np.tile(COVERAGE * step, (len(uv), 1))
+    extent = np.minimum(COVERAGE * step, np.minimum(uv, size - uv) / RIM)
+    if _bulges(face):  # it closes upon itself
+        extent[:, 0] = COVERAGE * step[0]
+    return uv, extent
+
+
+def _bulges(face: Face) -> bool:
+    """Whether a face is curved, and so no disc."""
+    return np.isfinite(face.curved[0]) and not (face.round and np.isinf(face.curved[1]))
+
+
+def _finest(face: Face, spacing: float) -> float:
+    """The spacing [m] of patches around a curved face."""
+    return min(spacing, widest(face.curved[0], INSET))
 
 
 def _place_marks(
@@ -127,28 +144,33 @@ def _place_marks(
         places = places + rng.uniform(-marks.jitter, marks.jitter, places.shape)
         extent = extent * rng.uniform(0.6, 1.25, extent.shape)
     uv = places * cell
-    on_it = ((uv > low + 0.5 * extent) & (uv < high - 0.5 * extent)).all(axis=1)
-    return uv[on_it], extent[on_it]
+    room = np.minimum(uv - low, high - uv)  # to the edge
+    on_it = (room > 0.5 * extent).all(axis=1)
+    return uv[on_it], np.minimum(extent, room / 2)[on_it]
 
 
 def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Coordinates (N, 2) and standard deviations (N, 2) that cover a round face evenly, along a
     spiral of golden angles: equal steps in area from the rim to the pole."""
     radius, (around, height) = face.curved[0], face.size
-    flat = not np.isfinite(face.curved[1])
+    flat = not _bulges(face)
+    if not flat:
+        spacing = _finest(face, spacing)
     whole = height > 0.4 * around  # a full sphere, not half
     area = np.pi * radius**2 * (1 if flat else 4 if whole else 2)
     N = max(6, round(area / spacing**2))
     part = (np.arange(N) + 0.5) / N
     angle = np.arange(N) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
+    step = np.sqrt(area / N)
+    extent = np.full((N, 2), COVERAGE * step)
     if flat:
-        v = radius * np.sqrt(part)
+        v = (radius - 0.4 * step) * np.sqrt(part)
+        extent[:, 1] = np.minimum(extent[:, 1], (radius - v) / RIM)
     else:
         first = -1.0 if whole else 0.0
         latitude = np.arcsin(first + (1 - first) * part)
         v = radius * (latitude - np.arcsin(first))
-    step = np.sqrt(area / N)
-    return np.column_stack([radius * angle, v]), np.full((N, 2), COVERAGE * step)
+    return np.column_stack([radius * angle, v]), extent
 
 
 def _ground(

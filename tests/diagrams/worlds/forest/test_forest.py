@@ -145,7 +145,7 @@ def test_leaves_around_the_volume_stay_out_of_it(world):
     solid = p[:, 2] < 0.1  # ground and litter
     for shape in _shapes(world):
         if isinstance(shape, (Capsule, Sphere)):
-            solid |= np.abs(type(shape).distances(p, *shape.parameters())) < 0.1
+            solid |= np.abs(type(shape).distances(p, *shape.parameters())) < 0.15
     reach = 3 * scene.scales.max(axis=1)
     leaves = (beyond > 0) & ~solid
     assert leaves.sum() > 10_000

@@ -1,0 +1,152 @@
+"""The true depth of what is flown in: of generated worlds along flights, and of captures."""
+
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import ImageDepth32F
+
+from splatpilot.analysis.depth_errors import DepthFrame
+from splatpilot.analysis.reconstruction.scene_views import SceneViews
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.sensors import make_camera
+from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.surfaces import merge
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.drake_images import ranged_depth, render_view
+from splatpilot.systems.splats.gaussian_ply import read_ply
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.training.policies.primitives import Primitives
+from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.reconstruction.measures import has_true_depth
+
+_BEYOND = 0.1
+"""[m], how far outside the volume scenery may begin."""
+
+_VEIL = 0.01
+"""Alpha from which scenery that has no solid may be what a pixel shows."""
+
+_RAYS = 4096  # cast at once
+_NEAREST = 24  # shapes that they are cast at first
+
+
+class TrueDepth:
+    """Exact depth images of the solids of a generated world.
+
+    Scenery beyond the volume has no solids, and the trunks of forests end in crowns above it: what
+    is there is not known.
+    """
+
+    def __init__(self, blueprint: Blueprint) -> None:
+        self._lower_W, self._upper_W = blueprint.lower_W - _BEYOND, blueprint.upper_W + _BEYOND
+        shapes = [solid.shape for solid in (*blueprint.solids, *blueprint.scenery)]
+        self._shapes = Primitives([shapes], self._lower_W[None] - 40, self._upper_W[None] + 40)
+        scenery = blueprint.surroundings()
+        self._scenery = BakedScene(merge(scenery)) if scenery else None
+
+    def image(self, camera: OnboardCamera, X_WC: RigidTransform) -> NDArray[np.floating]:
+        """Planar depth (H, W) [m] along the middles of the pixels, exact to 3 mm within reach of
+        the camera; infinite where nothing is, NaN where unknown."""
+        slopes_C = camera.ray_slopes()
+        depth = self._cast(slopes_C.reshape(-1, 3), X_WC, camera.max_depth)
+        depth = depth.reshape(slopes_C.shape[:2])
+        R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
+        with np.errstate(invalid="ignore"):
+            p_WQ = p_WC + depth[..., None] * (slopes_C @ R_WC.T)
+            outside = ~((p_WQ >= self._lower_W) & (p_WQ <= self._upper_W)).all(axis=-1)
+            unknown = np.isfinite(depth) & (p_WQ[..., 2] > self._upper_W[2])
+        if self._scenery is not None:
+            info, reach = camera.camera_info(), camera.max_depth
+            view = render_view(self._scenery, info, X_WC, near=0.01, far=reach)
+            unknown |= outside & (view.alpha > _VEIL)
+        return np.where(unknown, np.nan, depth)
+
+    def _cast(self, slopes_C: NDArray, X_WC: RigidTransform, reach: float) -> NDArray:
+        """Depth (N,) [m] along rays (N, 3) of depth 1 to what begins within `reach` [m]."""
+        p_WC, R_WC = (
+            torch.tensor(x, dtype=torch.float32)[None]
+            for x in (X_WC.translation(), X_WC.rotation().matrix())
+        )
+        distances, _ = self._shapes.near(p_WC)
+        ordered = distances[0].sort().values
+        rays = torch.tensor(slopes_C, dtype=torch.float32)
+        lengths = rays.norm(dim=1)
+        depth = torch.full_like(lengths, torch.inf)
+        rest, nearest, horizon = torch.arange(len(rays)), _NEAREST, 0.0
+        while len(rest) and horizon < reach * lengths.max():
+            for some in rest.split(_RAYS):
+                grid = PinholeGrid(rays[some], half_pixel=0.0)
+                depth[some] = self._shapes.depth(p_WC, R_WC, grid, distances, nearest)[0]
+            # What has not been looked at is no nearer than this.
+            horizon = float(ordered[nearest]) if nearest < len(ordered) else np.inf
+            rest, nearest = rest[depth[rest] * lengths[rest] > horizon], 4 * nearest
+        return depth.numpy()
+
+
+def frames_along_flight(
+    scenario: Scenario, cameras: list[OnboardCamera], count: int
+) -> list[list[DepthFrame]]:
+    """Flies a scenario in a generated world, and returns of each camera `count` frames evenly in
+    time.
+
+    Raises:
+        ValueError: for worlds that are not generated or cannot be made.
+        InfeasibleFlightError: for flights that cannot be flown.
+    """
+    truth = TrueDepth(make_blueprint(scenario.world, scenario.seed))
+    world = make_world(scenario.world, scenario.seed)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
+    frames = []
+    for config in cameras:
+        camera = make_camera(config, world)
+        context = camera.CreateDefaultContext()
+        frames.append([])
+        for row in rows:
+            X_WB = pose_from_state(flight.states[row])
+            camera.GetInputPort("body_pose").FixValue(context, X_WB)
+            image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
+            X_WC = X_WB @ config.X_BC()
+            frames[-1].append(DepthFrame(image.data[..., 0].copy(), truth.image(config, X_WC)))
+    return frames
+
+
+def frames_of_capture(scene: Path, cameras: list[OnboardCamera]) -> list[list[DepthFrame]]:
+    """Returns of each camera its frames where the capture of a scene folder was withheld, the
+    truth being the nearest pixel of the captured depth.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: for a damaged scene or capture, or one of which
+            nothing was withheld.
+    """
+    views = SceneViews(scene)
+    if not views.metadata.held_out:
+        raise ValueError(f"{scene}: no frames were withheld from it to compare it with")
+    gaussians = BakedScene(read_ply(scene / "gaussians.ply"))
+    frames: list[list[DepthFrame]] = [[] for _ in cameras]
+    for i in views.metadata.held_out:
+        captured = views.capture.frame(i)
+        for config, seen in zip(cameras, frames, strict=True):
+            view = render_view(gaussians, config.camera_info(), captured.X_WC, 0.01, 1e10)
+            depth = ranged_depth(view, config.min_depth, config.max_depth)
+            truth = sampled(captured.depth, captured.K, config)
+            seen.append(DepthFrame(depth, truth))
+    return frames
+
+
+def sampled(depth: NDArray, K: NDArray, camera: OnboardCamera) -> NDArray[np.floating]:
+    """The depth image (H, W) [m] of the intrinsics K (3, 3) [px] as `camera` would see it from the
+    same place: the nearest pixel, NaN where that has no depth or the image ends."""
+    slopes_C = camera.ray_slopes()
+    u, v = (np.floor(slopes_C @ K[k]).astype(int) for k in (0, 1))
+    height, width = depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    found = depth[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
+    return np.where(inside & has_true_depth(found), found, np.nan)

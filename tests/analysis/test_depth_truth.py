@@ -1,0 +1,72 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from splatpilot.analysis.depth_errors import depth_errors
+from splatpilot.analysis.depth_truth import TrueDepth, frames_along_flight, frames_of_capture
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.diagrams.worlds.make_world import make_blueprint
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+
+CAMERA = OnboardCamera(64, 36)
+
+
+@pytest.mark.parametrize("scenario", ["P04", "P10", "P11"])
+def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
+    """Along every ray the solids' distances are positive up to its depth and zero there."""
+    config = load_config(Scenario(), scenario_file(scenario))
+    blueprint = replace(make_blueprint(config.world, 0), surroundings=list)
+    X_WC = RigidTransform(blueprint.p_WS) @ CAMERA.X_BC()
+    depth = TrueDepth(blueprint).image(CAMERA, X_WC)
+    hit = np.isfinite(depth)
+    assert hit.mean() > 0.4
+    rays_W = CAMERA.ray_slopes()[hit] @ X_WC.rotation().matrix().T
+    shapes = [solid.shape for solid in (*blueprint.solids, *blueprint.scenery)]
+    field = AnalyticDistanceField(shapes, np.full(3, -500.0), np.full(3, 500.0))
+    p_WQ = X_WC.translation() + depth[hit][:, None] * rays_W
+    np.testing.assert_allclose(field.distance(p_WQ), 0, atol=3e-3)
+    for part in np.linspace(0.02, 0.98, 25):
+        before = X_WC.translation() + part * depth[hit][:, None] * rays_W
+        assert field.distance(before).min() > -3e-3
+
+
+def test_scenery_has_no_truth():
+    """In a field of boxes the trees around it are unknown, the ground and the boxes are not."""
+    config = load_config(Scenario(), scenario_file("P04"))
+    blueprint = make_blueprint(config.world, 0)
+    X_WC = RigidTransform(blueprint.p_WG - (4, 0, 0)) @ CAMERA.X_BC()  # the end is in sight
+    bare = TrueDepth(replace(blueprint, surroundings=list)).image(CAMERA, X_WC)
+    truth = TrueDepth(blueprint).image(CAMERA, X_WC)
+    unknown = np.isnan(truth) & ~np.isnan(bare)
+    assert unknown.mean() > 0.1
+    assert not unknown[bare < 5].any()
+    np.testing.assert_array_equal(truth[~unknown], bare[~unknown])
+
+
+def test_a_camera_in_a_furnished_room_sees_what_is_there():
+    """Along the planner's flight through P10 at most 0.5 % of the pixels are off by more than 0.1 m
+    or 5 %, and depths nearer than 4 m are unbiased within 0.5 %."""
+    config = load_config(Scenario(), scenario_file("P10"))
+    frames = frames_along_flight(config, [CAMERA], 12)[0]
+    errors = depth_errors(frames, CAMERA.max_depth)
+    assert errors["all"].pixels == 12 * 64 * 36
+    assert errors["all"].too_near + errors["all"].too_far <= 0.005
+    assert abs(errors["all"].bias) <= 0.005
+    assert errors["elsewhere"].too_near + errors["elsewhere"].too_far <= 0.001
+
+
+def test_a_scene_is_compared_with_frames_withheld_from_it(place):
+    """Against depth rendered of itself a scene has no errors; what a wider camera sees beyond the
+    captured image is left out; a scene of which nothing was withheld is refused."""
+    seen = frames_of_capture(place.scene("same", held_out=[8]), [CAMERA])[0]
+    same = depth_errors(seen, CAMERA.max_depth)["all"]
+    assert (same.pixels, same.too_near, same.too_far) == (64 * 36, 0, 0)
+    wide = frames_of_capture(place.scene("wide", held_out=[8]), [OnboardCamera(64, 36, fov_x=120)])
+    assert depth_errors(wide[0], CAMERA.max_depth)["all"].left_out > 0.3
+    with pytest.raises(ValueError, match="no frames were withheld"):
+        frames_of_capture(place.scene("all", held_out=[]), [CAMERA])
