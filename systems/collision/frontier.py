@@ -19,10 +19,10 @@ def reachable_space(esdf: Esdf, radius: float) -> NDArray[np.bool_]:
     """The free voxels (nx, ny, nz) that are connected, by faces, to one in which a sphere of
     `radius` [m] fits: whatever is seen from where the sphere can be, is seen through them."""
     free = esdf.states == FieldState.FREE
-    parts = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
+    parts = np.asarray(label(free)[0], dtype=np.intp)  # pyright: ignore[reportIndexIssue]
     room = distance_to_voxels(~free, esdf.voxel_size) - 0.5 * esdf.voxel_size
-    roomy = np.bincount(parts[room > radius], minlength=parts.max() + 1) > 0
-    return free & roomy[parts]
+    roomy = np.unique(parts[free & (room > radius)])
+    return np.isin(parts, roomy)
 
 
 def frontier_faces(
@@ -79,7 +79,7 @@ def hidden_frontier(
 
 
 def _values_at(
-    p_WQ: NDArray[np.float64], image: np.ndarray, K: np.ndarray, X_WC: RigidTransform
+    p_WQ: np.ndarray, image: np.ndarray, K: np.ndarray, X_WC: RigidTransform
 ) -> NDArray[np.float64]:
     """The pixels (N,) of an image (H, W) that see the points (N, 3) [m]; NaN beside it."""
     p_CQ = (p_WQ - X_WC.translation()) @ X_WC.rotation().matrix()
@@ -95,7 +95,7 @@ def _values_at(
 
 def _grown(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The voxels (nx, ny, nz) and all that touch them, by a corner at least."""
-    return maximum_filter(voxels, size=3)
+    return np.asarray(maximum_filter(voxels, size=3), dtype=bool)
 
 
 def with_obstacles(esdf: Esdf, voxels: NDArray[np.bool_]) -> Esdf:

@@ -13,6 +13,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_depth import esdf_from_depth_images
 from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.drake_images import ranged_depth
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 
@@ -58,9 +59,8 @@ def closed(captured) -> tuple[Esdf, GaussianScene]:
 
 
 def seen_depth(frontier: GaussianScene, X_WC: RigidTransform) -> np.ndarray:
-    """(120, 160) [m], infinite where the frontier does not stop half of the light."""
-    view = BakedScene(frontier).render(K, 160, 120, X_WC)
-    return np.where(view.alpha > 0.5, view.depth, np.inf)
+    """(120, 160) [m], what a depth camera sees of the frontier."""
+    return ranged_depth(BakedScene(frontier).render(K, 160, 120, X_WC), 0.0, 50.0)
 
 
 def test_frontier_hides_nothing_that_was_captured(captured, closed):
