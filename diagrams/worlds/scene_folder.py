@@ -1,7 +1,8 @@
 """Scene folders: a reconstructed place on disk.
 
 `gaussians.ply` is what cameras see, `esdf.npz` what collides, and `scene.yaml` (`SceneMetadata`)
-where it comes from and how it is to be used.
+where it comes from and how it is to be used. `frontier.ply`, if there is one, closes the place
+where nobody looked any further: cameras of flights see it too, measures of the scene do not.
 """
 
 import os
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpilot.diagrams.worlds.scene_metadata import (
+    FRONTIER,
     SceneMetadata,
     read_scene_metadata,
     write_scene_metadata,
@@ -23,6 +25,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
 from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 _MAX_VOXELS = 2e7
@@ -59,6 +62,9 @@ def read_scene_folder(path: str | Path) -> World:
             f"{path / 'scene.yaml'}: the scale of this scene is unknown (metric: false), so no "
             "distance in it can be trusted; reconstruct it with a scale"
         )
+    gaussians = read_ply(path / "gaussians.ply")
+    if metadata.frontier:
+        gaussians = gaussians.merged_with(read_ply(path / FRONTIER))
     esdf = Esdf.load(path / "esdf.npz")
     for name in ("lower_W", "upper_W"):
         said, found = getattr(metadata, name), getattr(esdf, name)
@@ -70,7 +76,7 @@ def read_scene_folder(path: str | Path) -> World:
     red, green, blue = metadata.background
     return World(
         name=metadata.name,
-        gaussians=read_ply(path / "gaussians.ply"),
+        gaussians=gaussians,
         distance_field=esdf,
         esdf=esdf,
         background=(red, green, blue),
@@ -101,6 +107,7 @@ def check_scene_target(path: str | Path) -> None:
 def write_scene_folder(
     path: str | Path,
     world: World,
+    frontier: GaussianScene | None = None,
     *,
     provenance: str,
     gains: Sequence[float] = (),
@@ -113,7 +120,7 @@ def write_scene_folder(
     image_width: int = 0,
 ) -> SceneMetadata:
     """Writes `world` as a scene folder and returns what its `scene.yaml` says; see `SceneMetadata`
-    for what is said about it.
+    for what is said about it. Its Gaussians are without the `frontier`, see `close_frontier`.
 
     The folder appears whole: it is written beside its place and renamed. A scene that stands there
     is replaced. Only the grid of the distance field is kept.
@@ -136,6 +143,7 @@ def write_scene_folder(
         background=[float(x) for x in world.background],
         p_WS=[float(x) for x in world.p_WS],
         p_WG=[float(x) for x in world.p_WG],
+        frontier=frontier is not None,
         representation=representation,
         capture=capture,
         capture_settings=list(capture_settings),
@@ -147,6 +155,8 @@ def write_scene_folder(
     try:
         new.mkdir(parents=True)
         write_ply(world.gaussians, new / "gaussians.ply")
+        if frontier is not None:
+            write_ply(frontier, new / FRONTIER)
         esdf.save(new / "esdf.npz")
         write_scene_metadata(new, metadata)
         if path.exists():

@@ -10,6 +10,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from splatpilot.systems.files import written_atomically
 
 FORMAT_VERSION = 1
+FRONTIER = "frontier.ply"
 WORLD_FRAME = "z up"
 REPRESENTATIONS = ("3dgs", "2dgs")
 
@@ -39,6 +40,8 @@ class SceneMetadata:
     falls with the square of the distance from the centre. The scene is free of it."""
     background: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Colour where no Gaussian is seen; red, green, blue in 0 to 1."""
+    frontier: bool = False
+    """Whether `frontier.ply` stands where the distance field has obstacles that nobody saw."""
     p_WS: list[float] = field(default_factory=list)
     """[m], default start."""
     p_WG: list[float] = field(default_factory=list)

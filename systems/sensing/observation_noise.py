@@ -1,7 +1,8 @@
 """What real cameras add to images: noise, missing depth, changing brightness, delay.
 
 The noise of an image is a function of a seed and of the image's number alone. It can be drawn again
-for any image, in any order, and a flight with it repeats bit for bit.
+for any image, in any order, and a flight with it repeats bit for bit. Policies train with the same
+noise; training repeats the formula for depth in torch (`training/policies/observation.py`).
 """
 
 import math
@@ -21,7 +22,8 @@ class ObservationNoise:
     depth_multiplicative: float = 0.0
     # [m] Error of each depth pixel that does not grow with depth.
     depth_additive: float = 0.0
-    # [-] Probability of each depth pixel to read nothing, which is 0.
+    # [-] Probability of each depth pixel to read nothing, which is infinity, as if nothing were
+    # within range: so the Starling's time-of-flight streamer gives a pixel without an echo.
     depth_dropout: float = 0.0
     # [-] Noise of each colour pixel and channel, in parts of full scale.
     color_noise: float = 0.0
@@ -30,16 +32,15 @@ class ObservationNoise:
     # [s] Age of the images that the policy sees; its state is up to date.
     latency: float = 0.0
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+    def validate(self, name: str = "observation") -> None:
+        """Raises ValueError on a value out of range, naming it as a field of `name`, its limit and
+        the remedy."""
         limits = {"depth_additive": math.inf, "latency": _LARGEST_LATENCY}
         for field in fields(self):
             value, limit = getattr(self, field.name), limits.get(field.name, 1.0)
             if not (0.0 <= value <= limit and value < math.inf):
                 most = f" and at most {limit:g}" if limit < math.inf else " and finite"
-                raise ValueError(
-                    f"observation.{field.name} is {value}; it must be at least 0{most}"
-                )
+                raise ValueError(f"{name}.{field.name} is {value}; it must be at least 0{most}")
 
     @property
     def changes_depth(self) -> bool:
@@ -59,20 +60,40 @@ def noisy_depth(
     min_depth: float,
     max_depth: float,
 ) -> np.ndarray:
-    """The depth image (H, W) float32 [m] with errors and holes.
+    """The depth image (H, W) float32 [m] with errors and holes; see `disturb_depth`."""
+    relative, absolute = generator.standard_normal((2, *depth.shape))
+    drop = generator.random(depth.shape)
+    return disturb_depth(depth, noise, relative, absolute, drop, min_depth, max_depth)
 
-        z' = z (1 + depth_multiplicative n_1) + depth_additive n_2,   n ~ N(0, 1) at each pixel
+
+def disturb_depth(
+    depth: np.ndarray,
+    noise: ObservationNoise,
+    relative: np.ndarray,
+    absolute: np.ndarray,
+    drop: np.ndarray,
+    min_depth: float,
+    max_depth: float,
+) -> np.ndarray:
+    """
+    Planar depth [m] as a worse camera measures it, float32.
+
+        z' = z (1 + depth_multiplicative n_1) + depth_additive n_2
 
     Pixels that read 0 or infinity keep that, and what an error takes out of the camera's range
-    reads as Drake's cameras do: 0 below `min_depth`, infinity above `max_depth` [m].
+    reads as Drake's cameras do: 0 below `min_depth`, infinity above `max_depth` [m]. Where
+    u < depth_dropout a pixel reads infinity whatever it saw.
+
+    Args:
+        relative, absolute: n_1 and n_2, of the depth's shape, drawn from N(0, 1).
+        drop: u, of the depth's shape, drawn from U(0, 1).
     """
-    relative, absolute = generator.standard_normal((2, *depth.shape))
-    dropped = generator.random(depth.shape) < noise.depth_dropout
     measured = np.isfinite(depth) & (depth > 0.0)
     z = np.where(measured, depth, 1.0).astype(float)
     z = z * (1.0 + noise.depth_multiplicative * relative) + noise.depth_additive * absolute
     z = np.where(z < min_depth, 0.0, np.where(z > max_depth, np.inf, z))
-    return np.where(dropped, 0.0, np.where(measured, z, depth)).astype(np.float32)
+    dropped = drop < noise.depth_dropout
+    return np.where(dropped, np.inf, np.where(measured, z, depth)).astype(np.float32)
 
 
 def noisy_color(

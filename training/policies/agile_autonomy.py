@@ -31,6 +31,7 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.agile_autonomy_agent import (
@@ -38,16 +39,22 @@ from splatpilot.training.policies.agile_autonomy_agent import (
     AgileAutonomyAgent,
     reaching_acceleration,
 )
+from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
 from splatpilot.training.policies.evaluation import FlightConditions, evaluate_agent, render_depth
 from splatpilot.training.policies.network import TrajectoryModule
-from splatpilot.training.policies.observation import Observation, ObservationNoise
+from splatpilot.training.policies.observation import (
+    Observation,
+    noisy_depth,
+    training_noise,
+    validate_training_noise,
+)
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import (
     WorldSelection,
     training_worlds,
     validation_worlds,
 )
-from splatpilot.training.policies.vehicles import BodyRate
+from splatpilot.training.policies.vehicles import BodyRate, choose_rows
 from splatpilot.training.policies.world_batch import STARTS, WorldBatch
 
 EPSILON = 0.05
@@ -84,7 +91,8 @@ class AgileAutonomyTraining:
     batch: int = 128
     # [-] Weight of the cost head's error.
     cost_weight: float = 0.1
-    noise: ObservationNoise = field(default_factory=ObservationNoise)
+    # What the images are disturbed by, and how late they are.
+    noise: ObservationNoise = field(default_factory=training_noise)
     # How the flights are that choose among checkpoints.
     validation: FlightConditions = field(default_factory=lambda: FlightConditions(body_rate=True))
 
@@ -95,6 +103,7 @@ class AgileAutonomyTraining:
         for name in ("rounds", "round_updates", "environments", "steps", "ask_every", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        validate_training_noise(self.noise, "noise")
         if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
             raise ValueError(f"speeds is {self.speeds}; give one or more of 0.1 to 10 m/s")
 
@@ -132,7 +141,7 @@ class AgileAutonomyTrainer:
         )
         sample = {name: values[chosen] for name, values in data.items()}
         spec = self.spec
-        depth = config.noise.disturb(sample["depth"].float(), self._generator)
+        depth = noisy_depth(sample["depth"].float(), config.noise, self._generator)
         image = (1.0 / depth.clamp(NEAREST, FARTHEST)).reshape(
             -1, spec.image_height, spec.image_width
         )
@@ -182,6 +191,8 @@ class AgileAutonomyTrainer:
         speed = torch.tensor(config.speeds, device=device)[which]
         control = FlatnessControllerConfig()
         vehicle, by_student = self._start(worlds, world, student)
+        latency = config.noise.latency * RATE
+        past = remembered(vehicle, latency)
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
         for step in range(config.steps):
@@ -191,16 +202,13 @@ class AgileAutonomyTrainer:
             ended |= ~inside.all(1)
             if ended.any():
                 fresh, flown = self._start(worlds, world, student)
-                vehicle = BodyRate(
-                    *(
-                        torch.where(ended[:, None], a, b)
-                        for a, b in zip(fresh, vehicle, strict=True)
-                    )
-                )
+                vehicle = choose_rows(ended, fresh, vehicle)
+                past = choose_rows(ended, remembered(fresh, latency), past)
                 by_student = torch.where(ended, flown, by_student)
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
                 distances, _ = primitives.near(vehicle.p)
-            depth, R_WB = render_depth(vehicle, primitives, self._agent.grid, distances)
+            past, R_WB = remember(past, vehicle), vehicle.attitude()
+            depth = render_depth(delayed(past, latency), primitives, self._agent.grid, distances)
             seen = Observation(depth, vehicle, R_WB, p_WG, speed)
             asked = step % config.ask_every == 0
             if asked:
@@ -224,7 +232,7 @@ class AgileAutonomyTrainer:
             along = LOOKAHEAD + (step % config.ask_every) * 2.0 / 3.0
             i, part = int(along), along - int(along)
             p_WR = (1.0 - part) * tracked[:, i] + part * tracked[:, i + 1]
-            noisy = seen._replace(depth=config.noise.disturb(depth, self._generator))
+            noisy = seen._replace(depth=noisy_depth(depth, config.noise, self._generator))
             of_student, _, _ = self._agent.decide(noisy, self._agent.initial_memory(N))
             a_cmd = torch.where(
                 by_student[:, None], of_student, reaching_acceleration(p_WR, vehicle)

@@ -6,12 +6,19 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
 from splatpilot.training.policies.evaluation import Agent, render_depth
 from splatpilot.training.policies.network import TrainableNetwork
-from splatpilot.training.policies.observation import Observation, ObservationNoise
-from splatpilot.training.policies.vehicles import PointMass
+from splatpilot.training.policies.observation import (
+    Observation,
+    noisy_depth,
+    training_noise,
+    validate_training_noise,
+)
+from splatpilot.training.policies.vehicles import PointMass, choose_rows, where_rows
 from splatpilot.training.policies.world_batch import STARTS, WorldBatch
 
 NEAREST = 4
@@ -58,7 +65,8 @@ class RolloutConfig:
     averaging: float = 0.5
     # [s] A flight ends after this time, wherever it is.
     longest: float = 15.0
-    noise: ObservationNoise = field(default_factory=ObservationNoise)
+    # What the images are disturbed by, and how late they are.
+    noise: ObservationNoise = field(default_factory=training_noise)
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
@@ -71,6 +79,7 @@ class RolloutConfig:
                 raise ValueError(
                     f"rollout.{name} is {limits}; it must be two positive numbers, the lesser first"
                 )
+        validate_training_noise(self.noise, "rollout.noise")
         if not 0.0 <= self.gradient_decay <= 1.0:
             raise ValueError(
                 f"rollout.gradient_decay is {self.gradient_decay}; it must be between 0 and 1"
@@ -84,6 +93,7 @@ class Episodes(NamedTuple):
     """The flights of N vehicles, which go on from one update to the next."""
 
     vehicle: PointMass
+    past: PointMass  # (N, K, ...), see `remembered`
     world: Tensor  # (N,), numbers of the worlds flown in
     v_mean: Tensor  # (N, 3) [m/s]
     memory: Tensor  # (N, H)
@@ -104,17 +114,20 @@ class DifferentiableRollout:
         self.learner, self.worlds, self.config = learner, worlds, config
         self.generator = generator
         self._control = FlatnessControllerConfig()
+        self._latency = config.noise.latency * learner.rate
         self.episodes = self._new_episodes()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next losses depend on but the learner."""
-        episodes = [*self.episodes.vehicle, *self.episodes[1:]]
+        vehicle, past, *others = self.episodes
+        episodes = [*vehicle, *past, *others]
         return {"episodes": episodes, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """The inverse of `state_dict`."""
-        count = len(PointMass._fields)
-        self.episodes = Episodes(PointMass(*state["episodes"][:count]), *state["episodes"][count:])
+        saved, count = state["episodes"], len(PointMass._fields)
+        vehicle, past = PointMass(*saved[:count]), PointMass(*saved[count : 2 * count])
+        self.episodes = Episodes(vehicle, past, *saved[2 * count :])
         self.generator.set_state(state["generator"])
 
     def _uniform(self, *size: int) -> Tensor:
@@ -136,9 +149,10 @@ class DifferentiableRollout:
         way = self.worlds.way(p, world)
         v = way * (speed * self._uniform(N))[:, None] + 0.3 * (self._uniform(N, 3) - 0.5)
         yaw = torch.atan2(way[:, 1], way[:, 0]) + 1.0 * (self._uniform(N) - 0.5)
-        lag = between(config.lag, N, 1)
+        vehicle = PointMass(p, v, torch.zeros_like(p), yaw, between(config.lag, N, 1))
         return Episodes(
-            PointMass(p, v, torch.zeros_like(p), yaw, lag),
+            vehicle,
+            remembered(vehicle, self._latency),
             world,
             v,
             self.learner.initial_memory(N),
@@ -160,11 +174,10 @@ class DifferentiableRollout:
         fresh = self._new_episodes()
         fresh = fresh._replace(age=torch.zeros_like(fresh.age))
 
-        def choose(new: Tensor, old: Tensor) -> Tensor:
-            return torch.where(ended.reshape(-1, *[1] * (old.dim() - 1)), new, old)
-
-        vehicle = PointMass(*map(choose, fresh.vehicle, episodes.vehicle))
-        return Episodes(vehicle, *map(choose, fresh[1:], episodes[1:]))
+        vehicle = choose_rows(ended, fresh.vehicle, episodes.vehicle)
+        past = choose_rows(ended, fresh.past, episodes.past)
+        others = zip(fresh[2:], episodes[2:], strict=True)
+        return Episodes(vehicle, past, *(where_rows(ended, a, b) for a, b in others))
 
     def losses(self) -> dict[str, Tensor]:
         """Flies on for `steps` and returns the mean of each term of the loss, differentiable."""
@@ -173,14 +186,16 @@ class DifferentiableRollout:
         keep = config.gradient_decay**dt
         forget = 1.0 - torch.exp(torch.tensor(-dt / config.averaging))
         with torch.no_grad():
-            vehicle, world, v_mean, memory, speed, age = self._restart_ended(self.episodes)
+            episodes = self._restart_ended(self.episodes)
+        vehicle, past, world, v_mean, memory, speed, age = episodes
         primitives, p_WG = worlds.primitives.select(world), worlds.p_WG[world]
         totals: dict[str, Tensor] = {}
         distances, normals = primitives.near(vehicle.p)
         for _ in range(config.steps):
-            depth, R_WB = render_depth(vehicle, primitives, learner.grid, distances)
-            depth = config.noise.disturb(depth, self.generator)
-            seen = Observation(depth, vehicle, R_WB, p_WG, speed)
+            past = remember(past, vehicle)
+            depth = render_depth(delayed(past, self._latency), primitives, learner.grid, distances)
+            depth = noisy_depth(depth, config.noise, self.generator)
+            seen = Observation(depth, vehicle, vehicle.attitude(), p_WG, speed)
             a_cmd, heading, memory = learner.decide(seen, memory)
             before = vehicle
             vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, self._control, heading)
@@ -204,6 +219,7 @@ class DifferentiableRollout:
                 totals[name] = totals.get(name, 0.0) + term / config.steps
         self.episodes = Episodes(
             vehicle.detach(),
+            past,
             world,
             v_mean.detach(),
             memory.detach(),

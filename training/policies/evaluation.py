@@ -6,9 +6,11 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.observation import Observation, ObservationNoise
+from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
+from splatpilot.training.policies.observation import Observation, noisy_depth
 from splatpilot.training.policies.primitives import Primitives
 from splatpilot.training.policies.ray_casting import PinholeGrid
 from splatpilot.training.policies.vehicles import BodyRate, PointMass, Vehicle
@@ -33,15 +35,14 @@ class Agent(Protocol):
         ...
 
 
+@torch.no_grad()
 def render_depth(
     vehicle: Vehicle, primitives: Primitives, grid: PinholeGrid, distances: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Depth (N, R) [m] from the vehicles' cameras, and their attitudes R_WB (N, 3, 3)."""
-    R_WB = vehicle.attitude()
-    with torch.no_grad():
-        x, y, z = R_WB.unbind(2)
-        R_WC = torch.stack([-y, -z, x], 2)
-        return primitives.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, grid, distances), R_WB
+) -> Tensor:
+    """Depth (N, R) [m] from the vehicles' cameras; see `Primitives.depth`."""
+    x, y, z = vehicle.attitude().unbind(2)
+    R_WC = torch.stack([-y, -z, x], 2)
+    return primitives.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, grid, distances)
 
 
 class Outcomes(NamedTuple):
@@ -92,10 +93,11 @@ def evaluate_agent(
     agent: Agent,
     worlds: WorldBatch,
     conditions: FlightConditions,
-    noise: ObservationNoise | None = None,
+    noise: ObservationNoise,
     seed: int = 0,
 ) -> Outcomes:
-    """Flies every world once from its start, at rest, level and facing the goal."""
+    """Flies every world once from its start, at rest, level and facing the goal; the images are
+    disturbed and late as `noise` says."""
     device = worlds.p_WS.device
     generator = torch.Generator(device).manual_seed(seed)
     count = len(worlds)
@@ -109,6 +111,8 @@ def evaluate_agent(
         vehicle = PointMass(worlds.p_WS, zero, zero, yaw, lag)
     memory, control = agent.initial_memory(count), FlatnessControllerConfig()
     speed = torch.full((count,), conditions.speed, device=device)
+    latency = noise.latency * agent.rate
+    past = remembered(vehicle, latency)
 
     reached, collided, left = (torch.zeros(count, dtype=torch.bool, device=device) for _ in "rcl")
     clearance = torch.full((count,), torch.inf, device=device)
@@ -130,13 +134,13 @@ def evaluate_agent(
         if ended.any():
             keep = (~ended).nonzero()[:, 0]
             flying, memory, distances = flying[keep], memory[keep], distances[keep]
-            vehicle = type(vehicle)(*(x[keep] for x in vehicle))
+            vehicle, past = (type(vehicle)(*(x[keep] for x in of)) for of in (vehicle, past))
             primitives = worlds.primitives.select(flying)
             continue
-        depth, R_WB = render_depth(vehicle, primitives, agent.grid, distances)
-        if noise is not None:
-            depth = noise.disturb(depth, generator)
-        seen = Observation(depth, vehicle, R_WB, p_WG[flying], speed[flying])
+        past = remember(past, vehicle)
+        depth = render_depth(delayed(past, latency), primitives, agent.grid, distances)
+        depth = noisy_depth(depth, noise, generator)
+        seen = Observation(depth, vehicle, vehicle.attitude(), p_WG[flying], speed[flying])
         a_cmd, heading, memory = agent.decide(seen, memory)
         before = vehicle.p
         vehicle = vehicle.step(a_cmd, dt, control, heading)

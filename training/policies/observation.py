@@ -1,11 +1,11 @@
 """What depth policies are told, in torch; see `systems.policies.observation` for each formula."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.policies.vehicles import Vehicle
 
 
@@ -19,25 +19,38 @@ class Observation(NamedTuple):
     speed: Tensor  # (N,) [m/s], asked for
 
 
-@dataclass
-class ObservationNoise:
-    """How depth images are disturbed in training, each pixel anew in every image."""
+def training_noise() -> ObservationNoise:
+    """How the images of a training run are disturbed unless its configuration says otherwise."""
+    return ObservationNoise(depth_multiplicative=0.03, depth_additive=0.02, depth_dropout=0.01)
 
-    # [-] Standard deviation of each depth, as a part of it.
-    scale: float = 0.03
-    # [m] Standard deviation of what is added to each depth.
-    offset: float = 0.02
-    # [-] Part of the pixels that read nothing, which is as far as can be seen.
-    dropout: float = 0.01
 
-    def disturb(self, depth: Tensor, generator: torch.Generator) -> Tensor:
-        """Planar depth (N, R) [m] as a worse camera measures it."""
-        normal = torch.empty_like(depth).normal_(generator=generator)
-        depth = depth * (1.0 + self.scale * normal)
-        if self.offset > 0.0:
-            depth = depth + self.offset * normal.normal_(generator=generator)
-        dropped = normal.uniform_(generator=generator) < self.dropout
-        return torch.where(dropped, torch.inf, depth.clamp(min=0.0))
+def validate_training_noise(noise: ObservationNoise, name: str) -> None:
+    """Raises ValueError on noise out of range, or of colours, naming the field of `name`."""
+    noise.validate(name)
+    for field in ("color_noise", "brightness_jitter"):
+        if getattr(noise, field) > 0.0:
+            raise ValueError(
+                f"{name}.{field} is {getattr(noise, field)}, but training has images of depth "
+                "alone; it must be 0"
+            )
+
+
+def noisy_depth(depth: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
+    """Planar depth (N, R) [m] as a worse camera of unlimited range measures it, each pixel anew."""
+    relative = torch.empty_like(depth).normal_(generator=generator)
+    absolute = torch.empty_like(depth).normal_(generator=generator)
+    drop = torch.empty_like(depth).uniform_(generator=generator)
+    return disturb_depth(depth, noise, relative, absolute, drop)
+
+
+def disturb_depth(
+    depth: Tensor, noise: ObservationNoise, relative: Tensor, absolute: Tensor, drop: Tensor
+) -> Tensor:
+    """See `splatpilot.systems.sensing.observation_noise`; the range is 0 to infinity."""
+    z = depth * (1.0 + noise.depth_multiplicative * relative) + noise.depth_additive * absolute
+    measured = depth.isfinite() & (depth > 0.0)
+    z = torch.where(measured, z.clamp(min=0.0), depth)
+    return torch.where(drop < noise.depth_dropout, torch.inf, z)
 
 
 def inverse_depth(depth: Tensor, nearest: float, farthest: float) -> Tensor:

@@ -124,6 +124,16 @@ class BodyRate(NamedTuple):
 Vehicle = PointMass | BodyRate
 
 
+def choose_rows[V: Vehicle](chosen: Tensor, these: V, others: V) -> V:
+    """The rows of `these` vehicles where `chosen` (N,), those of the others elsewhere."""
+    return type(these)(*(where_rows(chosen, a, b) for a, b in zip(these, others, strict=True)))
+
+
+def where_rows(chosen: Tensor, these: Tensor, others: Tensor) -> Tensor:
+    """The rows of one tensor (N, ...) where `chosen` (N,), those of the other elsewhere."""
+    return torch.where(chosen.reshape(-1, *[1] * (these.dim() - 1)), these, others)
+
+
 def flatness_command(
     state: Tensor,
     a_WB: Tensor,

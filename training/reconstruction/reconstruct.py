@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
 from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
 from splatpilot.diagrams.worlds.world import World
@@ -146,11 +147,15 @@ def reconstruct(
             gains[held_out] = [view.gain for view in measured.views]
         how = f"{config.representation}, {config.iterations} steps"
 
-    field, difference = make_distance_field(capture, frames, gaussians, config)
+    field, difference, depth = make_distance_field(capture, frames, gaussians, config)
+    frontier = None
+    if capture.metric:
+        field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
     p_WS, p_WG, geodesic, warnings = _start_and_goal(capture, field)
     write_scene_folder(
         out,
         World(capture.name, gaussians, field, field, background, p_WS, p_WG),
+        frontier,
         provenance=f"{capture.source}, {len(capture)} frames, {how}",
         gains=[float(gain) for gain in gains],
         vignetting=photometry.vignetting,

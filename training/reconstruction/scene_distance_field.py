@@ -150,9 +150,10 @@ def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
 
 def make_distance_field(
     capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
-) -> tuple[Esdf, FieldDifference | None]:
-    """Returns the distance field of a reconstruction, from depth rendered or captured; and, if the
-    capture has depth and was optimised, how the former differs from that of all captured depth.
+) -> tuple[Esdf, FieldDifference | None, DepthSource]:
+    """Returns the distance field of a reconstruction, from depth rendered or captured; if the
+    capture has depth and was optimised, how the former differs from that of all captured depth;
+    and all depth that is known best: captured or, without any, rendered.
 
     Args:
         capture: what was seen.
@@ -162,7 +163,7 @@ def make_distance_field(
     """
     every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
     if config.iterations == 0:
-        return fuse(every, config.voxel_size, config.max_range), None
+        return fuse(every, config.voxel_size, config.max_range), None, every
     K = capture.K.copy()
     K[:2] /= frames.factor
     rendered = render_depth(
@@ -177,15 +178,15 @@ def make_distance_field(
     unit = unit_of(rendered, capture.metric)
     voxel_size, max_range = config.voxel_size * unit, config.max_range * unit
     if not capture.has_depth:
-        return fuse(rendered, voxel_size, max_range), None
+        return fuse(rendered, voxel_size, max_range), None, rendered
     truth = fuse(every, voxel_size, max_range)
     field = fuse(add_sky(rendered, frames), voxel_size, max_range, (truth.lower_W, truth.upper_W))
     difference = compare_fields(field, truth)
     if config.distance_field == "rendered":
-        return field, difference
+        return field, difference, every
     seen = DepthSource(
         lambda k: capture.registered_depth(frames.numbers[k]),
         capture.K,
         [capture.X_WCs[i] for i in frames.numbers],
     )
-    return fuse(seen, voxel_size, max_range), difference
+    return fuse(seen, voxel_size, max_range), difference, every

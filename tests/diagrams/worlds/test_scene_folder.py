@@ -15,7 +15,7 @@ from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.splats.gaussian_ply import write_ply
+from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
@@ -78,6 +78,19 @@ def test_round_trip(tmp_path, world):
     np.testing.assert_allclose(metadata.lower_W, [1, 2, 3])
     np.testing.assert_allclose(metadata.upper_W, [5, 4, 5])
     assert metadata.observed_free_volume == pytest.approx(14 * 10 * 10 * 0.2**3)
+
+
+def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
+    """What closes a scene is among the Gaussians of its world, not of its `gaussians.ply`; a scene
+    that has lost it is refused."""
+    folder, frontier = tmp_path / "scene", box_of_gaussians(step=1.0)
+    written = write_scene_folder(folder, world, frontier, provenance="")
+    assert written.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
+    means = np.concatenate([world.gaussians.means, frontier.means])
+    np.testing.assert_array_equal(read_scene(folder).gaussians.means, means)
+    (folder / "frontier.ply").unlink()
+    with pytest.raises(FileNotFoundError, match=r"frontier\.ply"):
+        read_scene(folder)
 
 
 def test_how_it_was_made_is_kept(tmp_path, world):

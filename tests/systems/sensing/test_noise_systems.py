@@ -7,6 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.policies.observation import pool_depth
 from splatpilot.systems.sensing.color_noise import ColorNoise
 from splatpilot.systems.sensing.delayed_pose import DelayedPose
 from splatpilot.systems.sensing.depth_noise import DepthNoise
@@ -47,14 +48,16 @@ def test_depth_noise_is_of_its_size_and_within_the_range():
 
 
 def test_depth_dropout_is_of_its_rate():
-    """A tenth of the pixels read 0, the others what they read without noise."""
+    """A tenth of the pixels read infinity, the others what they read without noise; in the image
+    that a policy pools they are no obstacle."""
     image = ImageDepth32F(80, 60)
     image.mutable_data[...] = 5.0
     (seen,) = seen_at(
         DepthNoise(ObservationNoise(depth_dropout=0.1), CAMERA, RATE, seed=7), image, 0.2
     )
-    assert set(np.unique(seen)) == {0.0, 5.0}
-    assert np.mean(seen == 0) == pytest.approx(0.1, abs=0.018)  # four errors of the estimate
+    assert set(np.unique(seen)) == {5.0, np.inf}
+    assert np.mean(seen == np.inf) == pytest.approx(0.1, abs=0.018)  # four errors of the estimate
+    np.testing.assert_array_equal(pool_depth(seen[..., 0], 15, 20), 5.0)
 
 
 def test_color_noise_is_of_its_size():

@@ -23,12 +23,12 @@ def test_depth_errors_have_the_sizes_asked_for():
 
 
 def test_dropout_and_range():
-    """Dropped pixels read 0 at the rate asked for; what leaves the range reads 0 or infinity; what
-    read 0 or infinity stays so.
+    """Dropped pixels read infinity at the rate asked for; what leaves the range reads 0 or
+    infinity; what read 0 or infinity stays so.
     """
     dropped = noisy_depth(DEPTH, ObservationNoise(depth_dropout=0.2), image_generator(1, 0), 0, 20)
-    assert np.mean(dropped == 0) == pytest.approx(0.2, abs=0.01)
-    assert set(np.unique(dropped)) == {0.0, 4.0}
+    assert np.mean(dropped == np.inf) == pytest.approx(0.2, abs=0.01)
+    assert set(np.unique(dropped)) == {4.0, np.inf}
     wide = noisy_depth(DEPTH, ObservationNoise(depth_additive=3.0), image_generator(2, 0), 1.0, 9.0)
     read = wide[np.isfinite(wide) & (wide > 0)]
     assert read.min() >= 1.0

@@ -42,7 +42,7 @@ SMALL = [
 ]
 TINY = [*SMALL, "rollout.environments=4", "rollout.steps=4"]
 OF_POLICY = {
-    "depthnav": ["rollout.environments=4", "rollout.steps=4", "empty=0.5"],
+    "depthnav": [*TINY[-2:], "empty=0.5", "rollout.noise.latency=0.1"],
     "agile_autonomy": ["rounds=2", "round_updates=3", "environments=4", "steps=16", "batch=8"],
 }
 

@@ -1,0 +1,78 @@
+"""Where seen, free space ends in space nobody looked into."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.frontier import (
+    frontier_faces,
+    hidden_frontier,
+    reachable_space,
+    with_obstacles,
+)
+
+K = np.array([[40.0, 0.0, 40.0], [0.0, 40.0, 30.0], [0.0, 0.0, 1.0]])
+
+
+def half_seen_room(closet: bool = False) -> Esdf:
+    """A room of 4 x 2 x 2 m with walls of 0.2 m, of which the last 1.5 m along x are unknown; a
+    closet of 0.4 m behind a wall is known too. Voxels of 0.1 m, the lower corner is the origin."""
+    occupied = np.ones((44, 24, 24), bool)
+    occupied[2:42, 2:22, 2:22] = False
+    unknown = np.zeros_like(occupied)
+    unknown[27:] = ~occupied[27:]
+    if closet:
+        occupied[34:38, 10:14, 10:14] = unknown[34:38, 10:14, 10:14] = False
+    return esdf_from_occupancy(occupied, unknown, np.zeros(3), 0.1)
+
+
+def test_only_what_a_vehicle_can_look_into_is_closed():
+    """The room is reachable for a sphere that fits; a closet apart from it, and a room for spheres
+    too large, are not."""
+    field = half_seen_room(closet=True)
+    free = field.states == FieldState.FREE
+    expected = free.copy()
+    expected[27:] = False
+    np.testing.assert_array_equal(reachable_space(field, 0.35), expected)
+    assert not reachable_space(field, 1.1).any()
+    assert free[27:].any()
+
+
+def test_obstacles_begin_two_voxels_behind_what_was_seen():
+    """Of a plane between seen and unknown space every voxel is closed but those at the walls'
+    corners; distances before it are the nearer of walls' and plane's, what planners trust stays."""
+    field = half_seen_room()
+    reachable = reachable_space(field, 0.35)
+    hidden, before = hidden_frontier(field, reachable, [], K, [])
+    assert set(np.argwhere(hidden)[:, 0]) == {28}
+    assert hidden[28, 2:22, 2:22].all()
+    centers, normals = frontier_faces(before, hidden)
+    assert len(centers) == 20 * 20
+    np.testing.assert_array_equal(centers[:, 0], 28.0)
+    np.testing.assert_array_equal(normals, np.tile([-1.0, 0.0, 0.0], (400, 1)))
+
+    closed = with_obstacles(field, hidden)
+    p_WQ = np.array([[2.0, 1.2, 1.2], [2.5, 1.0, 1.2], [0.5, 1.2, 1.2], [2.65, 0.3, 1.2]])
+    np.testing.assert_allclose(closed.distance(p_WQ), [0.8, 0.3, 0.3, 0.1], atol=0.01)
+    assert closed.query([2.85, 1.2, 1.2]).state == FieldState.OCCUPIED
+    free = field.states == FieldState.FREE
+    np.testing.assert_allclose(
+        closed.conservative().distances[free], field.conservative().distances[free], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("sky", [np.inf, 1000.0])
+def test_space_before_the_sky_stays_open(sky):
+    """Where a camera that looks along x sees sky the frontier stays open, elsewhere it is closed:
+    also where a wall farther away was seen."""
+    field = half_seen_room()
+    R_WC = RollPitchYaw(0.0, np.pi / 2, 0.0).ToRotationMatrix()  # x of the image is -z
+    X_WC = RigidTransform(R_WC, [0.8, 1.2, 1.2])
+    depth = np.full((60, 80), 50.0)
+    depth[:, :40] = sky
+    hidden, _ = hidden_frontier(field, reachable_space(field, 0.35), [depth], K, [X_WC])
+    assert hidden[28, 2:22, 2:11].all()
+    assert not hidden[28, 2:22, 13:].any()

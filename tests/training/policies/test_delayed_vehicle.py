@@ -1,0 +1,139 @@
+"""Images as late in training as in flight."""
+
+import numpy as np
+import pytest
+import torch
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from splatpilot.systems.policies.agile_autonomy_inference import FOV_X
+from splatpilot.systems.sensing.delayed_pose import DelayedPose
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
+from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
+from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.evaluation import (
+    CAMERA_AHEAD,
+    FlightConditions,
+    evaluate_agent,
+    render_depth,
+)
+from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
+from splatpilot.training.policies.vehicles import BodyRate
+
+PERIOD = 1.0 / 15.0  # [s]
+SELECTION = WorldSelection(kinds=["P02"], count=1, voxel_size=0.5)
+TWO_STEPS = ObservationNoise(latency=2 * PERIOD)
+
+
+class Wandering(LeafSystem):
+    """The states (n, 13) of a flight, one every period."""
+
+    def __init__(self, states: np.ndarray) -> None:
+        super().__init__()
+        self._states = states
+        self.DeclareVectorOutputPort("state", 13, self._calc)
+
+    def _calc(self, context, output) -> None:
+        output.set_value(self._states[round(context.get_time() / PERIOD)])
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.05, PERIOD, 3 * PERIOD, 0.18])
+def test_past_is_what_delayed_pose_gives(latency):
+    """At every step of a flight the delayed vehicle has the pose that `DelayedPose` gives of the
+    same samples, also before there is anything that old."""
+    states = np.cumsum(np.random.default_rng(0).normal(scale=0.1, size=(8, 13)), axis=0)
+    states[:, 6] += 1.0
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Wandering(states))
+    system = builder.AddSystem(DelayedPose(latency, PERIOD))
+    builder.Connect(source.get_output_port(), system.GetInputPort("state"))
+    simulator = Simulator(builder.Build())
+    context = system.GetMyContextFromRoot(simulator.get_mutable_context())
+
+    vehicles = [BodyRate(torch.tensor(state)[None], torch.zeros(1, 3)) for state in states]
+    past = remembered(vehicles[0], latency / PERIOD)
+    for step, vehicle in enumerate(vehicles):
+        simulator.AdvanceTo(step * PERIOD)
+        X_WB = system.GetOutputPort("pose").Eval(context)
+        past = remember(past, vehicle)
+        then = delayed(past, latency / PERIOD)
+        np.testing.assert_allclose(then.p[0], X_WB.translation(), atol=1e-9)
+        np.testing.assert_allclose(then.attitude()[0], X_WB.rotation().matrix(), atol=1e-9)
+
+
+class Watcher:
+    """Accelerates ahead and notes what it observes."""
+
+    rate = 1.0 / PERIOD
+    grid = PinholeGrid.of(16, 9, 90.0)
+
+    def __init__(self) -> None:
+        self.seen = []
+
+    def initial_memory(self, count):
+        return torch.zeros(count, 0)
+
+    def decide(self, seen, memory):
+        self.seen.append(seen)
+        return 2.0 * seen.R_WB[:, :, 0], None, memory
+
+    def losses(self, transition):
+        return {"none": transition.a.sum()}
+
+
+def test_rollouts_see_late_images_and_know_their_state():
+    """The depth of each step is what the vehicle saw two steps before, over the end of an update
+    too, and at first what it sees now; an episode that begins anew has no past."""
+    worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
+    config = RolloutConfig(environments=6, steps=3, noise=TWO_STEPS)
+    rollout = DifferentiableRollout(watcher, worlds, config, torch.Generator().manual_seed(0))
+    rollout.episodes = rollout.episodes._replace(age=torch.zeros(6))
+    rollout.losses()
+    rollout.episodes = rollout.episodes._replace(age=torch.tensor([99.0, 0, 0, 0, 0, 0]))
+    rollout.losses()
+    primitives = worlds.primitives.select(rollout.episodes.world)
+    seen = [step.vehicle.detach() for step in watcher.seen]
+    went_on = (seen[3].p - seen[2].p).norm(dim=1) < 1.0
+    assert not went_on[0] and went_on.sum() >= 3
+    for now, then in enumerate([0, 0, 0, 1, 2, 3]):
+        rows = went_on if now > 2 else slice(None)
+        distances, _ = primitives.near(seen[now].p)
+        expected = render_depth(seen[then], primitives, watcher.grid, distances)
+        torch.testing.assert_close(watcher.seen[now].depth[rows], expected[rows], rtol=0, atol=0)
+        torch.testing.assert_close(watcher.seen[now].R_WB, seen[now].attitude())
+    fresh = render_depth(seen[3], primitives, watcher.grid, primitives.near(seen[3].p)[0])
+    for now in (3, 4, 5):
+        torch.testing.assert_close(watcher.seen[now].depth[0], fresh[0], rtol=0, atol=0)
+
+
+def test_measured_flights_see_late_images():
+    """So do the flights that measure a policy."""
+    worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
+    evaluate_agent(watcher, worlds, FlightConditions(patience=0.05), TWO_STEPS)
+    assert len(watcher.seen) > 4
+    primitives = worlds.primitives
+    for now, then in enumerate([0, 0, 0, 1, 2]):
+        of, distances = watcher.seen[then].vehicle, primitives.near(watcher.seen[now].vehicle.p)[0]
+        expected = render_depth(of, primitives, watcher.grid, distances)
+        torch.testing.assert_close(watcher.seen[now].depth, expected, rtol=0, atol=0)
+
+
+def test_imitation_learns_from_late_images():
+    """The images that the student imitates with are of two steps before what the expert knew."""
+    config = AgileAutonomyTraining(
+        worlds=SELECTION, environments=1, steps=6, ask_every=1, noise=TWO_STEPS
+    )
+    config.worlds.held_out = 1
+    trainer = AgileAutonomyTrainer(config)
+    trainer.begin_update(0)
+    data = trainer.state_dict()["data"]
+    primitives = training_worlds(config.worlds, 0).primitives.select(torch.zeros(6).long())
+    x, y, z = data["R_WB"].unbind(2)
+    p_WC, R_WC = data["p_WB"] + CAMERA_AHEAD * x, torch.stack([-y, -z, x], 2)
+    distances, _ = primitives.near(data["p_WB"])
+    spec = trainer.spec
+    grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X)
+    depth = primitives.depth(p_WC, R_WC, grid, distances)[[0, 0, 0, 1, 2, 3]]
+    torch.testing.assert_close(data["depth"], depth.half(), rtol=2e-3, atol=0)

@@ -1,0 +1,59 @@
+"""What policies in training are told, against what those in flight are."""
+
+import numpy as np
+import pytest
+import torch
+
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.sensing import observation_noise
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.training.policies.diffaero import DiffAeroTraining
+from splatpilot.training.policies.observation import (
+    disturb_depth,
+    noisy_depth,
+    training_noise,
+    validate_training_noise,
+)
+
+
+@pytest.mark.parametrize("noise", [training_noise(), ObservationNoise(1.0, 2.0, 0.3)])
+def test_training_disturbs_depth_as_flight_does(noise):
+    """Of the same draws torch and numpy make the same of every depth: of those that read nothing,
+    too near or next to it, and where errors exceed the depth."""
+    random = np.random.default_rng(0)
+    depth = random.uniform(0.0, 20.0, (40, 50)).astype(np.float32)
+    depth[:, :5], depth[:, 5:10] = np.inf, 0.0
+    draws = [*random.standard_normal((2, 40, 50)), random.random((40, 50))]
+    flown = observation_noise.disturb_depth(depth, noise, *draws, 0.0, np.inf)
+    trained = disturb_depth(torch.tensor(depth), noise, *(torch.tensor(d) for d in draws))
+    np.testing.assert_allclose(trained, flown, rtol=1e-6, atol=1e-6)
+
+
+def test_noise_is_drawn_as_asked_for():
+    """Errors and holes have their sizes, and the same generator gives the same noise."""
+    noise = ObservationNoise(depth_multiplicative=0.03, depth_additive=0.05, depth_dropout=0.1)
+    depth = torch.full((400, 100), 4.0)
+    noisy, again = (noisy_depth(depth, noise, torch.Generator().manual_seed(0)) for _ in "ab")
+    torch.testing.assert_close(noisy, again, rtol=0, atol=0)
+    seen = torch.isfinite(noisy)
+    assert float((~seen).float().mean()) == pytest.approx(0.1, abs=0.01)
+    assert float(noisy[seen].std()) == pytest.approx(np.hypot(0.12, 0.05), rel=0.02)
+    assert float(noisy[seen].mean()) == pytest.approx(4.0, abs=0.003)
+
+
+def test_noise_that_training_cannot_have_is_named():
+    """Noise of colours, which training does not see, and noise out of range are refused."""
+    with pytest.raises(ValueError, match=r"noise\.brightness_jitter is 0\.2, but training"):
+        validate_training_noise(ObservationNoise(brightness_jitter=0.2), "noise")
+    with pytest.raises(ValueError, match=r"rollout\.noise\.latency is 2; it must be"):
+        validate_training_noise(ObservationNoise(latency=2), "rollout.noise")
+
+
+def test_noise_that_does_not_exist_is_named():
+    """A field that there is not, in a scenario and in training, is an error that lists those that
+    there are."""
+    for config, field in (Scenario(), "observation"), (DiffAeroTraining(), "rollout.noise"):
+        known = rf"there is no field {field}\.jitter; the fields are .*{field}\.depth_dropout"
+        with pytest.raises(ValueError, match=known):
+            load_config(config, overrides=[f"{field}.jitter=0.1"])
