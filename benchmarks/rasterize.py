@@ -109,12 +109,12 @@ def print_scaling(scene: GaussianScene, X_WC: RigidTransform) -> None:
 
 
 def print_baked(scene: GaussianScene, X_WC: RigidTransform) -> None:
-    header("RGB+ED without gradients", "rasterize", "baked", "gain")
+    header("RGB+MD without gradients", "rasterize", "baked", "gain")
     baked, renderer = BakedScene(scene), create_renderer()
     for width, height in SIZES:
         viewmats, Ks = cameras_of(X_WC, width, height)
         arguments: dict[str, Any] = tensors_of(scene) | {"viewmats": viewmats, "Ks": Ks}
-        arguments |= {"width": width, "height": height, "render_mode": "RGB+ED"}
+        arguments |= {"width": width, "height": height, "render_mode": "RGB+MD"}
         arguments["renderer"] = renderer
         K = intrinsics(width, height)
         plain, _ = milliseconds(lambda arguments=arguments: rasterize(**arguments))
