@@ -4,8 +4,10 @@ from pathlib import Path
 
 from pydrake.math import RigidTransform
 
+from splatpilot.diagrams.worlds.scene_folder import read_background
 from splatpilot.diagrams.worlds.scene_metadata import SceneMetadata, read_scene_metadata
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.splats.background import put_behind
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame
@@ -47,6 +49,7 @@ class SceneViews:
 
     def __init__(self, scene: Path, capture: Capture | None = None):
         self.metadata: SceneMetadata = read_scene_metadata(scene)
+        self.background = read_background(scene, self.metadata)
         if capture is None:
             capture = read_capture_of(scene, self.metadata)
         self.capture = capture
@@ -77,12 +80,13 @@ class SceneViews:
 
     def render(self, frame: CaptureFrame) -> RenderedView:
         """Returns what the scene shows the camera of `frame`."""
-        height, width = frame.depth.shape
-        background = self.metadata.background
-        return self.renderer.render(frame.K, width, height, frame.X_WC, background)
+        return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
 
     def measure(self, frame: CaptureFrame, lpips: Lpips | None = None) -> ViewMeasures:
         """Compares both."""
-        return measure_view(
-            self.render(frame), frame.image, frame.depth, self.metadata.vignetting, lpips
-        )
+        on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
+        return measure_view(on_black, self.background, frame, vignetting, lpips)
+
+    def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
+        height, width = frame.depth.shape
+        return self.renderer.render(frame.K, width, height, frame.X_WC)

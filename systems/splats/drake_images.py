@@ -6,6 +6,12 @@ from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.systems.splats.background import (
+    BLACK,
+    Background,
+    EnvironmentMap,
+    put_behind,
+)
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 
 # Below one half, more of the light along a ray comes from behind the surface than from it: no depth
@@ -19,7 +25,7 @@ def render_view(
     X_WC: RigidTransform,
     near: float,
     far: float,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Background = BLACK,
 ) -> RenderedView:
     """What the pinhole camera of `camera_info` at X_WC sees; see `BakedScene.render`.
 
@@ -27,15 +33,10 @@ def render_view(
     intrinsics are taken as they are.
     """
     width, height = camera_info.width(), camera_info.height()
-    return scene.render(
-        camera_info.intrinsic_matrix(),
-        width,
-        height,
-        X_WC,
-        near=near,
-        far=far,
-        background=background,
-    )
+    K, plain = camera_info.intrinsic_matrix(), not isinstance(background, EnvironmentMap)
+    behind = background if plain else BLACK
+    view = scene.render(K, width, height, X_WC, near=near, far=far, background=behind)
+    return view if plain else put_behind(view, background, K, X_WC)
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:

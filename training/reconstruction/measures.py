@@ -5,34 +5,44 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.systems.splats.background import Background, put_behind
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
+from splatpilot.systems.splats.drake_images import OPAQUE_ALPHA
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.reconstruction.losses import photometric_loss
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.reconstruction.losses import FAR, photometric_loss
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.vignette import vignette
 
-NEAR, FAR = 1e-3, 150.0
-"""[m], true depths that count: the range of `log_depth_loss`."""
+NEAR = 1e-3
+"""[m], with `FAR` the range of true depths that count, as in `log_depth_loss`."""
 
 FLOATER_MARGIN = 0.1
 """[m], and as a fraction of the true depth: how far in front of the true surface floaters are."""
-FLOATER_ALPHA = 0.5
+
+_SHOWN = {
+    "psnr_db": "{:.2f} dB",
+    "depth_mae_m": "{:.4f} m",
+    "hole_fraction": "{:.2%} holes",
+}
 
 
 @dataclass(frozen=True)
 class ViewMeasures:
     """One view against the truth. Depth is not measured where the truth has none."""
 
-    psnr_db: float  # [dB]
+    psnr_db: float  # [dB], before the scene's own background
+    psnr_on_black_db: float  # [dB], before black, except where the truth is infinitely far
     ssim: float
     lpips: float | None  # LPIPS-squeeze; None without its weights
     depth_mae_m: float | None  # [m]
     depth_relative: float | None  # mean of |error| / true depth
     floater_fraction: float | None  # of the pixels with true depth
+    hole_fraction: float | None  # of the pixels with true depth
     gain: float  # brightness of the true image relative to the scene
 
 
@@ -43,13 +53,13 @@ class HeldOutMeasures:
     views: tuple[ViewMeasures, ...]
 
     def means(self) -> dict[str, float]:
-        """Returns the mean PSNR and, where there is depth, the mean depth error, by name."""
-        found = {name: mean_measure(self.views, name) for name in ("psnr_db", "depth_mae_m")}
+        """Returns the mean PSNR and, where there is depth, the mean depth error and share of
+        holes, by name."""
+        found = {name: mean_measure(self.views, name) for name in _SHOWN}
         return {name: value for name, value in found.items() if value is not None}
 
     def __str__(self) -> str:
-        units = {"psnr_db": "{:.2f} dB", "depth_mae_m": "{:.4f} m"}
-        return ", ".join(units[name].format(value) for name, value in self.means().items())
+        return ", ".join(_SHOWN[name].format(value) for name, value in self.means().items())
 
 
 def mean_measure(views: Iterable[ViewMeasures], name: str) -> float | None:
@@ -82,8 +92,8 @@ def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
 def depth_mae_m(depth: NDArray, truth: NDArray) -> float | None:
     """Returns the mean absolute error [m] over the pixels that have true depth; None if none has.
 
-    `depth` is the expected depth and 0 where nothing was drawn: a hole is wrong by all of its
-    depth.
+    `depth` is what depth cameras in the scene have, before they cut it to their range, and 0 in a
+    hole, which so is wrong by all of its depth.
     """
     valid = has_true_depth(truth)
     return float(np.abs(depth - truth)[valid].mean(dtype=np.float64)) if valid.any() else None
@@ -97,29 +107,34 @@ def depth_relative(depth: NDArray, truth: NDArray) -> float | None:
     return float((np.abs(depth - truth)[valid] / truth[valid]).mean(dtype=np.float64))
 
 
-def floaters(depth: NDArray, alpha: NDArray, truth: NDArray) -> NDArray[np.bool_]:
+def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
     """Returns which pixels (H, W) show a floater.
 
-    A pixel with true depth D does if the rendered surface stands in front of the true one, at a
-    depth less than D - max(0.1 m, D / 10), and covers it by more than half (alpha > 1/2).
-
-    The rendered surface is the expected depth sum w z / sum w, which is what depth cameras here
-    show, so what a policy would take for an obstacle. A veil of little weight far in front counts
-    as soon as it draws that depth forward by the margin, though the median depth would be behind it
-    still. The margin leaves room for pixels that see both sides of an edge at a slight offset; a
-    relative part is needed because such offsets grow with depth, an absolute one because nothing
-    nearer than 0.1 m to a surface is flown through.
+    A pixel with true depth D does if depth cameras see a surface in front of the true one, at a
+    depth less than D - max(0.1 m, D / 10): what a policy takes for an obstacle. The margin leaves
+    room for pixels that see both sides of an edge at a slight offset; a relative part is needed
+    because such offsets grow with depth, an absolute one because nothing nearer than 0.1 m to a
+    surface is flown through.
     """
     margin = FLOATER_MARGIN * np.maximum(1, truth)
     with np.errstate(invalid="ignore"):
         in_front = depth < truth - margin
-    return has_true_depth(truth) & in_front & (alpha > FLOATER_ALPHA)
+    return has_true_depth(truth) & in_front & (depth > 0)
 
 
-def floater_fraction(depth: NDArray, alpha: NDArray, truth: NDArray) -> float | None:
+def floater_fraction(depth: NDArray, truth: NDArray) -> float | None:
     """Returns the share of `floaters` among the pixels with true depth; None if none has any."""
-    count = has_true_depth(truth).sum()
-    return float(floaters(depth, alpha, truth).sum() / count) if count else None
+    valid = has_true_depth(truth)
+    return float(floaters(depth, truth)[valid].mean()) if valid.any() else None
+
+
+def hole_fraction(depth: NDArray, truth: NDArray) -> float | None:
+    """Returns the share of holes among the pixels with true depth; None if none has any.
+
+    A hole is where depth cameras see nothing, so that a policy takes it for open.
+    """
+    valid = has_true_depth(truth)
+    return float((depth == 0)[valid].mean()) if valid.any() else None
 
 
 def fit_exposure(color: NDArray, truth: NDArray, vignetting: float) -> tuple[NDArray, float]:
@@ -137,9 +152,9 @@ def fit_exposure(color: NDArray, truth: NDArray, vignetting: float) -> tuple[NDA
 
 
 def measure_view(
-    view: RenderedView,
-    image: NDArray[np.uint8],
-    depth: NDArray[np.float32],
+    on_black: RenderedView,
+    background: Background,
+    frame: CaptureFrame,
     vignetting: float = 0.0,
     lpips: Lpips | None = None,
 ) -> ViewMeasures:
@@ -148,14 +163,17 @@ def measure_view(
     Colours are compared as `fit_exposure` exposes them.
 
     Args:
-        view: what was rendered.
-        image: (H, W, 3), the true image, of the same size.
-        depth: (H, W) [m], the true depth.
+        on_black: what was rendered, before black.
+        background: of the scene.
+        frame: the truth, of the same size.
         vignetting: of the capture, see `vignette`.
         lpips: the perceptual distance; None leaves it out.
     """
-    truth = image / 255
+    truth, far = frame.image / 255, frame.depth >= FAR
+    view = put_behind(on_black, background, frame.K, frame.X_WC)
     exposed, gain = fit_exposure(view.color, truth, vignetting)
+    color_on_black = np.where(far[..., None], view.color, on_black.color)
+    depth = np.where(view.alpha >= OPAQUE_ALPHA, view.depth, 0)
     distance = None
     if lpips is not None:
         with torch.no_grad():
@@ -163,11 +181,13 @@ def measure_view(
             distance = lpips(a, b).item()
     return ViewMeasures(
         psnr_db=psnr_db(exposed, truth),
+        psnr_on_black_db=psnr_db(fit_exposure(color_on_black, truth, vignetting)[0], truth),
         ssim=ssim(exposed, truth),
         lpips=distance,
-        depth_mae_m=depth_mae_m(view.depth, depth),
-        depth_relative=depth_relative(view.depth, depth),
-        floater_fraction=floater_fraction(view.depth, view.alpha, depth),
+        depth_mae_m=depth_mae_m(depth, frame.depth),
+        depth_relative=depth_relative(depth, frame.depth),
+        floater_fraction=floater_fraction(depth, frame.depth),
+        hole_fraction=hole_fraction(depth, frame.depth),
         gain=gain,
     )
 
@@ -182,12 +202,10 @@ class SceneRenderer:
         means, quats, scales, opacities, sh = map(torch.from_numpy, arrays)
         self._tensors = (means, quats, scales, opacities, sh)
 
-    def render(
-        self, K: NDArray, width: int, height: int, X_WC: RigidTransform, background: ArrayLike
-    ) -> RenderedView:
-        """Renders colour over the background, expected depth and alpha; see `BakedScene.render`."""
+    def render(self, K: NDArray, width: int, height: int, X_WC: RigidTransform) -> RenderedView:
+        """Renders colour on black, depth and alpha; see `BakedScene.render`."""
         if self._baked is not None:
-            return self._baked.render(K, width, height, X_WC, background=background)
+            return self._baked.render(K, width, height, X_WC)
         with torch.no_grad():
             rendering = render(
                 "2dgs",
@@ -196,7 +214,6 @@ class SceneRenderer:
                 torch.tensor(K, dtype=torch.float32)[None],
                 width,
                 height,
-                background=torch.tensor(np.asarray(background), dtype=torch.float32)[None],
                 depth_mode="ED",
                 renderer=self._renderer,
             )

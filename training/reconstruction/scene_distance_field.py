@@ -15,6 +15,7 @@ from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
@@ -81,14 +82,14 @@ def render_depth(
 
 def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
     """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
-    number measured nothing within range: there the space before the sky was seen to be free."""
+    number shows the infinitely far: there the space before the sky was seen to be free."""
     places = {number: k for k, number in enumerate(frames.numbers)}
 
     def load(i: int) -> NDArray[np.float32]:
         depth = rendered.load(i)
         if i not in places:
             return depth
-        return np.where((depth == 0) & np.isinf(frames[places[i]].depth), np.float32(np.inf), depth)
+        return np.where((depth == 0) & (frames[places[i]].depth >= FAR), np.float32(np.inf), depth)
 
     return DepthSource(load, rendered.K, rendered.X_WCs)
 
