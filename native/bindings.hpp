@@ -107,7 +107,7 @@ void check_size(const Array& image, const Camera& camera, size_t channels) {
 
 // Where an image of colour (3 channels), depth (1) or both (4) and its alpha are to be written.
 inline Image output_image(const Output& image, const Output& alpha, const Camera& camera,
-                          bool expected_depth, const Floats<nb::shape<3>>& background) {
+                          DepthMode depth_mode, const Floats<nb::shape<3>>& background) {
   const size_t channels = image.shape(2);
   require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
   check_size(image, camera, channels);
@@ -116,7 +116,7 @@ inline Image output_image(const Output& image, const Output& alpha, const Camera
   if (channels >= 3) out.color = image.data();
   if (channels != 3) out.depth = image.data() + channels - 1;
   out.color_stride = out.depth_stride = static_cast<int>(channels);
-  out.expected_depth = expected_depth;
+  out.depth_mode = depth_mode;
   out.alpha = alpha.data();
   std::copy_n(background.data(), 3, out.background);
   return out;

@@ -12,16 +12,18 @@ void Renderer::start(Frame& frame, const Camera& camera, bool keep) {
   lap();
 }
 
-void Renderer::project(Frame& frame, size_t count, const ProjectChunk& project) {
+void Renderer::project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project) {
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
   frame.gaussians = count;
   frame.chunk_counts.resize(chunks);
   if (frame.splats.size() < count) frame.splats.resize(count);
+  if (median_depth && frame.planes.size() < count) frame.planes.resize(count);
   if (depth_bits_.size() < count) depth_bits_.resize(count);
   pool_.for_each(chunks, [&](size_t chunk) {
     const size_t begin = chunk * kChunkSize;
-    frame.chunk_counts[chunk] = project(begin, std::min(count, begin + kChunkSize),
-                                        frame.splats.data() + begin, depth_bits_.data() + begin);
+    frame.chunk_counts[chunk] =
+        project(begin, std::min(count, begin + kChunkSize), frame.splats.data() + begin,
+                median_depth ? frame.planes.data() + begin : nullptr, depth_bits_.data() + begin);
   });
   seconds_.project = lap();
 }

@@ -15,6 +15,7 @@ struct Frame {
   size_t gaussians = 0;  // in the input
   // Chunk c owns splats[c * kChunkSize ...], of which the first chunk_counts[c] are in use.
   std::vector<Splat> splats;
+  std::vector<DepthPlane> planes;  // of the splats, for the median depth alone
   std::vector<size_t> chunk_counts;
   std::vector<size_t> tile_offsets;
   std::vector<Pair> pairs;
@@ -37,7 +38,7 @@ struct Frame {
 };
 
 inline RasterInput raster_input(const Frame& frame) {
-  return {frame.splats.data(), frame.pairs.data(),  frame.tile_offsets.data(),
+  return {frame.splats.data(), frame.planes.data(), frame.pairs.data(), frame.tile_offsets.data(),
           frame.camera.width,  frame.camera.height, frame.tiles_x()};
 }
 

@@ -73,13 +73,13 @@ RenderedFrame render(Renderer& renderer, const Means& means, const Quats& quats,
                      const Means& scales, const Opacities& opacities, const Colors& colors,
                      int sh_degree, const Intrinsics& K, const Pose& X_CW, int width, int height,
                      double near_plane, double far_plane, double radius_clip, double eps2d,
-                     bool antialiased, bool expected_depth, const Floats<nb::shape<3>>& background,
+                     bool antialiased, DepthMode depth_mode, const Floats<nb::shape<3>>& background,
                      const Output& image, const Output& alpha, bool keep) {
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
   const Camera camera =
       camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased);
-  const Image out = output_image(image, alpha, camera, expected_depth, background);
+  const Image out = output_image(image, alpha, camera, depth_mode, background);
   const Exclusive use(renderer);
   return RenderedFrame(renderer.render(gaussians, camera, out, keep));
 }
@@ -92,7 +92,7 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Intrinsics&
   check_size(color, camera, 3);
   check_size(depth, camera, 1);
   check_size(alpha, camera, 1);
-  Image out{color.data(), 3, depth.data(), 1, true, alpha.data(), {}};
+  Image out{color.data(), 3, depth.data(), 1, DepthMode::kMedian, alpha.data(), {}};
   std::copy_n(background.data(), 3, out.background);
   const Exclusive use(renderer);
   renderer.render(scene.arrays(), camera, out);
@@ -143,6 +143,11 @@ NB_MODULE(_native, m) {
       },
       "quats"_a, "Index of the first quaternion too short or too long to be normalised, or -1.");
 
+  nb::enum_<DepthMode>(m, "DepthMode", "What the depth of a pixel is.")
+      .value("ACCUMULATED", DepthMode::kAccumulated, "sum w z")
+      .value("EXPECTED", DepthMode::kExpected, "sum w z / sum w")
+      .value("MEDIAN", DepthMode::kMedian,
+             "z where what footprints without blur let through falls below one half, else 0");
   nb::class_<RenderedFrame>(m, "Frame", "What remains of a rendered image.")
       .def_ro("splat_count", &RenderedFrame::splat_count, "Gaussians that were visible.")
       .def_prop_ro(
@@ -165,8 +170,8 @@ NB_MODULE(_native, m) {
         "a frame's splats.");
   m.def("render", &render, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a, "scales"_a,
         "opacities"_a, "colors"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
-        "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "antialiased"_a,
-        "expected_depth"_a, "background"_a, "image"_a, "alpha"_a, "keep"_a,
+        "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "antialiased"_a, "depth_mode"_a,
+        "background"_a, "image"_a, "alpha"_a, "keep"_a,
         "Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With\n"
         "keep, a backward pass can start from the frame.");
 
@@ -181,7 +186,7 @@ NB_MODULE(_native, m) {
           nb::kw_only(), "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a);
   m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, nb::kw_only(), "K"_a, "X_CW"_a,
         "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a,
-        "depth"_a, "alpha"_a, "Writes colour, expected depth and alpha.");
+        "depth"_a, "alpha"_a, "Writes colour, median depth and alpha.");
 
   bind_losses(m);
   bind_gradients(m);

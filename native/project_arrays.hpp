@@ -99,8 +99,22 @@ SP_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, u
   }
 }
 
+// In the camera frame: the inverse covariance times p_C, up to scale, from the columns of its
+// factor.
+SP_INLINE Vector16 plane_normal(const Camera& camera, const Vector16 columns[3], const F16 scale[3],
+                                const Vector16& d_W) {
+  const F16 least = min(min(scale[0], scale[1]), scale[2]);
+  Vector16 n_W = {F16(0.0f), F16(0.0f), F16(0.0f)};
+  for (int k = 0; k < 3; ++k) {
+    const F16 ratio = least / scale[k];
+    const Vector16 axis = (F16(1.0f) / scale[k]) * columns[k];
+    n_W = n_W + (ratio * ratio * dot(axis, d_W)) * axis;
+  }
+  return to_camera(camera, n_W);
+}
+
 inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size_t begin,
-                             size_t end, Splat* splats, uint32_t* depth_bits) {
+                             size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   uint32_t candidates[kChunkSize + kLanes];
   const size_t candidate_count = cull_arrays(g, camera, begin, end, candidates);
   // Lanes past the end repeat a Gaussian that exists and are masked out.
@@ -126,6 +140,10 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
         lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, log2_opacity, pack));
     if (candidate_count - first < kLanes) bits &= (1u << (candidate_count - first)) - 1;
     if (!bits) continue;
+    if (planes) {
+      const Vector16 n_C = plane_normal(camera, columns, in.scale, d_W);
+      append_planes(depth_plane(camera, p_C, inverse_z, p0, p1, n_C), bits, planes + count);
+    }
     F16 color[3];
     gather_colors(g, indices, bits, d_W, color);
     count += append_splats(pack, color, bits, indices, splats + count, depth_bits + count);

@@ -36,24 +36,41 @@ SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
   return lane_bits(visible);
 }
 
+// In the camera frame: for d_W, the inverse of L L^T times it, up to the scale of its last entry.
+SP_INLINE Vector16 plane_normal(const Camera& camera, const F16 L[6], const Vector16& d_W) {
+  const F16 y0 = d_W.x / L[0];
+  const F16 y1 = (d_W.y - L[1] * y0) / L[2];
+  const F16 y2 = (d_W.z - L[3] * y0 - L[4] * y1) / L[5];
+  const F16 n2 = y2 / L[5];
+  const F16 n1 = (y1 - L[4] * n2) / L[2];
+  const F16 n0 = (y0 - L[1] * n1 - L[3] * n2) / L[0];
+  return to_camera(camera, {n0, n1, n2});
+}
+
 SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
-                                     Splat* splats, uint32_t* depth_bits) {
+                                     Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   const float* geometry = scene.geometry + group * 10 * kLanes;
   const auto field = [&](int f) { return load(geometry + f * kLanes); };
   const Vector16 d_W = from_centre(camera, field(0), field(1), field(2));
   const Vector16 p_C = to_camera(camera, d_W);
   if (!any(in_depth_range(camera, p_C.z))) return 0;
   const F16 inverse_z = F16(1.0f) / p_C.z;
-  Vector16 m[2], p[2];
+  Vector16 m[2];
   projection_rows(camera, p_C, inverse_z, m);
-  for (int i = 0; i < 2; ++i) {  // p = m L with L lower triangular
-    p[i] = {m[i].x * field(3) + m[i].y * field(4) + m[i].z * field(6),
-            m[i].y * field(5) + m[i].z * field(7), m[i].z * field(8)};
-  }
+  F16 L[6];
+  for (int k = 0; k < 6; ++k) L[k] = field(3 + k);
+  const auto times_L = [&](const Vector16& row) -> Vector16 {
+    return {row.x * L[0] + row.y * L[1] + row.z * L[3], row.y * L[2] + row.z * L[4], row.z * L[5]};
+  };
+  const Vector16 p0 = times_L(m[0]), p1 = times_L(m[1]);
   SplatPack pack;
   const uint32_t bits =
-      lane_bits(finish_projection(camera, p_C, inverse_z, p[0], p[1], field(9), pack));
+      lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, field(9), pack));
   if (!bits) return 0;
+  if (planes) {
+    const Vector16 n_C = plane_normal(camera, L, d_W);
+    append_planes(depth_plane(camera, p_C, inverse_z, p0, p1, n_C), bits, planes);
+  }
 
   F16 color[3];
   const int coefficients = (scene.sh_degree + 1) * (scene.sh_degree + 1);
@@ -70,7 +87,7 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
 
 // begin and end count Gaussians and are multiples of the chunk size, or the scene's end.
 inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size_t begin,
-                            size_t end, Splat* splats, uint32_t* depth_bits) {
+                            size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   constexpr size_t kGroupsPerBox = kBoundSize / kLanes;
   const size_t last_group = end / kLanes;
   size_t count = 0;
@@ -79,7 +96,8 @@ inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size
     for (; boxes; boxes &= boxes - 1) {
       const size_t first = (box + __builtin_ctz(boxes)) * kGroupsPerBox;
       for (size_t group = first; group < first + kGroupsPerBox && group < last_group; ++group) {
-        count += project_baked_group(scene, camera, group, splats + count, depth_bits + count);
+        count += project_baked_group(scene, camera, group, splats + count,
+                                     planes ? planes + count : nullptr, depth_bits + count);
       }
     }
   }

@@ -48,7 +48,7 @@ using Rows = Doubles<nb::shape<-1, 3>>;
 RenderedFrame render_projected(Renderer& renderer, const Doubles<nb::shape<-1, 2>>& means2d,
                                const Rows& covariances, const Opacities& depths,
                                const Opacities& opacities, const Means& colors, int width,
-                               int height, double radius_clip, bool expected_depth,
+                               int height, double radius_clip, DepthMode depth_mode,
                                const Floats<nb::shape<3>>& background, const Output& image,
                                const Output& alpha, bool keep) {
   const size_t n = means2d.shape(0);
@@ -63,7 +63,8 @@ RenderedFrame render_projected(Renderer& renderer, const Doubles<nb::shape<-1, 2
   camera.width = width;
   camera.height = height;
   camera.radius_clip = static_cast<float>(std::floor(radius_clip));
-  const Image out = output_image(image, alpha, camera, expected_depth, background);
+  require(depth_mode != DepthMode::kMedian, "projected Gaussians have no median depth");
+  const Image out = output_image(image, alpha, camera, depth_mode, background);
   const Exclusive use(renderer);
   return RenderedFrame(renderer.render(projected, camera, out, keep));
 }
@@ -98,7 +99,7 @@ size_t place_splats(const ProjectedArrays& projected, const Camera& camera, size
 void bind_projected(nb::module_& m) {
   m.def("render_projected", &render_projected, "renderer"_a, nb::kw_only(), "means2d"_a,
         "covariances"_a, "depths"_a, "opacities"_a, "colors"_a, "width"_a, "height"_a,
-        "radius_clip"_a, "expected_depth"_a, "background"_a, "image"_a, "alpha"_a, "keep"_a,
+        "radius_clip"_a, "depth_mode"_a, "background"_a, "image"_a, "alpha"_a, "keep"_a,
         "As render, of Gaussians that are projected.");
   m.def("splat_factors", &factors, "renderer"_a, "frame"_a,
         "(n, 3) ux, uy, vy of a frame's splats: u = ux dx + uy dy and v = vy dy make the\n"

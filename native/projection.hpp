@@ -77,6 +77,11 @@ struct SplatPack {
   F16 mean_x, mean_y, extent_x, extent_y, ux, uy, vy, log2_opacity, depth, slope_x, slope_y;
 };
 
+// One pack per field of DepthPlane.
+struct PlanePack {
+  F16 ux, uy, vy, w_x, w_y, w;
+};
+
 SP_INLINE F16 largest_component(const Vector16& a) {
   return max(max(max(a.x, -a.x), max(a.y, -a.y)), max(a.z, -a.z));
 }
@@ -132,6 +137,52 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
   // An overflow somewhere leaves an infinity or a NaN in one of these.
   const F16 finite = (out.ux + out.vy) * F16(0.0f) + out.uy * F16(0.0f);
   return visible & (finite >= F16(0.0f));
+}
+
+// From P as above and n_C, the inverse covariance times p_C up to scale.
+SP_INLINE PlanePack depth_plane(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
+                                const Vector16& p0, const Vector16& p1, const Vector16& n_C) {
+  // What keeps a Gaussian seen edge-on invertible [px^2].
+  const F16 least = F16(1e-8f), one = F16(1.0f);
+  PlanePack out;
+  const F16 raw00 = p0.x * p0.x + p0.y * p0.y + p0.z * p0.z;
+  const F16 raw11 = p1.x * p1.x + p1.y * p1.y + p1.z * p1.z;
+  const F16 s01 = p0.x * p1.x + p0.y * p1.y + p0.z * p1.z;
+  const F16 s11 = raw11 + least;
+  const Vector16 c = cross(p0, p1);
+  const F16 det = (c.x * c.x + c.y * c.y + c.z * c.z) + least * (raw00 + s11);
+  const F16 inverse_s11 = one / s11;
+  out.ux = min(F16(kExponentScale) * sqrt(s11 / det), F16(1e6f));
+  out.uy = -(out.ux * s01 * inverse_s11);
+  out.vy = F16(kExponentScale) * sqrt(inverse_s11);
+
+  const F16 facing = n_C.x * p_C.x + (n_C.y * p_C.y + n_C.z * p_C.z);
+  const Mask16 known = (facing > F16(1e-30f)) & (facing < F16(1e30f));
+  const F16 inverse_facing = one / select(known, facing, one);
+  const F16 slope_x = n_C.x * inverse_facing * F16(1.0f / camera.fx);
+  const F16 slope_y = n_C.y * inverse_facing * F16(1.0f / camera.fy);
+  // A Gaussian that reaches to the camera's plane is turned, so that it has depth everywhere.
+  const F16 variance =
+      slope_x * slope_x * raw00 + (slope_y * slope_y * raw11 + F16(2.0f) * slope_x * slope_y * s01);
+  const F16 reach = F16(kMaxExtent) * sqrt(max(variance, F16(1e-30f)));
+  const F16 turn = zero_unless(known, min(F16(kNearestDepth) * inverse_z / reach, one));
+  out.w_x = turn * slope_x;
+  out.w_y = turn * slope_y;
+  out.w = inverse_z;
+  return out;
+}
+
+// Appends the lanes in `bits`, in lane order.
+SP_INLINE void append_planes(const PlanePack& p, uint32_t bits, DepthPlane* planes) {
+  alignas(64) float fields[6][kLanes];
+  const F16* packs[6] = {&p.ux, &p.uy, &p.vy, &p.w_x, &p.w_y, &p.w};
+  for (int f = 0; f < 6; ++f) store(fields[f], *packs[f]);
+  for (; bits; bits &= bits - 1, ++planes) {
+    const int lane = __builtin_ctz(bits);
+    float row[8] = {};
+    for (int f = 0; f < 6; ++f) row[f] = fields[f][lane];
+    std::memcpy(planes, row, sizeof(DepthPlane));
+  }
 }
 
 // Appends the lanes in `bits`, in lane order.

@@ -14,15 +14,25 @@ struct StagedSplat {
   float red, green, blue, depth;
 };
 
+// A DepthPlane in the tile's own coordinates.
+struct StagedPlane {
+  float ux, uy, u0, vy, v0;
+  float w_x, w_y, w;
+};
+
 // Running sums of the 16 pixels of a block. Transmittance never grows, so a pixel whose next value
 // would not exceed the limit is finished for good: that one comparison takes the place of a mask
 // carried from splat to splat. Pixels outside the image start at 0, finished.
 struct BlockState {
   F16 transmittance, red, green, blue, depth, alpha;
+  // Of the median depth: what footprints without blur let through, and the inverse depth at which
+  // that fell to one half, if it did.
+  F16 sharp_transmittance, median_w;
 };
 
 struct alignas(64) StagedTile {
   StagedSplat splats[kStageSize];
+  StagedPlane planes[kStageSize];
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
 };
 
@@ -32,6 +42,12 @@ SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
           s.vy,       -(s.vy * y), s.log2_opacity,
           s.color[0], s.color[1],  s.color[2],
           s.depth};
+}
+
+SP_INLINE StagedPlane in_tile(const DepthPlane& p, const Splat& s, float left, float top) {
+  const float x = s.mean_x - left, y = s.mean_y - top;
+  return {p.ux,  p.uy,  -(p.ux * x + p.uy * y),       p.vy, -(p.vy * y),
+          p.w_x, p.w_y, p.w - (p.w_x * x + p.w_y * y)};
 }
 
 // From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
@@ -52,22 +68,36 @@ SP_INLINE void transpose_blocks(int32_t* blocks, int count,
   }
 }
 
+template <bool kMedian>
 SP_INLINE void stage(const RasterInput& in, size_t begin, int count, float left, float top,
                      StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
   for (int i = 0; i < count; ++i) {
     const Pair* pair = in.pairs + begin + i;
-    if (i + kPrefetchAhead < count) __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
-    staged.splats[i] = in_tile(in.splats[pair->splat], left, top);
+    if (i + kPrefetchAhead < count) {
+      __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
+      if constexpr (kMedian) __builtin_prefetch(in.planes + pair[kPrefetchAhead].splat);
+    }
+    const Splat& splat = in.splats[pair->splat];
+    staged.splats[i] = in_tile(splat, left, top);
+    if constexpr (kMedian) {
+      staged.planes[i] = in_tile(in.planes[pair->splat], splat, left, top);
+    }
     blocks[i] = static_cast<int32_t>(pair->blocks);
   }
   transpose_blocks(blocks, count, staged.touching);
 }
 
+// The exponent of alpha, in base 2, of a StagedSplat or StagedPlane.
+template <typename Footprint>
+SP_INLINE F16 exponent_at(const Footprint& at, float log2_opacity, const F16& x, const F16& y) {
+  const F16 u = F16(at.ux) * x + (F16(at.uy) * y + F16(at.u0));
+  const F16 v = F16(at.vy) * y + F16(at.v0);
+  return (F16(log2_opacity) - u * u) - v * v;
+}
+
 SP_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
-  const F16 u = F16(splat.ux) * x + (F16(splat.uy) * y + F16(splat.u0));
-  const F16 v = F16(splat.vy) * y + F16(splat.v0);
-  const F16 exponent = (F16(splat.log2_opacity) - u * u) - v * v;
+  const F16 exponent = exponent_at(splat, splat.log2_opacity, x, y);
   return zero_unless(exponent >= F16(kLog2AlphaCut), min(exp2(exponent), F16(kMaxAlpha)));
 }
 
@@ -91,15 +121,33 @@ SP_INLINE LaneCentres block_centres(const LaneCentres& centres, int b) {
           centres.y + F16(static_cast<float>(kBlockSize * (b / 4)))};
 }
 
-// Composites the staged splats of one block; returns whether any pixel is still open.
-template <bool kColor, bool kDepth>
+// Lets the light through one splat without blur; returns whether any pixel has half of it left.
+// Those that do take the splat's depth, in case it takes the half.
+SP_INLINE bool seek_median(const StagedPlane& plane, float log2_opacity, const LaneCentres& pixel,
+                           BlockState& s) {
+  const F16 half = F16(0.5f);
+  const F16 exponent = exponent_at(plane, log2_opacity, pixel.x, pixel.y);
+  const F16 alpha = zero_unless(exponent >= F16(kLog2AlphaCut), exp2(exponent));
+  const F16 w = F16(plane.w_x) * pixel.x + (F16(plane.w_y) * pixel.y + F16(plane.w));
+  s.median_w = select(s.sharp_transmittance > half, w, s.median_w);
+  s.sharp_transmittance = s.sharp_transmittance - s.sharp_transmittance * alpha;
+  return any(s.sharp_transmittance > half);
+}
+
+// Composites the staged splats of one block; returns whether any pixel is still open. A pixel whose
+// colour is finished is open while its median depth is sought.
+template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
                          BlockState& state) {
   BlockState s = state;
-  bool open = true;
+  bool open = true, seeking = kMedian && any(s.sharp_transmittance > F16(0.5f));
   for (int word = 0; word < words && open; ++word) {
     for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
-      const StagedSplat& splat = staged.splats[64 * word + __builtin_ctzll(bits)];
+      const int i = 64 * word + __builtin_ctzll(bits);
+      const StagedSplat& splat = staged.splats[i];
+      if constexpr (kMedian) {
+        if (seeking) seeking = seek_median(staged.planes[i], splat.log2_opacity, pixel, s);
+      }
       const F16 alpha = alpha_at(splat, pixel.x, pixel.y);
       const F16 rest = s.transmittance * (F16(1.0f) - alpha);
       const Mask16 keep = rest > F16(kMinTransmittance);
@@ -113,8 +161,11 @@ SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneC
       }
       if constexpr (kDepth) s.depth += weight * F16(splat.depth);
       if (!any(keep)) {
-        open = false;
-        break;
+        if (!seeking) {
+          open = false;
+          break;
+        }
+        s.transmittance = max(rest, F16(1e-20f));  // and never a subnormal number
       }
     }
   }
@@ -127,7 +178,7 @@ struct BlockPixels {
   alignas(64) float red[kLanes], green[kLanes], blue[kLanes], depth[kLanes], alpha[kLanes];
 };
 
-template <bool kColor, bool kDepth>
+template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPixels& pixels) {
   store(pixels.alpha, state.alpha);
   if constexpr (kColor) {
@@ -137,8 +188,12 @@ SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPi
     store(pixels.blue, state.blue + rest * F16(image.background[2]));
   }
   if constexpr (kDepth) {
-    store(pixels.depth,
-          image.expected_depth ? state.depth / max(state.alpha, F16(1e-10f)) : state.depth);
+    const bool expected = image.depth_mode == DepthMode::kExpected;
+    store(pixels.depth, expected ? state.depth / max(state.alpha, F16(1e-10f)) : state.depth);
+  }
+  if constexpr (kMedian) {
+    const F16 z = F16(1.0f) / max(state.median_w, F16(1e-10f));
+    store(pixels.depth, zero_unless(state.sharp_transmittance <= F16(0.5f), z));
   }
 }
 
@@ -158,11 +213,11 @@ SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Vi
   }
 }
 
-template <bool kColor, bool kDepth>
+template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE void write_block(const Image& image, const BlockState& state, int width, int height,
                            int left, int top) {
   BlockPixels pixels;
-  finish_block<kColor, kDepth>(image, state, pixels);
+  finish_block<kColor, kDepth, kMedian>(image, state, pixels);
   for_each_pixel(width, height, left, top, [&](int lane, size_t pixel) {
     image.alpha[pixel] = pixels.alpha[lane];
     if constexpr (kColor) {
@@ -171,7 +226,7 @@ SP_INLINE void write_block(const Image& image, const BlockState& state, int widt
       color[1] = pixels.green[lane];
       color[2] = pixels.blue[lane];
     }
-    if constexpr (kDepth) image.depth[pixel * image.depth_stride] = pixels.depth[lane];
+    if constexpr (kDepth || kMedian) image.depth[pixel * image.depth_stride] = pixels.depth[lane];
   });
 }
 
@@ -185,7 +240,7 @@ SP_INLINE F16 ones_inside(int width, int height, const LaneCentres& centres, int
       F16(1.0f));
 }
 
-template <bool kColor, bool kDepth>
+template <bool kColor, bool kDepth, bool kMedian>
 void raster_tile_channels(const RasterInput& in, const Image& image, const StageWriter* record,
                           int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
@@ -194,8 +249,8 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const F16 zero = F16(0.0f);
-    state[b] = {
-        ones_inside(in.width, in.height, centres, left, top, b), zero, zero, zero, zero, zero};
+    const F16 open = ones_inside(in.width, in.height, centres, left, top, b);
+    state[b] = {open, zero, zero, zero, zero, zero, open, zero};
     if (any(state[b].transmittance > zero)) inside |= 1u << b;
   }
 
@@ -213,30 +268,34 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
     }
     ++stages;
     const int count = end - begin < kStageSize ? static_cast<int>(end - begin) : kStageSize;
-    stage(in, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
+    stage<kMedian>(in, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
       const LaneCentres pixel = block_centres(centres, b);
-      const bool open = composite<kColor, kDepth>(staged, (count + 63) / 64, b, pixel, state[b]);
+      const bool open =
+          composite<kColor, kDepth, kMedian>(staged, (count + 63) / 64, b, pixel, state[b]);
       if (!open) live &= ~(1u << b);
     }
   }
   if (record) record->stages_done[tile] = stages;
   for (uint32_t bits = inside; bits; bits &= bits - 1) {
     const int b = __builtin_ctz(bits);
-    write_block<kColor, kDepth>(image, state[b], in.width, in.height, left + kBlockSize * (b % 4),
-                                top + kBlockSize * (b / 4));
+    write_block<kColor, kDepth, kMedian>(image, state[b], in.width, in.height,
+                                         left + kBlockSize * (b % 4), top + kBlockSize * (b / 4));
   }
 }
 
 inline void raster_tile(const RasterInput& in, const Image& image, const StageWriter* record,
                         int tile) {
-  if (image.color && image.depth) {
-    raster_tile_channels<true, true>(in, image, record, tile);
+  if (image.depth && image.depth_mode == DepthMode::kMedian) {
+    image.color ? raster_tile_channels<true, false, true>(in, image, record, tile)
+                : raster_tile_channels<false, false, true>(in, image, record, tile);
+  } else if (image.color && image.depth) {
+    raster_tile_channels<true, true, false>(in, image, record, tile);
   } else if (image.color) {
-    raster_tile_channels<true, false>(in, image, record, tile);
+    raster_tile_channels<true, false, false>(in, image, record, tile);
   } else {
-    raster_tile_channels<false, true>(in, image, record, tile);
+    raster_tile_channels<false, true, false>(in, image, record, tile);
   }
 }
 

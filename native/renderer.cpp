@@ -23,23 +23,26 @@ Renderer::Renderer(int threads, const std::string& simd_level)
 
 std::shared_ptr<const Frame> Renderer::render(const GaussianArrays& gaussians, const Camera& camera,
                                               const Image& image, bool keep) {
-  const auto project = [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
-    return kernels_.project(gaussians, camera, begin, end, splats, depth_bits);
+  const auto project = [&](size_t begin, size_t end, Splat* splats, DepthPlane* planes,
+                           uint32_t* depth_bits) {
+    return kernels_.project(gaussians, camera, begin, end, splats, planes, depth_bits);
   };
   return draw(camera, image, keep, gaussians.count, project);
 }
 
 std::shared_ptr<const Frame> Renderer::render(const BakedArrays& scene, const Camera& camera,
                                               const Image& image) {
-  const auto project = [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
-    return kernels_.project_baked(scene, camera, begin, end, splats, depth_bits);
+  const auto project = [&](size_t begin, size_t end, Splat* splats, DepthPlane* planes,
+                           uint32_t* depth_bits) {
+    return kernels_.project_baked(scene, camera, begin, end, splats, planes, depth_bits);
   };
   return draw(camera, image, false, scene.groups * 16, project);
 }
 
 std::shared_ptr<const Frame> Renderer::render(const ProjectedArrays& projected,
                                               const Camera& camera, const Image& image, bool keep) {
-  const auto project = [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
+  const auto project = [&](size_t begin, size_t end, Splat* splats, DepthPlane*,
+                           uint32_t* depth_bits) {
     return place_splats(projected, camera, begin, end, splats, depth_bits);
   };
   return draw(camera, image, keep, projected.count, project);
@@ -49,7 +52,7 @@ std::shared_ptr<const Frame> Renderer::draw(const Camera& camera, const Image& i
                                             size_t count, const ProjectChunk& project) {
   const std::shared_ptr<Frame> frame = frames_.take();
   start(*frame, camera, keep);
-  this->project(*frame, count, project);
+  this->project(*frame, count, image.depth_mode == DepthMode::kMedian, project);
   sort(*frame);
   bin(*frame, kernels_.bin);
   composite(*frame, image);

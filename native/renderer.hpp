@@ -74,11 +74,12 @@ class Renderer {
   }
 
  private:
-  using ProjectChunk =
-      std::function<size_t(size_t begin, size_t end, Splat* splats, uint32_t* depth_bits)>;
+  using ProjectChunk = std::function<size_t(size_t begin, size_t end, Splat* splats,
+                                            DepthPlane* planes, uint32_t* depth_bits)>;
   void start(Frame& frame, const Camera& camera, bool keep);
-  // Splats of Gaussians [0, count), chunk by chunk: project() returns how many.
-  void project(Frame& frame, size_t count, const ProjectChunk& project);
+  // Splats of Gaussians [0, count), chunk by chunk, and their planes for `median_depth`: project()
+  // returns how many.
+  void project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project);
   void sort(const Frame& frame);
   void bin(Frame& frame, BinKernel kernel);
   void composite(Frame& frame, const Image& image);

@@ -25,8 +25,8 @@ std::shared_ptr<const SurfelFrame> Renderer::render_surfels(const GaussianArrays
   Frame& bounds = frame->bounds;
   start(bounds, camera, keep);
   if (frame->surfels.size() < surfels.count) frame->surfels.resize(surfels.count);
-  project(bounds, surfels.count,
-          [&](size_t begin, size_t end, Splat* splats, uint32_t* depth_bits) {
+  project(bounds, surfels.count, false,
+          [&](size_t begin, size_t end, Splat* splats, DepthPlane*, uint32_t* depth_bits) {
             return kernels.project(surfels, camera, begin, end, splats,
                                    frame->surfels.data() + begin, depth_bits);
           });

@@ -20,6 +20,8 @@ constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
+// How far the inverse depth of a Gaussian may fall towards its rim, of that of its centre.
+constexpr float kNearestDepth = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.
 constexpr float kMaxExtent = 3.33f;
 // The exponent is kept in base 2 and in Cholesky form: alpha = exp2(log2 o - u^2 - v^2) with
@@ -57,6 +59,16 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64);
 
+// How a Gaussian enters the median depth: its footprint without blur, as in Splat, and the inverse
+// depth of the point of greatest density along a pixel's ray, w + w_x dx + w_y dy. That is the
+// plane n . p = n . mean with n = covariance^-1 mean, in the camera frame.
+struct alignas(32) DepthPlane {
+  float ux, uy, vy;
+  float w_x, w_y, w;  // [1/(m px)], [1/m]
+  float unused[2];
+};
+static_assert(sizeof(DepthPlane) == 32);
+
 // A splat in a tile and the blocks of the tile that it touches.
 struct Pair {
   uint32_t splat;
@@ -87,13 +99,17 @@ struct BakedArrays {
                           // largest scale; one box per kBoundSize Gaussians
 };
 
+// sum w z; that divided by alpha; z where what is let through, of footprints without blur, falls
+// below one half, 0 where it never does.
+enum class DepthMode { kAccumulated, kExpected, kMedian };
+
 // Where tiles write. Strides are in floats; a null pointer means "not wanted".
 struct Image {
   float* color;
   int color_stride;
   float* depth;
   int depth_stride;
-  bool expected_depth;  // divide the accumulated depth by alpha
+  DepthMode depth_mode;
   float* alpha;
   float background[3];
 };
@@ -113,6 +129,7 @@ using StageReader = StageRecord<const float, const uint32_t>;
 
 struct RasterInput {
   const Splat* splats;
+  const DepthPlane* planes;    // of the splats, for the median depth
   const Pair* pairs;           // grouped by tile, in depth order
   const size_t* tile_offsets;  // (tiles + 1,)
   int width, height, tiles_x;
@@ -188,12 +205,12 @@ struct Kernels {
   const char* name;
   const SurfelKernels* surfels;
   const LossKernels* losses;
-  // Projects Gaussians [begin, end); writes visible ones and the bits of their depths in input
-  // order; returns how many.
+  // Projects Gaussians [begin, end); writes visible ones, their planes if these are not null, and
+  // the bits of their depths in input order; returns how many.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,
-                    uint32_t* depth_bits);
+                    DepthPlane*, uint32_t* depth_bits);
   size_t (*project_baked)(const BakedArrays&, const Camera&, size_t begin, size_t end, Splat*,
-                          uint32_t* depth_bits);
+                          DepthPlane*, uint32_t* depth_bits);
   BinKernel bin;
   // With `record`, a backward pass can follow.
   void (*raster_tile)(const RasterInput&, const Image&, const StageWriter* record, int tile);

@@ -21,7 +21,7 @@ class RenderedView(NamedTuple):
     """What a pinhole camera sees of a scene, float32."""
 
     color: "NDArray[np.float32]"  # (H, W, 3), over the background
-    depth: "NDArray[np.float32]"  # (H, W) [m] expected z: alpha-weighted mean; 0 where alpha is 0
+    depth: "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0 where there is no surface
     alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
 
 
@@ -98,7 +98,7 @@ class BakedScene:
         far: float = 1e10,
         background: "ArrayLike" = (0.0, 0.0, 0.0),
     ) -> RenderedView:
-        """Renders colour, expected depth and alpha.
+        """Renders colour, median depth and alpha.
 
         Args:
             K: (3, 3) pinhole intrinsics [px]; skew is ignored. Pixel (i, j) has its centre at

@@ -14,11 +14,6 @@ from splatpilot.systems.splats.background import (
 )
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 
-# Below one half, more of the light along a ray comes from behind the surface than from it: no depth
-# to speak of.
-OPAQUE_ALPHA = 0.5
-
-
 def render_view(
     scene: BakedScene,
     camera_info: CameraInfo,
@@ -44,14 +39,17 @@ def color_pixels(color: NDArray) -> NDArray[np.uint8]:
     return np.clip(color * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
-def ranged_depth(view: RenderedView, min_depth: float, max_depth: float) -> NDArray[np.float32]:
-    """Planar depth of the surfaces in `view`  # (H, W) [m].
+def surface_depth(view: RenderedView) -> NDArray[np.float32]:
+    """Planar depth of the surfaces in `view`, infinite where there is none  # (H, W) [m]."""
+    return np.where(view.depth > 0, view.depth, np.float32(np.inf))
 
-    As in Drake, nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so
-    does a pixel whose alpha stays below one half.
+
+def ranged_depth(view: RenderedView, min_depth: float, max_depth: float) -> NDArray[np.float32]:
+    """`surface_depth` as Drake's cameras give it: 0 nearer than `min_depth` and infinite farther
+    than `max_depth`  # (H, W) [m].
     """
-    seen = (view.alpha >= OPAQUE_ALPHA) & (view.depth <= max_depth)
-    return np.where(seen, np.where(view.depth < min_depth, np.float32(0), view.depth), np.inf)
+    depth = surface_depth(view)
+    return np.where(depth > max_depth, np.inf, np.where(depth < min_depth, np.float32(0), depth))
 
 
 def surface_labels(view: RenderedView) -> NDArray[np.int16]:
@@ -59,4 +57,4 @@ def surface_labels(view: RenderedView) -> NDArray[np.int16]:
     Gaussians carry no semantics  # (H, W).
     """
     unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
-    return np.where(view.alpha >= OPAQUE_ALPHA, unspecified, empty).astype(np.int16)
+    return np.where(view.depth > 0, unspecified, empty).astype(np.int16)

@@ -25,6 +25,7 @@ from splatpilot.systems.splats.rasterization_checks import (
     check_render_mode,
     check_shapes,
     check_values,
+    depth_mode_of,
     pair_meta,
 )
 from splatpilot.systems.splats.rasterization_unscented import (
@@ -70,9 +71,15 @@ def rasterize(
     centre, plus eps2d on the diagonal. Contributions with a < 1/255 are skipped, and a pixel is
     finished before T would fall to 1e-4. Gaussians of equal depth blend in the order of the input.
 
+    z is the depth of the centre for "D" and "ED". The median depth is that of a surface: z of the
+    point of greatest density along the pixel's ray, at the Gaussian where what passes through S
+    without eps2d falls to one half, and 0 where it never does. A pixel beside an edge shows what is
+    behind, whatever tails reach it, and a flat Gaussian has the depth of its plane, n . p = n . c
+    with n = covariance^-1 c for a centre c in the camera frame (Zhang et al. 2024, RaDe-GS).
+
     Colour, depth and alpha are differentiable with respect to means, quats, scales, opacities,
     colors, viewmats (all twelve numbers, taken as free) and backgrounds; a Gaussian that is skipped
-    or held at a = .99 has no part in the derivative there. Equal input gives equal bits, gradients
+    or held at a = .99 has no part in the derivative there, and a median depth is constant. Equal input gives equal bits, gradients
     included, whatever the number of threads.
 
     With distortion coefficients, or for a fisheye, S and the centre on the image are those of the
@@ -98,7 +105,7 @@ def rasterize(
         sh_degree: Degree to evaluate, 0 to 3; None when `colors` are colours.
         backgrounds: (C, 3) colours behind everything, black if None; depth has no background.
         render_mode: "RGB"; "D", the accumulated depth sum w z [m]; "ED", the expected depth
-            sum w z / sum w; or "RGB+D", "RGB+ED".
+            sum w z / sum w; "MD", the median depth, see below; or "RGB+D", "RGB+ED", "RGB+MD".
         absgrad: In backward, set ``meta["means2d"].absgrad`` (M, 2): the sums over pixels of the
             absolute values of what they add to the gradient of means2d.
         rasterize_mode: "classic", or "antialiased": opacities are multiplied by
@@ -121,7 +128,8 @@ def rasterize(
     Raises:
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it),
             or Ks of an undistorted pinhole requires a gradient.
-        NotImplementedError: tensors are on a GPU and the cameras are distorted.
+        NotImplementedError: two of these come together: tensors on a GPU, distorted cameras, median
+            depth.
         ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
@@ -129,9 +137,20 @@ def rasterize(
     check_camera_model(camera_model, tangential_coeffs, max_angle)
     unscented = camera_model != "pinhole" or not (radial_coeffs is tangential_coeffs is None)
     check_render_mode(render_mode)
+    median = "MD" in render_mode
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(
             f"rasterize_mode is {rasterize_mode!r}; it must be one of {', '.join(RASTERIZE_MODES)}"
+        )
+    if median and rasterize_mode == "antialiased":
+        raise ValueError(
+            f"render_mode {render_mode!r} needs rasterize_mode 'classic': antialiasing makes small "
+            "Gaussians fainter than they are in the median depth"
+        )
+    if median and (unscented or means.device.type == "cuda"):
+        raise NotImplementedError(
+            f"render_mode {render_mode!r} is there for undistorted pinholes on the CPU alone; undo "
+            "the distortion, and move the tensors with .cpu()"
         )
     check_shapes(tensors, sh_degree, RADIAL_COUNTS[camera_model])
     if means.device.type == "cuda":
@@ -179,7 +198,7 @@ def rasterize(
         per_camera_colors=colors.ndim == (3 if sh_degree is None else 4),
         backgrounds=arrays.get("backgrounds", np.zeros((len(viewmats), 3), dtype=np.float32)),
         channels=CHANNELS[render_mode],
-        expected_depth="ED" in render_mode,
+        depth_mode=depth_mode_of(render_mode),
         absgrad=absgrad,
     )
     wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())

@@ -55,7 +55,7 @@ class Views:
     per_camera_colors: bool
     backgrounds: NDArray[np.float32]  # (C, 3)
     channels: int
-    expected_depth: bool
+    depth_mode: _native.DepthMode
     absgrad: bool
 
     def draw(self, gaussians: dict[str, NDArray[np.float32]], keep: bool) -> Drawing:
@@ -90,7 +90,7 @@ class Views:
             "width": self.width,
             "height": self.height,
             "radius_clip": self.radius_clip,
-            "expected_depth": self.expected_depth,
+            "depth_mode": self.depth_mode,
             "background": self.backgrounds[camera],
             "image": drawing.image[camera].numpy(),
             "alpha": drawing.alpha[camera].numpy(),
@@ -214,6 +214,9 @@ class Composite(torch.autograd.Function):
         views: Views = ctx.views
         means2d, image, alpha = ctx.saved_tensors
         v_image, v_alpha = v_image.contiguous(), v_alpha.contiguous()
+        if views.depth_mode == _native.DepthMode.MEDIAN:
+            v_image = v_image.clone()
+            v_image[..., -1] = 0
         v_means2d = v_splats = v_backgrounds = None
         if ctx.needs_input_grad[2]:
             v_splats = torch.empty(len(means2d), SPLAT_GRADIENT)
@@ -227,7 +230,7 @@ class Composite(torch.autograd.Function):
                     image=image[c].numpy(),
                     alpha=alpha[c].numpy(),
                     background=views.backgrounds[c],
-                    expected_depth=views.expected_depth,
+                    expected_depth=views.depth_mode == _native.DepthMode.EXPECTED,
                     absolute=views.absgrad,
                     v_splats=v_splats[rows].numpy(),
                     v_means2d=v_means2d[rows].numpy(),

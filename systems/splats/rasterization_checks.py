@@ -1,5 +1,6 @@
 """What the rasterisers refuse and how they say so, and what else they share."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor
 from splatpilot import _native
 
 TILE_SIZE = 16  # [px]
-CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}
+CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "MD": 1, "RGB+D": 4, "RGB+ED": 4, "RGB+MD": 4}
 SCENE = ("means", "quats", "scales", "opacities", "colors")
 TENSORS = (*SCENE, "viewmats", "Ks", "backgrounds", "radial_coeffs", "tangential_coeffs")
 
@@ -121,9 +122,16 @@ def _bad_value(name: str, array: np.ndarray, flat_index: int, requirement: str) 
     return ValueError(f"{name}[{where}] is {array[index]:g}; it must {requirement}")
 
 
-def check_render_mode(render_mode: str) -> None:
-    if render_mode not in CHANNELS:
-        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(CHANNELS)}")
+def check_render_mode(render_mode: str, modes: Iterable[str] = CHANNELS) -> None:
+    if render_mode not in modes:
+        raise ValueError(f"render_mode is {render_mode!r}; it must be one of {', '.join(modes)}")
+
+
+def depth_mode_of(render_mode: str) -> _native.DepthMode:
+    """What the depth of a `render_mode` is; of one without depth, any."""
+    if "MD" in render_mode:
+        return _native.DepthMode.MEDIAN
+    return _native.DepthMode.EXPECTED if "ED" in render_mode else _native.DepthMode.ACCUMULATED
 
 
 def check_device(means: Tensor) -> None:

@@ -50,10 +50,10 @@ class SplatCamera(LeafSystem):
     The images are rendered when a port is evaluated, once for all of them, and again only when the
     pose has changed.
 
-    Depth is planar z of the expected surface, sum_i w_i z_i / sum_i w_i, in metres
+    Depth is planar z of the surface, the median depth of `rasterize`, in metres
     (`depth_image_32f`) or millimetres (`depth_image_16u`). As in Drake, nearer than `min_depth`
-    reads 0, farther than `max_depth` reads infinity or 65535, and so does a pixel whose alpha stays
-    below one half. Labels are `RenderLabel.kUnspecified` where there is a surface and
+    reads 0, farther than `max_depth` reads infinity or 65535, and so does a pixel without a
+    surface. Labels are `RenderLabel.kUnspecified` where there is a surface and
     `RenderLabel.kEmpty` elsewhere: Gaussians carry no semantics.
     """
 

@@ -26,6 +26,7 @@ from splatpilot.systems.splats.rasterization_checks import (
 )
 
 DEPTH_MODES = ("expected", "median")
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 IMAGES = {"color": 3, "normal": 3, "depth": 1, "alpha": 1, "median": 1, "distort": 1}  # channels
 
 
@@ -256,7 +257,7 @@ def _viewmat_gradient(by_camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:
 
 
 def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_clip: float) -> None:
-    check_render_mode(render_mode)
+    check_render_mode(render_mode, RENDER_MODES)
     if depth_mode not in DEPTH_MODES:
         raise ValueError(f"depth_mode is {depth_mode!r}; it must be one of {DEPTH_MODES}")
     if distloss and "D" not in render_mode:
