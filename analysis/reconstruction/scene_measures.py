@@ -16,6 +16,7 @@ NAMES = {
     "depth_relative": ("depth error, relative", "{:.2%}"),
     "floater_fraction": ("floaters", "{:.2%}"),
     "hole_fraction": ("holes", "{:.2%}"),
+    "unseen_fraction": ("left out as unseen", "{:.2%}"),
 }
 """How measures are called and written in tables."""
 

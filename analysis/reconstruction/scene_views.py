@@ -1,7 +1,11 @@
 """A scene folder beside the capture that it was made from."""
 
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.scene_folder import read_background
@@ -15,6 +19,7 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.measures import SceneRenderer, ViewMeasures, measure_view
+from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.views import shrink, shrink_factor
 
 
@@ -64,6 +69,11 @@ class SceneViews:
             read_ply(scene / "gaussians.ply"), self.metadata.representation
         )
 
+    @property
+    def measured(self) -> Sequence[int]:
+        """The frames on which the scene is measured: those held out, or every eighth."""
+        return self.metadata.held_out or range(0, len(self.capture), 8)
+
     def frame(self, i: int) -> CaptureFrame:
         """Returns frame i of the capture in the size at which the scene was made."""
         return self.shrink(self.capture.frame(i))
@@ -82,10 +92,26 @@ class SceneViews:
         """Returns what the scene shows the camera of `frame`."""
         return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
 
-    def measure(self, frame: CaptureFrame, lpips: Lpips | None = None) -> ViewMeasures:
-        """Compares both."""
+    @cached_property
+    def _fitted(self) -> list[ThinnedFrame]:
+        """The frames that the scene was made from."""
+        held_out = set(self.metadata.held_out)
+        numbers = [i for i in range(len(self.capture)) if i not in held_out]
+        return [ThinnedFrame.of(self.frame(i)) for i in numbers]
+
+    def seen(self, frame: CaptureFrame) -> NDArray[np.bool_]:
+        """Returns the pixels (H, W) of `frame` that show what the scene was made from."""
+        return seen_pixels(frame, self._fitted)
+
+    def measure(
+        self,
+        frame: CaptureFrame,
+        seen: NDArray[np.bool_] | None = None,
+        lpips: Lpips | None = None,
+    ) -> ViewMeasures:
+        """Compares both, in the pixels `seen` or in all."""
         on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
-        return measure_view(on_black, self.background, frame, vignetting, lpips)
+        return measure_view(on_black, self.background, frame, vignetting, seen, lpips)
 
     def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
         height, width = frame.depth.shape

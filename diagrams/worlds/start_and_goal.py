@@ -9,6 +9,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from splatpilot.systems.collision.esdf import Esdf
 
+SHORTEST = 1.0
+"""[m], length of the shortest way that is worth a flight."""
+
 _MAX_NODES = 250_000
 
 
@@ -18,22 +21,24 @@ def choose_start_and_goal(
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
-    [m] to spare can fly through space known to be free: in the largest connected part of a grid,
-    the node farthest from any node, and the node farthest from that (the double sweep, exact on
-    trees). If no space has that much margin, half of it is tried, and then none. Paths longer than
+    [m] to spare can fly through space known to be free, at least `SHORTEST`: in the largest
+    connected part of a grid, the node farthest from any node, and the node farthest from that (the
+    double sweep, exact on trees). If no space has that much margin, half of it is tried, and then none. Paths longer than
     `longest` [m] are not considered: a flight should end in good time.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius`.
+        ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
     """
+    reach = 0.0
     for graph, p_WN in _free_graphs(esdf, radius, margin):
         _, label = connected_components(graph, directed=False)
         inner = int(np.argmax(label == np.bincount(label).argmax()))
         start, _ = _farthest(graph, inner)
         goal, length = _farthest(graph, start, longest)
-        if length > 0:
+        if length >= SHORTEST:
             return p_WN[start], p_WN[goal], length
-    raise _no_room(esdf, radius)
+        reach = max(reach, length)
+    raise _no_room(esdf, radius, reach)
 
 
 def draw_start_and_goal(
@@ -46,9 +51,10 @@ def draw_start_and_goal(
     longest there is, up to `longest` [m]. The same seed gives the same bits.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius`.
+        ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
     """
     rng = np.random.default_rng(seed)
+    reach = 0.0
     for graph, p_WN in _free_graphs(esdf, radius, margin):
         _, label = connected_components(graph, directed=False)
         part = np.flatnonzero(label == np.bincount(label).argmax())
@@ -57,10 +63,10 @@ def draw_start_and_goal(
             start = int(rng.choice(part))
             lengths = dijkstra(graph, directed=False, indices=start, limit=longest)
             far = np.flatnonzero(np.isfinite(lengths) & (lengths >= 0.6 * min(reach, longest)))
-            if len(far) and reach > 0:
+            if len(far) and reach >= SHORTEST:
                 goal = int(rng.choice(far))
                 return p_WN[start], p_WN[goal], float(lengths[goal])
-    raise _no_room(esdf, radius)
+    raise _no_room(esdf, radius, reach)
 
 
 def _free_graphs(
@@ -83,7 +89,13 @@ def _free_graphs(
             yield graph, p_WN.reshape(-1, 3)[nodes]
 
 
-def _no_room(esdf: Esdf, radius: float) -> ValueError:
+def _no_room(esdf: Esdf, radius: float, reach: float) -> ValueError:
+    if reach > 0:
+        return ValueError(
+            f"the longest way of a vehicle of radius {radius} m through free space is {reach:.2f} "
+            f"m, at least {SHORTEST:.0f} m is needed, and unknown space counts as occupied; "
+            "capture more of the place"
+        )
     largest = float(esdf.conservative().distances.max())
     return ValueError(
         f"no free space for a vehicle of radius {radius} m: the largest clearance is "

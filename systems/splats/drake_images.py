@@ -14,6 +14,7 @@ from splatpilot.systems.splats.background import (
 )
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 
+
 def render_view(
     scene: BakedScene,
     camera_info: CameraInfo,

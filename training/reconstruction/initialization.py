@@ -12,7 +12,6 @@ from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.depth_gaussians import frame_gaussians, principal_axes
-from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.overlap import STRIDE, ThinnedFrame, find_new_pixels
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.views import ReconstructionViews
@@ -22,7 +21,7 @@ _SOME = 4
 # Opacity and size, in distances to the third neighbour, of Gaussians about points.
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5
 # Opacity with which Gaussians on surfaces start into the optimisation.
-_FIRST_OPACITY = 0.7
+_FIRST_OPACITY = 0.9
 # Depth of random Gaussians, in extents of the cameras.
 _RANDOM_DEPTH = (0.1, 10.0)
 
@@ -97,12 +96,6 @@ def detail_of(config: ReconstructConfig) -> Detail:
     )
 
 
-def drop_far(frame: CaptureFrame) -> CaptureFrame:
-    """Returns the frame without depth (0) where it shows the infinitely far: no Gaussian stands
-    there."""
-    return replace(frame, depth=np.where(frame.depth < FAR, frame.depth, np.float32(0)))
-
-
 def gaussians_from_depth(
     frames: Sequence[CaptureFrame], photometry: Photometry, detail: Detail
 ) -> GaussianScene:
@@ -119,7 +112,7 @@ def gaussians_from_depth(
     gains = photometry.gains
     # A gain is a rough account of another tone curve, so other images are preferred to odd ones.
     odd = np.flatnonzero(np.abs(np.log(gains / np.median(gains))) > 0.05)
-    views = [ThinnedFrame.of(drop_far(frame)) for frame in frames]
+    views = [ThinnedFrame.of(frame) for frame in frames]
     new = find_new_pixels(views, last=odd.tolist())
 
     def gaussians_of(k: int, frame: CaptureFrame) -> tuple[NDArray, NDArray, NDArray]:
@@ -138,12 +131,12 @@ def gaussians_from_depth(
     progress = tqdm(desc="Gaussians", unit="frame")
     while True:
         # Some of the frames tell when it is far too many.
-        parts = {k: gaussians_of(k, drop_far(frames[k])) for k in some}
+        parts = {k: gaussians_of(k, frames[k]) for k in some}
         progress.update(len(parts))
         estimate = sum(len(p_WQ) for p_WQ, _, _ in parts.values()) * len(frames) / len(some)
         if estimate <= 1.1 * detail.max_gaussians:
             for k in set(range(len(frames))).difference(some):
-                parts[k] = gaussians_of(k, drop_far(frames[k]))
+                parts[k] = gaussians_of(k, frames[k])
                 progress.update()
             if sum(len(p_WQ) for p_WQ, _, _ in parts.values()) <= detail.max_gaussians:
                 break
@@ -152,7 +145,7 @@ def gaussians_from_depth(
         elif detail.optimized:
             # Edges of depth alone make too many: optimisation fills in what is left out here.
             for k in set(range(len(frames))).difference(some):
-                parts[k] = gaussians_of(k, drop_far(frames[k]))
+                parts[k] = gaussians_of(k, frames[k])
                 progress.update()
             break
         elif max_cell < 64:

@@ -10,7 +10,6 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.background import Background, put_behind
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
-from splatpilot.systems.splats.drake_images import OPAQUE_ALPHA
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.losses import FAR, photometric_loss
@@ -33,7 +32,8 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class ViewMeasures:
-    """One view against the truth. Depth is not measured where the truth has none."""
+    """One view against the truth. Depth is not measured where the truth has none, and nothing in
+    pixels that are left out because no camera saw what they show."""
 
     psnr_db: float  # [dB], before the scene's own background
     psnr_on_black_db: float  # [dB], before black, except where the truth is infinitely far
@@ -43,6 +43,7 @@ class ViewMeasures:
     depth_relative: float | None  # mean of |error| / true depth
     floater_fraction: float | None  # of the pixels with true depth
     hole_fraction: float | None  # of the pixels with true depth
+    unseen_fraction: float  # of all pixels, those left out
     gain: float  # brightness of the true image relative to the scene
 
 
@@ -137,17 +138,21 @@ def hole_fraction(depth: NDArray, truth: NDArray) -> float | None:
     return float((depth == 0)[valid].mean()) if valid.any() else None
 
 
-def fit_exposure(color: NDArray, truth: NDArray, vignetting: float) -> tuple[NDArray, float]:
+def fit_exposure(
+    color: NDArray, truth: NDArray, vignetting: float, seen: NDArray[np.bool_] | None = None
+) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) as the camera would have exposed it, and the gain.
 
     The corners are darkened by the vignetting of the capture, and all pixels multiplied by the one
-    number that brings them closest to the true image (least squares): how a camera exposed a frame
-    says nothing of the place, and for a frame that is withheld from the fit nobody knows it.
+    number that brings those `seen` (H, W), or all, closest to the true image (least squares): how a
+    camera exposed a frame says nothing of the place, and for a frame that is withheld from the fit
+    nobody knows it.
     """
     height, width = color.shape[:2]
     image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
-    energy = float((image * image).sum())
-    gain = float((image * truth).sum()) / energy if energy > 0 else 1.0
+    x, y = (image, truth) if seen is None else (image[seen], truth[seen])
+    energy = float((x * x).sum())
+    gain = float((x * y).sum()) / energy if energy > 0 else 1.0
     return np.clip(gain * image, 0, 1), gain
 
 
@@ -156,6 +161,7 @@ def measure_view(
     background: Background,
     frame: CaptureFrame,
     vignetting: float = 0.0,
+    seen: NDArray[np.bool_] | None = None,
     lpips: Lpips | None = None,
 ) -> ViewMeasures:
     """Compares a rendered view with what its camera saw.
@@ -167,27 +173,34 @@ def measure_view(
         background: of the scene.
         frame: the truth, of the same size.
         vignetting: of the capture, see `vignette`.
+        seen: (H, W), the pixels to measure, see `seen_pixels`; all if None. For structure and
+            perception, whose windows reach over others, these are as they should be.
         lpips: the perceptual distance; None leaves it out.
     """
     truth, far = frame.image / 255, frame.depth >= FAR
+    if seen is None:
+        seen = np.ones(far.shape, dtype=bool)
+    true_depth = np.where(seen, frame.depth, 0)
     view = put_behind(on_black, background, frame.K, frame.X_WC)
-    exposed, gain = fit_exposure(view.color, truth, vignetting)
-    color_on_black = np.where(far[..., None], view.color, on_black.color)
-    depth = np.where(view.alpha >= OPAQUE_ALPHA, view.depth, 0)
+    before_black = np.where(far[..., None], view.color, on_black.color)
+    exposed, gain = fit_exposure(view.color, truth, vignetting, seen)
+    exposed_before_black, _ = fit_exposure(before_black, truth, vignetting, seen)
+    whole = np.where(seen[..., None], exposed, truth)
     distance = None
     if lpips is not None:
         with torch.no_grad():
-            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth))
+            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (whole, truth))
             distance = lpips(a, b).item()
     return ViewMeasures(
-        psnr_db=psnr_db(exposed, truth),
-        psnr_on_black_db=psnr_db(fit_exposure(color_on_black, truth, vignetting)[0], truth),
-        ssim=ssim(exposed, truth),
+        psnr_db=psnr_db(exposed[seen], truth[seen]),
+        psnr_on_black_db=psnr_db(exposed_before_black[seen], truth[seen]),
+        ssim=ssim(whole, truth),
         lpips=distance,
-        depth_mae_m=depth_mae_m(depth, frame.depth),
-        depth_relative=depth_relative(depth, frame.depth),
-        floater_fraction=floater_fraction(depth, frame.depth),
-        hole_fraction=hole_fraction(depth, frame.depth),
+        depth_mae_m=depth_mae_m(view.depth, true_depth),
+        depth_relative=depth_relative(view.depth, true_depth),
+        floater_fraction=floater_fraction(view.depth, true_depth),
+        hole_fraction=hole_fraction(view.depth, true_depth),
+        unseen_fraction=float(1 - seen.mean()),
         gain=gain,
     )
 
@@ -214,7 +227,7 @@ class SceneRenderer:
                 torch.tensor(K, dtype=torch.float32)[None],
                 width,
                 height,
-                depth_mode="ED",
+                depth_mode="MD",
                 renderer=self._renderer,
             )
         images = (rendering.color, rendering.depth, rendering.alpha)

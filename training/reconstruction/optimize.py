@@ -19,6 +19,7 @@ from splatpilot.training.reconstruction.densification import DefaultStrategy
 from splatpilot.training.reconstruction.losses import log_depth_loss, photometric_loss
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
 from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
+from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.photometry import fit_gain
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
@@ -62,6 +63,8 @@ class Optimization:
         self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
         self._renderer = create_renderer(config.renderer_threads)
         self._background = background
+        fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))] if held_out else []
+        self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out or []))]
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
         self.center, self.extent = views.extent()
@@ -162,7 +165,9 @@ class Optimization:
             seen = self._render(views, k)
             images = (image.cpu().numpy() for image in (seen.color, seen.depth, seen.alpha))
             view, frame = RenderedView(*images), views.frame(k)
-            found.append(measure_view(view, self._background, frame, views.vignetting))
+            found.append(
+                measure_view(view, self._background, frame, views.vignetting, self._seen[k])
+            )
         return HeldOutMeasures(tuple(found))
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -173,15 +178,16 @@ class Optimization:
     def _fit_gains(self) -> None:
         """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
         views = self._views
-        gains = [
-            fit_gain(self._render(views, k).color.cpu() * views.vignette[..., None], image)
-            for k, image in ((k, views.images[k] / 255) for k in range(len(views)))
-        ]
+        gains = []
+        for k, image in enumerate(views.images):
+            seen = self._render(views, k)
+            color, alpha = seen.color.cpu(), seen.alpha.cpu()[..., None]
+            gains.append(fit_gain(color * views.vignette[..., None], alpha * image / 255))
         log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
         self.gains = torch.exp(log_gains - log_gains.mean())
 
     def _render(self, views: ReconstructionViews, k: int) -> Rendering:
-        """Renders the Gaussians as view k sees them, on black, with expected depth."""
+        """Renders the Gaussians as view k sees them, on black, with median depth."""
         return render(
             self._config.representation,
             self._gaussians(),
@@ -189,7 +195,7 @@ class Optimization:
             views.K.to(self._config.device),
             views.width,
             views.height,
-            depth_mode="ED",
+            depth_mode="MD",
             renderer=self._renderer,
         )
 

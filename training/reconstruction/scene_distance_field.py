@@ -19,8 +19,6 @@ from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
-# Rendered depth counts where at least this much of the light is stopped.
-_SOLID = 0.5
 # Fields are compared where the true one is at most this far from a surface [m].
 _NEAR = 0.5
 # The median depth of a scene of unknown scale is taken to be this [m].
@@ -54,8 +52,7 @@ def render_depth(
     X_WCs: Sequence[RigidTransform],
     threads: int,
 ) -> DepthSource:
-    """Returns what cameras would measure in the scene: expected depth, 0 where less than half of
-    the light is stopped."""
+    """Returns what cameras would measure in the scene: median depth, 0 where no surface is."""
     tensors = tuple(
         torch.from_numpy(getattr(gaussians, name))
         for name in ("means", "quats", "scales", "opacities", "sh")
@@ -72,10 +69,10 @@ def render_depth(
                 torch.from_numpy(K).float()[None],
                 width,
                 height,
-                depth_mode="ED",
+                depth_mode="MD",
                 renderer=renderer,
             )
-        return torch.where(rendering.alpha > _SOLID, rendering.depth, 0).numpy()
+        return rendering.depth.numpy()
 
     return DepthSource(load, K, X_WCs)
 
@@ -132,13 +129,15 @@ class FieldDifference:
         )
 
 
-def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
-    """Compares two fields on the same grid."""
+def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference | None:
+    """Compares two fields on the same grid; None if nothing near a surface is known in both."""
     d, d_true = field.distances, truth.distances
     known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
     free = known & (d_true > truth.voxel_size)
     occupied = known & (truth.states == FieldState.OCCUPIED)
     near = known & (np.abs(d_true) < _NEAR)
+    if not near.any():
+        return None
     error = (d - d_true)[near]
     return FieldDifference(
         mean=float(error.mean()),

@@ -94,6 +94,7 @@ def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
         depth_relative=mae / 2,
         floater_fraction=share,
         hole_fraction=share / 10,
+        unseen_fraction=0.0,
         gain=1.0,
     )
     return SceneMeasures(True, 8, 8, {0: view}, "none")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 
 RADIUS = 0.354
@@ -69,6 +69,16 @@ def test_no_room_at_all():
     """A place too narrow for the vehicle is an error that names radius and largest clearance."""
     with pytest.raises(ValueError, match=r"radius 0\.354 m: the largest clearance is 0\.\d\d m"):
         choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.7, 0.7))), RADIUS)
+
+
+def test_no_way_worth_a_flight():
+    """A place in which the vehicle cannot fly a metre is an error that names the longest way."""
+    cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.2, 1.2)))
+    for choose in (choose_start_and_goal, lambda *given: draw_start_and_goal(*given, seed=0)):
+        with pytest.raises(
+            ValueError, match=r"longest way .* is 0\.\d\d m, at least 1 m is needed"
+        ):
+            choose(cell, RADIUS)
 
 
 def test_same_field_same_choice():

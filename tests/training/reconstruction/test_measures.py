@@ -165,7 +165,8 @@ def test_a_translucent_surface_is_a_hole():
     alpha = np.zeros((HEIGHT, WIDTH), np.float32)
     alpha[12:, :16] = 0.4
     alpha[12:, 16:] = 1.0
-    seen = RenderedView(alpha[..., None] * np.float32([gray]), np.where(depth < 9, depth, 0), alpha)
+    color = alpha[..., None] * np.float32([gray])
+    seen = RenderedView(color, np.where(alpha > 0.5, depth, 0), alpha)
     frame = CaptureFrame(image, depth, RigidTransform(), K)
     found = measure_view(seen, gray, frame)
     assert found.hole_fraction == pytest.approx(0.5)
@@ -173,8 +174,32 @@ def test_a_translucent_surface_is_a_hole():
     assert found.floater_fraction == 0
     assert found.psnr_db > 50
     assert found.psnr_on_black_db < 20
-    opaque = RenderedView((alpha > 0)[..., None] * np.float32([gray]), depth, alpha > 0)
+    solid = np.float32(alpha > 0)
+    opaque = RenderedView(solid[..., None] * np.float32([gray]), depth, solid)
     assert measure_view(opaque, gray, frame).psnr_on_black_db > 50
+
+
+def test_what_no_camera_saw_is_left_out():
+    """Pixels that are not to be measured have no part in any figure but their share."""
+    color = noise().astype(np.float32)
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    frame = CaptureFrame(np.round(255 * color).astype(np.uint8), depth, RigidTransform(), K)
+    seen = np.ones((HEIGHT, WIDTH), bool)
+    seen[:6] = False
+    wrong = RenderedView(
+        *(
+            np.where(seen.reshape(x.shape[:2] + (1,) * (x.ndim - 2)), x, 0)
+            for x in (color, depth, np.ones_like(depth))
+        )
+    )
+    found = measure_view(wrong, (0.0, 0.0, 0.0), frame, seen=seen)
+    assert found.psnr_db > 50 and found.psnr_on_black_db > 50 and found.ssim > 0.999
+    assert (found.depth_mae_m, found.hole_fraction) == (0, 0)
+    assert found.unseen_fraction == pytest.approx(0.25)
+    assert found.gain == pytest.approx(1, abs=1e-3)
+    everything = measure_view(wrong, (0.0, 0.0, 0.0), frame)
+    assert everything.hole_fraction == pytest.approx(0.25)
+    assert everything.unseen_fraction == 0
 
 
 def test_lpips_is_of_the_exposed_image():
