@@ -36,14 +36,17 @@ SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
   return lane_bits(visible);
 }
 
-// In the camera frame: for d_W, the inverse of L L^T times it, up to the scale of its last entry.
+// In the camera frame: the inverse of L L^T times d_W, up to scale: multiplied by (L00 L11 L22)^2,
+// which takes no division.
 SP_INLINE Vector16 plane_normal(const Camera& camera, const F16 L[6], const Vector16& d_W) {
-  const F16 y0 = d_W.x / L[0];
-  const F16 y1 = (d_W.y - L[1] * y0) / L[2];
-  const F16 y2 = (d_W.z - L[3] * y0 - L[4] * y1) / L[5];
-  const F16 n2 = y2 / L[5];
-  const F16 n1 = (y1 - L[4] * n2) / L[2];
-  const F16 n0 = (y0 - L[1] * n1 - L[3] * n2) / L[0];
+  const F16 L11_L22 = L[2] * L[5];
+  const F16 y0 = d_W.x * L11_L22;
+  const F16 rest = d_W.y * L[0] - L[1] * d_W.x;
+  const F16 y1 = rest * L[5];
+  const F16 y2 = (d_W.z * L[0] - L[3] * d_W.x) * L[2] - L[4] * rest;
+  const F16 n2 = L[0] * L[2] * y2;
+  const F16 n1 = L[0] * (L[5] * y1 - L[4] * y2);
+  const F16 n0 = L11_L22 * y0 - L[1] * (L[5] * y1 - L[4] * y2) - L[2] * L[3] * y2;
   return to_camera(camera, {n0, n1, n2});
 }
 

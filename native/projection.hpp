@@ -145,30 +145,33 @@ SP_INLINE PlanePack depth_plane(const Camera& camera, const Vector16& p_C, const
   // What keeps a Gaussian seen edge-on invertible [px^2].
   const F16 least = F16(1e-8f), one = F16(1.0f);
   PlanePack out;
-  const F16 raw00 = p0.x * p0.x + p0.y * p0.y + p0.z * p0.z;
-  const F16 raw11 = p1.x * p1.x + p1.y * p1.y + p1.z * p1.z;
+  const F16 s00 = p0.x * p0.x + p0.y * p0.y + p0.z * p0.z;
+  const F16 s11 = p1.x * p1.x + p1.y * p1.y + p1.z * p1.z + least;
   const F16 s01 = p0.x * p1.x + p0.y * p1.y + p0.z * p1.z;
-  const F16 s11 = raw11 + least;
   const Vector16 c = cross(p0, p1);
-  const F16 det = (c.x * c.x + c.y * c.y + c.z * c.z) + least * (raw00 + s11);
-  const F16 inverse_s11 = one / s11;
-  out.ux = min(F16(kExponentScale) * sqrt(s11 / det), F16(1e6f));
-  out.uy = -(out.ux * s01 * inverse_s11);
-  out.vy = F16(kExponentScale) * sqrt(inverse_s11);
+  const F16 det = (c.x * c.x + c.y * c.y + c.z * c.z) + least * (s00 + s11);
+  const F16 inverse = one / (s11 * det);
+  const F16 root = F16(kExponentScale) * sqrt(inverse);
+  out.ux = min(root * s11, F16(1e6f));
+  out.uy = -(out.ux * s01 * (inverse * det));
+  out.vy = root * sqrt(det);
 
   const F16 facing = n_C.x * p_C.x + (n_C.y * p_C.y + n_C.z * p_C.z);
   const Mask16 known = (facing > F16(1e-30f)) & (facing < F16(1e30f));
-  const F16 inverse_facing = one / select(known, facing, one);
-  const F16 slope_x = n_C.x * inverse_facing * F16(1.0f / camera.fx);
-  const F16 slope_y = n_C.y * inverse_facing * F16(1.0f / camera.fy);
-  // A Gaussian that reaches to the camera's plane is turned, so that it has depth everywhere.
-  const F16 variance =
-      slope_x * slope_x * raw00 + (slope_y * slope_y * raw11 + F16(2.0f) * slope_x * slope_y * s01);
-  const F16 reach = F16(kMaxExtent) * sqrt(max(variance, F16(1e-30f)));
-  const F16 turn = zero_unless(known, min(F16(kNearestDepth) * inverse_z / reach, one));
-  out.w_x = turn * slope_x;
-  out.w_y = turn * slope_y;
+  const F16 inverse_facing = zero_unless(known, one / facing);
+  out.w_x = n_C.x * inverse_facing * F16(1.0f / camera.fx);
+  out.w_y = n_C.y * inverse_facing * F16(1.0f / camera.fy);
   out.w = inverse_z;
+  // A Gaussian that reaches to the camera's plane is turned, so that it has depth everywhere.
+  const F16 fall =
+      F16(kMaxExtent * kMaxExtent) *
+      (out.w_x * out.w_x * s00 + (out.w_y * out.w_y * s11 + F16(2.0f) * out.w_x * out.w_y * s01));
+  const F16 most = F16(kMostFall) * inverse_z;
+  if (any(fall > most * most)) {
+    const F16 turn = min(most / sqrt(max(fall, F16(1e-30f))), one);
+    out.w_x = turn * out.w_x;
+    out.w_y = turn * out.w_y;
+  }
   return out;
 }
 

@@ -68,19 +68,19 @@ SP_INLINE void transpose_blocks(int32_t* blocks, int count,
   }
 }
 
-template <bool kMedian>
-SP_INLINE void stage(const RasterInput& in, size_t begin, int count, float left, float top,
-                     StagedTile& staged) {
+// With `planes`, of these too.
+SP_INLINE void stage(const RasterInput& in, bool planes, size_t begin, int count, float left,
+                     float top, StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
   for (int i = 0; i < count; ++i) {
     const Pair* pair = in.pairs + begin + i;
     if (i + kPrefetchAhead < count) {
       __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
-      if constexpr (kMedian) __builtin_prefetch(in.planes + pair[kPrefetchAhead].splat);
+      if (planes) __builtin_prefetch(in.planes + pair[kPrefetchAhead].splat);
     }
     const Splat& splat = in.splats[pair->splat];
     staged.splats[i] = in_tile(splat, left, top);
-    if constexpr (kMedian) {
+    if (planes) {
       staged.planes[i] = in_tile(in.planes[pair->splat], splat, left, top);
     }
     blocks[i] = static_cast<int32_t>(pair->blocks);
@@ -140,7 +140,7 @@ template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
                          BlockState& state) {
   BlockState s = state;
-  bool open = true, seeking = kMedian && any(s.sharp_transmittance > F16(0.5f));
+  bool open = true, seeking = kMedian;
   for (int word = 0; word < words && open; ++word) {
     for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
       const int i = 64 * word + __builtin_ctzll(bits);
@@ -256,6 +256,7 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
 
   StagedTile staged;
   uint32_t live = inside;
+  uint32_t seeking = kMedian ? inside : 0;  // blocks with pixels that have no median yet
   const size_t end = in.tile_offsets[tile + 1];
   uint32_t stages = 0;
   for (size_t begin = in.tile_offsets[tile]; begin < end && live; begin += kStageSize) {
@@ -268,12 +269,17 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
     }
     ++stages;
     const int count = end - begin < kStageSize ? static_cast<int>(end - begin) : kStageSize;
-    stage<kMedian>(in, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
+    stage(in, seeking != 0, begin, count, static_cast<float>(left), static_cast<float>(top),
+          staged);
+    const int words = (count + 63) / 64;
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
       const LaneCentres pixel = block_centres(centres, b);
-      const bool open =
-          composite<kColor, kDepth, kMedian>(staged, (count + 63) / 64, b, pixel, state[b]);
+      const bool seeks = kMedian && (seeking >> b & 1);
+      const bool open = seeks
+                            ? composite<kColor, kDepth, kMedian>(staged, words, b, pixel, state[b])
+                            : composite<kColor, kDepth, false>(staged, words, b, pixel, state[b]);
+      if (seeks && !any(state[b].sharp_transmittance > F16(0.5f))) seeking &= ~(1u << b);
       if (!open) live &= ~(1u << b);
     }
   }

@@ -21,7 +21,7 @@ constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
 // How far the inverse depth of a Gaussian may fall towards its rim, of that of its centre.
-constexpr float kNearestDepth = 0.9f;
+constexpr float kMostFall = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.
 constexpr float kMaxExtent = 3.33f;
 // The exponent is kept in base 2 and in Cholesky form: alpha = exp2(log2 o - u^2 - v^2) with

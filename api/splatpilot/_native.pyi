@@ -1,5 +1,6 @@
 """Splat kernels for CPUs."""
 
+import enum
 from typing import Annotated
 
 import numpy
@@ -20,6 +21,20 @@ def scene_is_valid(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32
 def first_zero_quaternion(quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)]) -> int:
     """
     Index of the first quaternion too short or too long to be normalised, or -1.
+    """
+
+class DepthMode(enum.Enum):
+    """What the depth of a pixel is."""
+
+    ACCUMULATED = 0
+    """sum w z"""
+
+    EXPECTED = 1
+    """sum w z / sum w"""
+
+    MEDIAN = 2
+    """
+    z where what footprints without blur let through falls below one half, else 0
     """
 
 class Frame:
@@ -53,7 +68,7 @@ def projected(renderer: Renderer, frame: Frame, opacities: Annotated[NDArray[num
     a frame's splats.
     """
 
-def render(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float, antialiased: bool, expected_depth: bool, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
+def render(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float, antialiased: bool, depth_mode: DepthMode, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
     """
     Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With
     keep, a backward pass can start from the frame.
@@ -65,7 +80,7 @@ class BakedScene:
     def __init__(self, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int) -> None: ...
 
 def render_baked(scene: BakedScene, renderer: Renderer, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, eps2d: float, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')]) -> None:
-    """Writes colour, expected depth and alpha."""
+    """Writes colour, median depth and alpha."""
 
 def photometric_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], ssim_weight: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, simd: str = '') -> float:
     """
@@ -110,7 +125,7 @@ def projected_surfels(renderer: Renderer, frame: SurfelFrame) -> tuple[Annotated
     frame's surfels, in the order of the input.
     """
 
-def render_projected(renderer: Renderer, *, means2d: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C', device='cpu', writable=False)], covariances: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], depths: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], width: int, height: int, radius_clip: float, expected_depth: bool, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
+def render_projected(renderer: Renderer, *, means2d: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C', device='cpu', writable=False)], covariances: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], depths: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], width: int, height: int, radius_clip: float, depth_mode: DepthMode, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
     """As render, of Gaussians that are projected."""
 
 def splat_factors(renderer: Renderer, frame: Frame) -> Annotated[NDArray[numpy.float32], dict(shape=(None, 3))]:

@@ -21,9 +21,7 @@ class RenderedView(NamedTuple):
     """What a pinhole camera sees of a scene, float32."""
 
     color: "NDArray[np.float32]"  # (H, W, 3), over the background
-    depth: (
-        "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0 where there is no surface
-    )
+    depth: "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0: no surface
     alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
 
 

@@ -40,17 +40,14 @@ def color_pixels(color: NDArray) -> NDArray[np.uint8]:
     return np.clip(color * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
-def surface_depth(view: RenderedView) -> NDArray[np.float32]:
-    """Planar depth of the surfaces in `view`, infinite where there is none  # (H, W) [m]."""
-    return np.where(view.depth > 0, view.depth, np.float32(np.inf))
-
-
 def ranged_depth(view: RenderedView, min_depth: float, max_depth: float) -> NDArray[np.float32]:
-    """`surface_depth` as Drake's cameras give it: 0 nearer than `min_depth` and infinite farther
-    than `max_depth`  # (H, W) [m].
+    """Planar depth of the surfaces in `view`  # (H, W) [m].
+
+    As in Drake, nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so
+    does a pixel without a surface.
     """
-    depth = surface_depth(view)
-    return np.where(depth > max_depth, np.inf, np.where(depth < min_depth, np.float32(0), depth))
+    seen = (view.depth > 0) & (view.depth <= max_depth)
+    return np.where(seen, np.where(view.depth < min_depth, np.float32(0), view.depth), np.inf)
 
 
 def surface_labels(view: RenderedView) -> NDArray[np.int16]:

@@ -79,8 +79,8 @@ def rasterize(
 
     Colour, depth and alpha are differentiable with respect to means, quats, scales, opacities,
     colors, viewmats (all twelve numbers, taken as free) and backgrounds; a Gaussian that is skipped
-    or held at a = .99 has no part in the derivative there, and a median depth is constant. Equal input gives equal bits, gradients
-    included, whatever the number of threads.
+    or held at a = .99 has no part in the derivative there, and a median depth is constant. Equal
+    input gives equal bits, gradients included, whatever the number of threads.
 
     With distortion coefficients, or for a fisheye, S and the centre on the image are those of the
     unscented projection (see `camera_models`), and Ks and the coefficients are differentiable too.

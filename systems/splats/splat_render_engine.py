@@ -33,7 +33,6 @@ from splatpilot.systems.splats.drake_images import (
     color_pixels,
     ranged_depth,
     render_view,
-    surface_depth,
     surface_labels,
 )
 
@@ -55,15 +54,15 @@ class SplatRenderEngine(RenderEngine):
     the cameras of `RgbdSensor`. The frame of the Gaussians is SceneGraph's world frame.
 
     The shapes are rendered by a second engine with the same camera. Per pixel, with its colour c
-    and depth d and the Gaussians' colour C, alpha A and median depth D, either depth infinite where
-    there is nothing:
+    and depth d (infinite where there is no shape) and the Gaussians' colour C, alpha A and median
+    depth D:
 
-    - colour is c where d <= D, unless both are infinite, else C + (1 - A) c: a shape behind thin
-      leaves shines through them, and where nothing is seen, it is the background of the shapes'
-      engine;
+    - colour is c where d <= D, else C + (1 - A) c: a shape behind thin leaves shines through them,
+      and where nothing is seen, it is the background of the shapes' engine;
     - depth is the lesser of d and D, planar z in metres, 0 nearer than the camera's depth range and
-      infinity beyond it;
-    - labels are those of the shapes where d <= D, else `RenderLabel.kUnspecified`.
+      infinity beyond it; where the Gaussians have no surface, it is d;
+    - labels are those of the shapes where d <= D or there is no D, else
+      `RenderLabel.kUnspecified`.
 
     A pixel has one D: a shape that stands between two translucent layers of Gaussians is drawn
     before or behind both. Gaussians cast no shadows on shapes nor shapes on them.
@@ -185,8 +184,7 @@ class SplatRenderEngine(RenderEngine):
     def DoRenderColorImage(self, camera: ColorRenderCamera, color_image_out: ImageRgba8U) -> None:
         view = self._view(camera.core())
         behind = np.asarray(self._shapes().RenderColorImage(*self._same(camera)).data)
-        shapes = self._shape_depth(camera.core())
-        shape_in_front = np.isfinite(shapes) & (shapes <= surface_depth(view))  # (H, W)
+        shape_in_front = self._shape_depth(camera.core()) <= view.depth  # (H, W)
         behind = behind[..., :3].astype(np.float32) / 255
         blended = view.color + (1 - view.alpha[..., None]) * behind
         color = np.where(shape_in_front[..., None], behind, blended)
@@ -207,8 +205,8 @@ class SplatRenderEngine(RenderEngine):
         shapes = np.asarray(self._shapes().RenderLabelImage(*self._same(camera)).data)[..., 0]
         splats = surface_labels(view)
         empty = int(RenderLabel.kEmpty)
-        shape_in_front = self._shape_depth(camera.core()) <= surface_depth(view)
-        labels = np.where(shape_in_front & (shapes != empty), shapes, splats)
+        shape_seen = (self._shape_depth(camera.core()) <= view.depth) | (splats == empty)
+        labels = np.where(shape_seen & (shapes != empty), shapes, splats)
         np.asarray(label_image_out.mutable_data)[..., 0] = labels
 
     # The two halves of an image.

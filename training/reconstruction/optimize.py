@@ -63,8 +63,10 @@ class Optimization:
         self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
         self._renderer = create_renderer(config.renderer_threads)
         self._background = background
-        fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))] if held_out else []
-        self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out or []))]
+        self._seen = []
+        if held_out is not None:
+            fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
+            self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
         self.center, self.extent = views.extent()

@@ -22,9 +22,9 @@ def median_depth(
     """The depth (H, W) [m] at which what sharp footprints let through falls to one half, else 0.
 
     On a Gaussian with the covariance S about c, in the camera frame, the depth is where the ray d
-    (of unit depth) meets the plane n . p = n . c with n = S^-1 c, turned until no part within `REACH`
-    standard deviations is nearer or farther by more than 0.9 of the inverse depth. Also returns how
-    near (H, W) an alpha or what is left came to a threshold.
+    (of unit depth) meets the plane n . p = n . c with n = S^-1 c, turned until no part within
+    `REACH` standard deviations is nearer or farther by more than 0.9 of the inverse depth. Also
+    returns how near (H, W) an alpha or what is left came to a threshold.
     """
     arguments = (a.double() for a in (means, quats, scales, opacities, viewmat, K))
     means, quats, scales, opacities, viewmat, K = arguments
