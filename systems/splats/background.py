@@ -40,7 +40,7 @@ class EnvironmentMap:
         image = cv2.imread(str(file), cv2.IMREAD_COLOR)
         if image is None:
             raise ValueError(f"{file}: cannot be read as an image; reconstruct the scene again")
-        return cls(image[..., ::-1].astype(np.float32) / 255)
+        return cls((image[..., ::-1] / 255).astype(np.float32))
 
     def save(self, file: Path) -> None:
         """Writes the texels as an image of 8 bits.

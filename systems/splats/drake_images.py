@@ -29,10 +29,11 @@ def render_view(
     intrinsics are taken as they are.
     """
     width, height = camera_info.width(), camera_info.height()
-    K, plain = camera_info.intrinsic_matrix(), not isinstance(background, EnvironmentMap)
-    behind = background if plain else BLACK
-    view = scene.render(K, width, height, X_WC, near=near, far=far, background=behind)
-    return view if plain else put_behind(view, background, K, X_WC)
+    K = camera_info.intrinsic_matrix()
+    if not isinstance(background, EnvironmentMap):
+        return scene.render(K, width, height, X_WC, near=near, far=far, background=background)
+    view = scene.render(K, width, height, X_WC, near=near, far=far)
+    return put_behind(view, background, K, X_WC)
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:
