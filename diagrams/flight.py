@@ -80,12 +80,18 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
 
     Raises:
         InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
-            surface than the vehicle's radius.
+            surface than the vehicle's radius; or if the flight would start at its goal.
     """
     p_WG = goal_of(scenario, world)
     p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
     _check_free(world, "start", p_WS)
     _check_free(world, "goal", p_WG)
+    apart = float(np.linalg.norm(p_WG - p_WS))
+    if apart <= scenario.goal_radius:
+        raise InfeasibleFlightError(
+            f"{world.name} cannot be flown: start and goal are {apart:.2f} m apart, no farther "
+            f"than goal_radius, {scenario.goal_radius} m; name others with start and goal"
+        )
 
     generator = np.random.default_rng(scenario.seed)
     p_WB = None

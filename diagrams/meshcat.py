@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer
@@ -40,7 +41,7 @@ def AddMeshcat(
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings that are drawn too.
     for end in ("top_color", "bottom_color"):
-        meshcat.SetProperty("/Background", end, list(world.background))
+        meshcat.SetProperty("/Background", end, list(mean_color(world.background)))
     draw_gaussians(
         meshcat,
         "/splatpilot/scene",

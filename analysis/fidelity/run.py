@@ -22,8 +22,6 @@ from splatpilot.analysis.fidelity.off_path import choose_withheld, displace_pose
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
 from splatpilot.analysis.fidelity.trust import first_crossing
 from splatpilot.analysis.fidelity.view_support import ViewSupport
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import read_measures
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import (
     SceneMetadata,
@@ -34,6 +32,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render_capture import true_camera
+from splatpilot.training.reconstruction.measures import mean_measure
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 TrueCamera = Callable[[RigidTransform], CaptureFrame]
@@ -96,6 +95,10 @@ def study_scene(
             f"{scene}: its capture {capture.source} has no metric depth, without which no depth "
             "error can be measured"
         )
+    # As beside the path, nothing is left out.
+    on_path = (views.measure(views.frame(i)) for i in views.measured)
+    on_path_psnr_db = mean_measure(on_path, "psnr_db")
+    assert on_path_psnr_db is not None
     camera = find_camera(Path(views.metadata.capture))
     if camera is not None:
         frames = _rendered_frames(views, scene, camera, config)
@@ -119,11 +122,10 @@ def study_scene(
             "needed; try smaller offsets, a smaller clearance or shorter stretches"
         )
     write_views(out.with_name(f"{out.name}_views.png"), views, samples, shown)
-    measures = read_measures(scene) or measure_scene(scene, capture)
     return FidelityStudy(
         name=out.name,
         kind="withheld" if camera is None else "rendered",
-        on_path_psnr_db=measures.mean("psnr_db") or float("nan"),
+        on_path_psnr_db=on_path_psnr_db,
         samples=samples,
         max_depth_error=config.max_depth_error,
         max_psnr_drop=config.max_psnr_drop,

@@ -88,5 +88,4 @@ class ViewSupport:
         return inside & same & near & (cosine >= _MAX_ANGLE)
 
     def _render(self, X_WC: RigidTransform) -> NDArray[np.float32]:
-        view = self._renderer.render(self._K, self._width, self._height, X_WC, (0, 0, 0))
-        return np.where(view.alpha > 0.5, view.depth, 0)
+        return self._renderer.render(self._K, self._width, self._height, X_WC).depth

@@ -178,7 +178,7 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
         view, found = views.render(frame), arms[arm.key].frames[i]
         image, _ = fit_exposure(view.color, truth, views.metadata.vignetting)
         error = np.abs(view.depth - np.where(known, frame.depth, 0))
-        mask = floaters(view.depth, view.alpha, frame.depth)
+        mask = floaters(view.depth, frame.depth)
         fraction, mae = found.floater_fraction or 0.0, found.depth_mae_m or 0.0
         rows[0].append(Panel(image, f"{found.psnr_db:.1f} dB"))
         rows[1].append(Panel(mark_floaters(image, mask), f"{fraction:.1%}"))

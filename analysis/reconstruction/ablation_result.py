@@ -11,7 +11,15 @@ from splatpilot.analysis.reconstruction.scene_measures import (
     format_measure,
 )
 
-COLUMNS = ("psnr_db", "ssim", "lpips", "depth_mae_m", "floater_fraction")
+COLUMNS = (
+    "psnr_db",
+    "ssim",
+    "lpips",
+    "depth_mae_m",
+    "floater_fraction",
+    "hole_fraction",
+    "psnr_on_black_db",
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +30,7 @@ class Arm:
     title: str
     representation: str
     depth: bool
-    paper: tuple[float, float, float, float, float]  # in the order of COLUMNS
+    paper: tuple[float, float, float, float, float]  # in the order of the first of COLUMNS
 
 
 ARMS = (
@@ -72,7 +80,8 @@ class AblationResult:
                 cells = [_spread(self.values(arm, name), NAMES[name][1]) for name in COLUMNS]
                 rows.append(["mean ± spread", arm.title, *cells])
         for arm in ARMS:
-            cells = [NAMES[n][1].format(v) for n, v in zip(COLUMNS, arm.paper, strict=True)]
+            known = dict(zip(COLUMNS, arm.paper, strict=False))
+            cells = [format_measure(known.get(name), NAMES[name][1]) for name in COLUMNS]
             rows.append(["paper", arm.title, *cells])
         return rows
 

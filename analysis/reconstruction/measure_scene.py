@@ -25,7 +25,6 @@ from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.measures import fit_exposure, has_true_depth
 
 SHEET = "views.png"
-_EVERY = 8
 _SHEET_ROWS = 4
 _ERROR_LIMIT = 0.05  # brightest colour of depth errors, as a fraction of the median depth
 
@@ -50,12 +49,11 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
     """
     views = SceneViews(scene, capture)
     lpips, missing = load_lpips()
-    numbers = views.metadata.held_out or range(0, len(views.capture), _EVERY)
     frames, size = {}, (0, 0)
-    for i in tqdm(numbers, "measuring", unit="frame"):
+    for i in tqdm(views.measured, "measuring", unit="frame"):
         frame = views.frame(i)
         size = frame.depth.shape
-        frames[i] = views.measure(frame, lpips)
+        frames[i] = views.measure(frame, views.seen(frame), lpips)
     height, width = size
     measures = SceneMeasures(bool(views.metadata.held_out), width, height, frames, missing)
     with written_atomically(scene / METRICS) as partial:

@@ -9,11 +9,14 @@ from splatpilot.training.reconstruction.measures import ViewMeasures, mean_measu
 METRICS = "metrics.json"
 NAMES = {
     "psnr_db": ("PSNR [dB]", "{:.2f}"),
+    "psnr_on_black_db": ("PSNR on black [dB]", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
     "lpips": ("LPIPS-squeeze", "{:.3f}"),
     "depth_mae_m": ("depth MAE [m]", "{:.3f}"),
     "depth_relative": ("depth error, relative", "{:.2%}"),
     "floater_fraction": ("floaters", "{:.2%}"),
+    "hole_fraction": ("holes", "{:.2%}"),
+    "unseen_fraction": ("left out as unseen", "{:.2%}"),
 }
 """How measures are called and written in tables."""
 
@@ -34,10 +37,17 @@ class SceneMeasures:
         """Returns the mean of a measure over the frames that have it; None if none has."""
         return mean_measure(self.frames.values(), name)
 
+    @property
+    def worst_hole_fraction(self) -> float | None:
+        """The share of holes in the frame that has most; None if none has true depth."""
+        found = (frame.hole_fraction for frame in self.frames.values())
+        return max((share for share in found if share is not None), default=None)
+
     def as_json(self) -> dict:
         """Returns the content of `metrics.json`: means, and the measures of each frame."""
         return {
             **{name: self.mean(name) for name in NAMES},
+            "worst_hole_fraction": self.worst_hole_fraction,
             "held_out": self.held_out,
             "width": self.width,
             "height": self.height,
@@ -50,6 +60,8 @@ class SceneMeasures:
         lines = [f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}"]
         for name, (title, form) in NAMES.items():
             lines.append(f"{title:<22} {format_measure(self.mean(name), form)}")
+        worst = format_measure(self.worst_hole_fraction, NAMES["hole_fraction"][1])
+        lines.append(f"{'holes, worst frame':<22} {worst}")
         if self.lpips_missing:
             lines.append(f"no LPIPS: {self.lpips_missing}")
         return "\n".join(lines)

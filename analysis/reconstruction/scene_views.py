@@ -1,11 +1,17 @@
 """A scene folder beside the capture that it was made from."""
 
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.diagrams.worlds.scene_folder import read_background
 from splatpilot.diagrams.worlds.scene_metadata import SceneMetadata, read_scene_metadata
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.splats.background import put_behind
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame
@@ -13,6 +19,7 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.measures import SceneRenderer, ViewMeasures, measure_view
+from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.views import shrink, shrink_factor
 
 
@@ -47,6 +54,7 @@ class SceneViews:
 
     def __init__(self, scene: Path, capture: Capture | None = None):
         self.metadata: SceneMetadata = read_scene_metadata(scene)
+        self.background = read_background(scene, self.metadata)
         if capture is None:
             capture = read_capture_of(scene, self.metadata)
         self.capture = capture
@@ -60,6 +68,11 @@ class SceneViews:
         self.renderer = SceneRenderer(
             read_ply(scene / "gaussians.ply"), self.metadata.representation
         )
+
+    @property
+    def measured(self) -> Sequence[int]:
+        """The frames on which the scene is measured: those held out, or every eighth."""
+        return self.metadata.held_out or range(0, len(self.capture), 8)
 
     def frame(self, i: int) -> CaptureFrame:
         """Returns frame i of the capture in the size at which the scene was made."""
@@ -77,12 +90,29 @@ class SceneViews:
 
     def render(self, frame: CaptureFrame) -> RenderedView:
         """Returns what the scene shows the camera of `frame`."""
-        height, width = frame.depth.shape
-        background = self.metadata.background
-        return self.renderer.render(frame.K, width, height, frame.X_WC, background)
+        return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
 
-    def measure(self, frame: CaptureFrame, lpips: Lpips | None = None) -> ViewMeasures:
-        """Compares both."""
-        return measure_view(
-            self.render(frame), frame.image, frame.depth, self.metadata.vignetting, lpips
-        )
+    @cached_property
+    def _fitted(self) -> list[ThinnedFrame]:
+        """The frames that the scene was made from."""
+        held_out = set(self.metadata.held_out)
+        numbers = [i for i in range(len(self.capture)) if i not in held_out]
+        return [ThinnedFrame.of(self.frame(i)) for i in numbers]
+
+    def seen(self, frame: CaptureFrame) -> NDArray[np.bool_]:
+        """Returns the pixels (H, W) of `frame` that show what the scene was made from."""
+        return seen_pixels(frame, self._fitted)
+
+    def measure(
+        self,
+        frame: CaptureFrame,
+        seen: NDArray[np.bool_] | None = None,
+        lpips: Lpips | None = None,
+    ) -> ViewMeasures:
+        """Compares both, in the pixels `seen` or in all."""
+        on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
+        return measure_view(on_black, self.background, frame, vignetting, seen, lpips)
+
+    def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
+        height, width = frame.depth.shape
+        return self.renderer.render(frame.K, width, height, frame.X_WC)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene
-from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import SHORTEST, draw_start_and_goal
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -26,7 +26,7 @@ class SceneSource:
     # Whether start and goal are drawn from the seed; otherwise they are the scene's own.
     draw_ends: bool = False
     # [m] Least length of the shortest way between ends that are drawn.
-    least_way: float = 0.0
+    least_way: float = SHORTEST
 
     def validate(self) -> None:
         """

@@ -1,7 +1,8 @@
 """Scene folders: a reconstructed place on disk.
 
 `gaussians.ply` is what cameras see, `esdf.npz` what collides, and `scene.yaml` (`SceneMetadata`)
-where it comes from and how it is to be used. `frontier.ply`, if there is one, closes the place
+where it comes from and how it is to be used. `environment.png`, if there is one, has the colours
+of what lies infinitely far (`EnvironmentMap`). `frontier.ply`, if there is one, closes the place
 where nobody looked any further: cameras of flights see it too, measures of the scene do not.
 """
 
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpilot.diagrams.worlds.scene_metadata import (
+    ENVIRONMENT,
     FRONTIER,
     SceneMetadata,
     read_scene_metadata,
@@ -24,6 +26,7 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
 from splatpilot.systems.files import require_writable_folder
+from splatpilot.systems.splats.background import Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -73,16 +76,27 @@ def read_scene_folder(path: str | Path) -> World:
                 f"{path}: scene.yaml has {name} {said}, but esdf.npz has {found.tolist()}; "
                 "the files are of different scenes"
             )
-    red, green, blue = metadata.background
     return World(
         name=metadata.name,
         gaussians=gaussians,
         distance_field=esdf,
         esdf=esdf,
-        background=(red, green, blue),
+        background=read_background(path, metadata),
         p_WS=np.array(metadata.p_WS),
         p_WG=np.array(metadata.p_WG),
     )
+
+
+def read_background(path: Path, metadata: SceneMetadata) -> Background:
+    """Returns the background of the scene folder `path`, whose `scene.yaml` says `metadata`.
+
+    Raises:
+        FileNotFoundError, ValueError: if `environment.png` is missing or damaged.
+    """
+    if metadata.environment:
+        return EnvironmentMap.load(path / ENVIRONMENT)
+    red, green, blue = metadata.background
+    return red, green, blue
 
 
 def check_scene_target(path: str | Path) -> None:
@@ -140,7 +154,8 @@ def write_scene_folder(
         observed_free_volume=esdf.volume(FieldState.FREE),
         gains=[float(gain) for gain in gains],
         vignetting=float(vignetting),
-        background=[float(x) for x in world.background],
+        background=[float(x) for x in mean_color(world.background)],
+        environment=isinstance(world.background, EnvironmentMap),
         p_WS=[float(x) for x in world.p_WS],
         p_WG=[float(x) for x in world.p_WG],
         frontier=frontier is not None,
@@ -158,6 +173,8 @@ def write_scene_folder(
         if frontier is not None:
             write_ply(frontier, new / FRONTIER)
         esdf.save(new / "esdf.npz")
+        if isinstance(world.background, EnvironmentMap):
+            world.background.save(new / ENVIRONMENT)
         write_scene_metadata(new, metadata)
         if path.exists():
             path.rename(old)

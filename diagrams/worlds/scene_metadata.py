@@ -9,7 +9,8 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
 from splatpilot.systems.files import written_atomically
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
 WORLD_FRAME = "z up"
 REPRESENTATIONS = ("3dgs", "2dgs")
@@ -40,6 +41,8 @@ class SceneMetadata:
     falls with the square of the distance from the centre. The scene is free of it."""
     background: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Colour where no Gaussian is seen; red, green, blue in 0 to 1."""
+    environment: bool = False
+    """Whether `environment.png` has that colour for each direction; `background` is their mean."""
     frontier: bool = False
     """Whether `frontier.ply` stands where the distance field has obstacles that nobody saw."""
     p_WS: list[float] = field(default_factory=list)
@@ -76,7 +79,12 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
         metadata = yaml_load_typed(schema=SceneMetadata, filename=str(file))
     except (RuntimeError, ValueError, TypeError, yaml.YAMLError) as error:
         raise ValueError(f"{file}: {error}; reconstruct the scene again or repair it") from error
-    if metadata.format_version != FORMAT_VERSION:
+    if metadata.format_version < FORMAT_VERSION:
+        raise ValueError(
+            f"{file}: format version {metadata.format_version}, from when scenes had no background "
+            "of their own and translucent surfaces; reconstruct the scene again"
+        )
+    if metadata.format_version > FORMAT_VERSION:
         raise ValueError(
             f"{file}: format version {metadata.format_version}, this program knows "
             f"{FORMAT_VERSION}; use the version of the program that wrote the scene"

@@ -9,7 +9,11 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from splatpilot.systems.collision.esdf import Esdf
 
+SHORTEST = 1.0
+"""[m], length of the shortest way that is worth a flight."""
+
 _MAX_NODES = 250_000
+_DRAWS = 20
 
 
 def choose_start_and_goal(
@@ -18,22 +22,24 @@ def choose_start_and_goal(
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
-    [m] to spare can fly through space known to be free: in the largest connected part of a grid,
-    the node farthest from any node, and the node farthest from that (the double sweep, exact on
-    trees). If no space has that much margin, half of it is tried, and then none. Paths longer than
-    `longest` [m] are not considered: a flight should end in good time.
+    [m] to spare can fly through space known to be free, at least `SHORTEST`: in the largest
+    connected part of a grid, the node farthest from any node, and the node farthest from that (the
+    double sweep, exact on trees). If no space has that much margin, half of it is tried, and then
+    none. Paths longer than `longest` [m] are not considered: a flight should end in good time.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius`.
+        ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
     """
+    reach = 0.0
     for graph, p_WN in _free_graphs(esdf, radius, margin):
         _, label = connected_components(graph, directed=False)
         inner = int(np.argmax(label == np.bincount(label).argmax()))
         start, _ = _farthest(graph, inner)
         goal, length = _farthest(graph, start, longest)
-        if length > 0:
+        if length >= SHORTEST:
             return p_WN[start], p_WN[goal], length
-    raise _no_room(esdf, radius)
+        reach = max(reach, length)
+    raise _no_room(esdf, radius, reach, SHORTEST)
 
 
 def draw_start_and_goal(
@@ -42,38 +48,35 @@ def draw_start_and_goal(
     seed: int,
     margin: float = 0.2,
     longest: float = 40.0,
-    least: float = 0.0,
+    least: float = SHORTEST,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     As `choose_start_and_goal`, but anywhere: the start is drawn from the largest connected part of
     free space, the goal from those nodes whose shortest path from it is at least 60 % of the
     longest there is, up to `longest` [m], and at least `least` [m]. The same seed gives the same
-    bits.
+    bits; where no start in so many draws has such a goal, it is an end of the longest path.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius`, or no way is as long as `least`.
+        ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
     """
     rng = np.random.default_rng(seed)
     reach = 0.0
     for graph, p_WN in _free_graphs(esdf, radius, margin):
         _, label = connected_components(graph, directed=False)
         part = np.flatnonzero(label == np.bincount(label).argmax())
-        _, reach = _farthest(graph, _farthest(graph, int(part[0]))[0])
-        for _ in range(20):
-            start = int(rng.choice(part))
+        end, _ = _farthest(graph, int(part[0]))
+        _, length = _farthest(graph, end)
+        reach = max(reach, length)
+        for attempt in range(_DRAWS + 1):
+            start = int(rng.choice(part)) if attempt < _DRAWS else end
             lengths = dijkstra(graph, directed=False, indices=start, limit=longest)
-            wanted = max(0.6 * min(reach, longest), least)
+            wanted = max(0.6 * min(length, longest), least)
             far = np.flatnonzero(np.isfinite(lengths) & (lengths >= wanted))
-            if len(far) and reach > 0:
+            if len(far):
                 goal = int(rng.choice(far))
                 return p_WN[start], p_WN[goal], float(lengths[goal])
-    if reach > 0:
-        raise ValueError(
-            f"no start was drawn from which a way of {least:g} m can be flown; the longest is "
-            f"{reach:.1f} m: ask for less with world.least_way, or capture more of the place"
-        )
-    raise _no_room(esdf, radius)
+    raise _no_room(esdf, radius, reach, least)
 
 
 def _free_graphs(
@@ -96,7 +99,13 @@ def _free_graphs(
             yield graph, p_WN.reshape(-1, 3)[nodes]
 
 
-def _no_room(esdf: Esdf, radius: float) -> ValueError:
+def _no_room(esdf: Esdf, radius: float, reach: float, least: float) -> ValueError:
+    if reach > 0:
+        return ValueError(
+            f"the longest way of a vehicle of radius {radius} m through free space is {reach:.2f} "
+            f"m, at least {least:g} m is needed, and unknown space counts as occupied; "
+            "capture more of the place"
+        )
     largest = float(esdf.conservative().distances.max())
     return ValueError(
         f"no free space for a vehicle of radius {radius} m: the largest clearance is "

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -21,8 +22,7 @@ class World:
     # What decides collisions: analytic in procedural worlds, the same object as `esdf` in others.
     distance_field: DistanceField
     esdf: Esdf  # the grid that planners and training read
-    # Colour where no Gaussian is seen; red, green, blue in 0 to 1.
-    background: tuple[float, float, float]
+    background: Background  # what is seen where no Gaussian is
     p_WS: NDArray[np.float64]  # (3,) [m], default start
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
 

@@ -6,6 +6,12 @@ from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.systems.splats.background import (
+    BLACK,
+    Background,
+    EnvironmentMap,
+    put_behind,
+)
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 
 
@@ -15,7 +21,7 @@ def render_view(
     X_WC: RigidTransform,
     near: float,
     far: float,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Background = BLACK,
 ) -> RenderedView:
     """What the pinhole camera of `camera_info` at X_WC sees; see `BakedScene.render`.
 
@@ -23,15 +29,11 @@ def render_view(
     intrinsics are taken as they are.
     """
     width, height = camera_info.width(), camera_info.height()
-    return scene.render(
-        camera_info.intrinsic_matrix(),
-        width,
-        height,
-        X_WC,
-        near=near,
-        far=far,
-        background=background,
-    )
+    K = camera_info.intrinsic_matrix()
+    if not isinstance(background, EnvironmentMap):
+        return scene.render(K, width, height, X_WC, near=near, far=far, background=background)
+    view = scene.render(K, width, height, X_WC, near=near, far=far)
+    return put_behind(view, background, K, X_WC)
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:

@@ -15,6 +15,7 @@ from pydrake.systems.sensors import (
 )
 
 from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.splats.background import BLACK, Background
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.drake_images import (
     color_pixels,
@@ -77,7 +78,7 @@ class SplatCamera(LeafSystem):
         max_depth: float = 20.0,
         near: float = 0.01,
         far: float = 1e10,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        background: Background = BLACK,
     ):
         """
         Args:
@@ -87,7 +88,8 @@ class SplatCamera(LeafSystem):
             X_BC: pose of the camera in the body that carries it; identity when None.
             min_depth, max_depth: range of the depth image [m].
             near, far: Gaussians whose centre is not between these planes are not drawn [m].
-            background: colour behind everything, red, green, blue in [0, 1].
+            background: colour behind everything, red, green, blue in [0, 1], or one for each
+                direction.
 
         Raises:
             ValueError: if the depth range is empty or a focal length is not positive.

@@ -136,6 +136,15 @@ def test_start_and_goal_need_room(post_world, field, point, message):
         sample_initial_state(Scenario(**{field: point}), post_world)
 
 
+def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
+    """Where start and goal are no farther apart than the goal's radius, nothing is flown."""
+    start = [float(x) for x in post_world.p_WS]
+    near = [start[0] + 0.25, *start[1:]]
+    with pytest.raises(ValueError, match=r"cannot be flown: start and goal are 0\.25 m apart"):
+        sample_initial_state(Scenario(goal=near), post_world)
+    sample_initial_state(Scenario(goal=near, goal_radius=0.2), post_world)
+
+
 def test_same_seed_gives_the_same_bits_in_two_processes():
     """Two processes that fly the default scenario for three seconds leave identical samples."""
     script = (

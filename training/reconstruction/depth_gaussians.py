@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.reconstruction.losses import FAR
 
 # A cell is flat if its inverse depth differs from a plane by less than this fraction (rms).
 _FLATNESS = 2e-3
@@ -72,7 +73,7 @@ class BlockMeans:
     ):
         pad = [(0, -n % max_size) for n in frame.depth.shape]
         depth = np.pad(frame.depth, pad).astype(np.float64)
-        valid = np.isfinite(depth) & (depth > 0)
+        valid = (depth > 0) & (depth < FAR)
         w = np.where(valid, 1 / np.where(valid, depth, 1), 0)
         v, u = np.indices(w.shape) + 0.5
         color = np.pad(image, [*pad, (0, 0)]).transpose(2, 0, 1).astype(np.float64)

@@ -16,14 +16,12 @@ from splatpilot.training.reconstruction.overlap import STRIDE, ThinnedFrame, fin
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-# Where what is beyond range is put [m]: at this distance of the camera that saw it.
-SHELL = 150.0
 # One in so many frames is tried first.
 _SOME = 4
 # Opacity and size, in distances to the third neighbour, of Gaussians about points.
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5
 # Opacity with which Gaussians on surfaces start into the optimisation.
-_FIRST_OPACITY = 0.7
+_FIRST_OPACITY = 0.9
 # Depth of random Gaussians, in extents of the cameras.
 _RANDOM_DEPTH = (0.1, 10.0)
 
@@ -75,7 +73,7 @@ def make_initial_gaussians(
             + " or ".join(repr(name) for name, there in has.items() if there)
         )
     if kind == "depth":
-        return gaussians_from_depth(frames, photometry, detail_of(config))[0]
+        return gaussians_from_depth(frames, photometry, detail_of(config))
     if capture.points is not None and kind == "points":
         points = capture.points
         return gaussians_from_points(points.p_WQ, points.colors)
@@ -98,20 +96,10 @@ def detail_of(config: ReconstructConfig) -> Detail:
     )
 
 
-def put_on_shell(frame: CaptureFrame) -> CaptureFrame:
-    """Returns the frame with all depth of more than `SHELL`, infinite depth too, on a sphere of
-    that radius about the camera, on which other cameras nearby see the same far things."""
-    height, width = frame.depth.shape
-    rows, columns = np.mgrid[0:height, 0:width] + 0.5
-    ray = frame.back_project(columns, rows, np.ones_like(rows))
-    planar = (SHELL / np.linalg.norm(ray, axis=-1)).astype(np.float32)
-    return replace(frame, depth=np.where(frame.depth > SHELL, planar, frame.depth))
-
-
 def gaussians_from_depth(
     frames: Sequence[CaptureFrame], photometry: Photometry, detail: Detail
-) -> tuple[GaussianScene, tuple[float, float, float]]:
-    """Returns Gaussians on all surfaces that the frames show, each once, and their mean colour.
+) -> GaussianScene:
+    """Returns Gaussians on all surfaces that the frames show, each once.
 
     Args:
         frames: loaded one by one, and more than once.
@@ -124,7 +112,7 @@ def gaussians_from_depth(
     gains = photometry.gains
     # A gain is a rough account of another tone curve, so other images are preferred to odd ones.
     odd = np.flatnonzero(np.abs(np.log(gains / np.median(gains))) > 0.05)
-    views = [ThinnedFrame.of(put_on_shell(frame)) for frame in frames]
+    views = [ThinnedFrame.of(frame) for frame in frames]
     new = find_new_pixels(views, last=odd.tolist())
 
     def gaussians_of(k: int, frame: CaptureFrame) -> tuple[NDArray, NDArray, NDArray]:
@@ -143,12 +131,12 @@ def gaussians_from_depth(
     progress = tqdm(desc="Gaussians", unit="frame")
     while True:
         # Some of the frames tell when it is far too many.
-        parts = {k: gaussians_of(k, put_on_shell(frames[k])) for k in some}
+        parts = {k: gaussians_of(k, frames[k]) for k in some}
         progress.update(len(parts))
         estimate = sum(len(p_WQ) for p_WQ, _, _ in parts.values()) * len(frames) / len(some)
         if estimate <= 1.1 * detail.max_gaussians:
             for k in set(range(len(frames))).difference(some):
-                parts[k] = gaussians_of(k, put_on_shell(frames[k]))
+                parts[k] = gaussians_of(k, frames[k])
                 progress.update()
             if sum(len(p_WQ) for p_WQ, _, _ in parts.values()) <= detail.max_gaussians:
                 break
@@ -157,7 +145,7 @@ def gaussians_from_depth(
         elif detail.optimized:
             # Edges of depth alone make too many: optimisation fills in what is left out here.
             for k in set(range(len(frames))).difference(some):
-                parts[k] = gaussians_of(k, put_on_shell(frames[k]))
+                parts[k] = gaussians_of(k, frames[k])
                 progress.update()
             break
         elif max_cell < 64:
@@ -175,9 +163,7 @@ def gaussians_from_depth(
         p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
     quats, scales = principal_axes(covariances)
     opacities = np.full(len(p_WQ), detail.opacity)
-    red, green, blue = np.clip(colors.mean(axis=0), 0, 1)
-    scene = GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
-    return scene, (float(red), float(green), float(blue))
+    return GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
 
 
 def _mostly_large(covariances: NDArray, count: int) -> NDArray[np.intp]:

@@ -19,6 +19,9 @@ WINDOW = 11  # [px] of SSIM
 SIGMA = 1.5  # [px]
 C1, C2 = 0.01**2, 0.03**2
 
+FAR = 150.0
+"""[m], true depth from which on a pixel shows the infinitely far, as the sky."""
+
 
 def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """
@@ -58,7 +61,7 @@ def log_depth_loss(
     weights: Tensor | None = None,
     *,
     epsilon: float = 1e-3,
-    far: float = 150.0,
+    far: float = FAR,
 ) -> Tensor:
     """
     1 / |V| sum over V of weight |log max(rendered, epsilon) - log max(depth, epsilon)|, where
@@ -100,7 +103,7 @@ def depth_edge_weights(
     radius: int = 2,
     gain: float = 4.0,
     epsilon: float = 1e-3,
-    far: float = 150.0,
+    far: float = FAR,
 ) -> Tensor:
     """
     Weights for `log_depth_loss` that keep thin structures: 1 + gain within `radius` pixels of a

@@ -5,34 +5,45 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.systems.splats.background import Background, put_behind
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.reconstruction.losses import photometric_loss
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.reconstruction.losses import FAR, photometric_loss
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.vignette import vignette
 
-NEAR, FAR = 1e-3, 150.0
-"""[m], true depths that count: the range of `log_depth_loss`."""
+NEAR = 1e-3
+"""[m], with `FAR` the range of true depths that count, as in `log_depth_loss`."""
 
 FLOATER_MARGIN = 0.1
 """[m], and as a fraction of the true depth: how far in front of the true surface floaters are."""
-FLOATER_ALPHA = 0.5
+
+_SHOWN = {
+    "psnr_db": "{:.2f} dB",
+    "depth_mae_m": "{:.4f} m",
+    "hole_fraction": "{:.2%} holes",
+}
 
 
 @dataclass(frozen=True)
 class ViewMeasures:
-    """One view against the truth. Depth is not measured where the truth has none."""
+    """One view against the truth. Depth is not measured where the truth has none, and nothing in
+    pixels that are left out because no camera saw what they show."""
 
-    psnr_db: float  # [dB]
+    psnr_db: float  # [dB], before the scene's own background
+    psnr_on_black_db: float  # [dB], before black, except where the truth is infinitely far
     ssim: float
     lpips: float | None  # LPIPS-squeeze; None without its weights
     depth_mae_m: float | None  # [m]
     depth_relative: float | None  # mean of |error| / true depth
     floater_fraction: float | None  # of the pixels with true depth
+    hole_fraction: float | None  # of the pixels with true depth
+    unseen_fraction: float  # of all pixels, those left out
     gain: float  # brightness of the true image relative to the scene
 
 
@@ -43,13 +54,13 @@ class HeldOutMeasures:
     views: tuple[ViewMeasures, ...]
 
     def means(self) -> dict[str, float]:
-        """Returns the mean PSNR and, where there is depth, the mean depth error, by name."""
-        found = {name: mean_measure(self.views, name) for name in ("psnr_db", "depth_mae_m")}
+        """Returns the mean PSNR and, where there is depth, the mean depth error and share of
+        holes, by name."""
+        found = {name: mean_measure(self.views, name) for name in _SHOWN}
         return {name: value for name, value in found.items() if value is not None}
 
     def __str__(self) -> str:
-        units = {"psnr_db": "{:.2f} dB", "depth_mae_m": "{:.4f} m"}
-        return ", ".join(units[name].format(value) for name, value in self.means().items())
+        return ", ".join(_SHOWN[name].format(value) for name, value in self.means().items())
 
 
 def mean_measure(views: Iterable[ViewMeasures], name: str) -> float | None:
@@ -82,8 +93,8 @@ def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
 def depth_mae_m(depth: NDArray, truth: NDArray) -> float | None:
     """Returns the mean absolute error [m] over the pixels that have true depth; None if none has.
 
-    `depth` is the expected depth and 0 where nothing was drawn: a hole is wrong by all of its
-    depth.
+    `depth` is what depth cameras in the scene have, before they cut it to their range, and 0 in a
+    hole, which so is wrong by all of its depth.
     """
     valid = has_true_depth(truth)
     return float(np.abs(depth - truth)[valid].mean(dtype=np.float64)) if valid.any() else None
@@ -97,50 +108,60 @@ def depth_relative(depth: NDArray, truth: NDArray) -> float | None:
     return float((np.abs(depth - truth)[valid] / truth[valid]).mean(dtype=np.float64))
 
 
-def floaters(depth: NDArray, alpha: NDArray, truth: NDArray) -> NDArray[np.bool_]:
+def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
     """Returns which pixels (H, W) show a floater.
 
-    A pixel with true depth D does if the rendered surface stands in front of the true one, at a
-    depth less than D - max(0.1 m, D / 10), and covers it by more than half (alpha > 1/2).
-
-    The rendered surface is the expected depth sum w z / sum w, which is what depth cameras here
-    show, so what a policy would take for an obstacle. A veil of little weight far in front counts
-    as soon as it draws that depth forward by the margin, though the median depth would be behind it
-    still. The margin leaves room for pixels that see both sides of an edge at a slight offset; a
-    relative part is needed because such offsets grow with depth, an absolute one because nothing
-    nearer than 0.1 m to a surface is flown through.
+    A pixel with true depth D does if depth cameras see a surface in front of the true one, at a
+    depth less than D - max(0.1 m, D / 10): what a policy takes for an obstacle. The margin leaves
+    room for pixels that see both sides of an edge at a slight offset; a relative part is needed
+    because such offsets grow with depth, an absolute one because nothing nearer than 0.1 m to a
+    surface is flown through.
     """
     margin = FLOATER_MARGIN * np.maximum(1, truth)
     with np.errstate(invalid="ignore"):
         in_front = depth < truth - margin
-    return has_true_depth(truth) & in_front & (alpha > FLOATER_ALPHA)
+    return has_true_depth(truth) & in_front & (depth > 0)
 
 
-def floater_fraction(depth: NDArray, alpha: NDArray, truth: NDArray) -> float | None:
+def floater_fraction(depth: NDArray, truth: NDArray) -> float | None:
     """Returns the share of `floaters` among the pixels with true depth; None if none has any."""
-    count = has_true_depth(truth).sum()
-    return float(floaters(depth, alpha, truth).sum() / count) if count else None
+    valid = has_true_depth(truth)
+    return float(floaters(depth, truth)[valid].mean()) if valid.any() else None
 
 
-def fit_exposure(color: NDArray, truth: NDArray, vignetting: float) -> tuple[NDArray, float]:
+def hole_fraction(depth: NDArray, truth: NDArray) -> float | None:
+    """Returns the share of holes among the pixels with true depth; None if none has any.
+
+    A hole is where depth cameras see nothing, so that a policy takes it for open.
+    """
+    valid = has_true_depth(truth)
+    return float((depth == 0)[valid].mean()) if valid.any() else None
+
+
+def fit_exposure(
+    color: NDArray, truth: NDArray, vignetting: float, seen: NDArray[np.bool_] | None = None
+) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) as the camera would have exposed it, and the gain.
 
     The corners are darkened by the vignetting of the capture, and all pixels multiplied by the one
-    number that brings them closest to the true image (least squares): how a camera exposed a frame
-    says nothing of the place, and for a frame that is withheld from the fit nobody knows it.
+    number that brings those `seen` (H, W), or all, closest to the true image (least squares): how a
+    camera exposed a frame says nothing of the place, and for a frame that is withheld from the fit
+    nobody knows it.
     """
     height, width = color.shape[:2]
     image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
-    energy = float((image * image).sum())
-    gain = float((image * truth).sum()) / energy if energy > 0 else 1.0
+    x, y = (image, truth) if seen is None else (image[seen], truth[seen])
+    energy = float((x * x).sum())
+    gain = float((x * y).sum()) / energy if energy > 0 else 1.0
     return np.clip(gain * image, 0, 1), gain
 
 
 def measure_view(
-    view: RenderedView,
-    image: NDArray[np.uint8],
-    depth: NDArray[np.float32],
+    on_black: RenderedView,
+    background: Background,
+    frame: CaptureFrame,
     vignetting: float = 0.0,
+    seen: NDArray[np.bool_] | None = None,
     lpips: Lpips | None = None,
 ) -> ViewMeasures:
     """Compares a rendered view with what its camera saw.
@@ -148,26 +169,38 @@ def measure_view(
     Colours are compared as `fit_exposure` exposes them.
 
     Args:
-        view: what was rendered.
-        image: (H, W, 3), the true image, of the same size.
-        depth: (H, W) [m], the true depth.
+        on_black: what was rendered, before black.
+        background: of the scene.
+        frame: the truth, of the same size.
         vignetting: of the capture, see `vignette`.
+        seen: (H, W), the pixels to measure, see `seen_pixels`; all if None. For structure and
+            perception, whose windows reach over others, these are as they should be.
         lpips: the perceptual distance; None leaves it out.
     """
-    truth = image / 255
-    exposed, gain = fit_exposure(view.color, truth, vignetting)
+    truth, far = frame.image / 255, frame.depth >= FAR
+    if seen is None:
+        seen = np.ones(far.shape, dtype=bool)
+    true_depth = np.where(seen, frame.depth, 0)
+    view = put_behind(on_black, background, frame.K, frame.X_WC)
+    before_black = np.where(far[..., None], view.color, on_black.color)
+    exposed, gain = fit_exposure(view.color, truth, vignetting, seen)
+    exposed_before_black, _ = fit_exposure(before_black, truth, vignetting, seen)
+    whole = np.where(seen[..., None], exposed, truth)
     distance = None
     if lpips is not None:
         with torch.no_grad():
-            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth))
+            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (whole, truth))
             distance = lpips(a, b).item()
     return ViewMeasures(
-        psnr_db=psnr_db(exposed, truth),
-        ssim=ssim(exposed, truth),
+        psnr_db=psnr_db(exposed[seen], truth[seen]),
+        psnr_on_black_db=psnr_db(exposed_before_black[seen], truth[seen]),
+        ssim=ssim(whole, truth),
         lpips=distance,
-        depth_mae_m=depth_mae_m(view.depth, depth),
-        depth_relative=depth_relative(view.depth, depth),
-        floater_fraction=floater_fraction(view.depth, view.alpha, depth),
+        depth_mae_m=depth_mae_m(view.depth, true_depth),
+        depth_relative=depth_relative(view.depth, true_depth),
+        floater_fraction=floater_fraction(view.depth, true_depth),
+        hole_fraction=hole_fraction(view.depth, true_depth),
+        unseen_fraction=float(1 - seen.mean()),
         gain=gain,
     )
 
@@ -182,12 +215,10 @@ class SceneRenderer:
         means, quats, scales, opacities, sh = map(torch.from_numpy, arrays)
         self._tensors = (means, quats, scales, opacities, sh)
 
-    def render(
-        self, K: NDArray, width: int, height: int, X_WC: RigidTransform, background: ArrayLike
-    ) -> RenderedView:
-        """Renders colour over the background, expected depth and alpha; see `BakedScene.render`."""
+    def render(self, K: NDArray, width: int, height: int, X_WC: RigidTransform) -> RenderedView:
+        """Renders colour on black, depth and alpha; see `BakedScene.render`."""
         if self._baked is not None:
-            return self._baked.render(K, width, height, X_WC, background=background)
+            return self._baked.render(K, width, height, X_WC)
         with torch.no_grad():
             rendering = render(
                 "2dgs",
@@ -196,8 +227,7 @@ class SceneRenderer:
                 torch.tensor(K, dtype=torch.float32)[None],
                 width,
                 height,
-                background=torch.tensor(np.asarray(background), dtype=torch.float32)[None],
-                depth_mode="ED",
+                depth_mode="MD",
                 renderer=self._renderer,
             )
         images = (rendering.color, rendering.depth, rendering.alpha)

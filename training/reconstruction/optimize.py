@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.torch_threads import one_torch_thread
@@ -18,6 +19,7 @@ from splatpilot.training.reconstruction.densification import DefaultStrategy
 from splatpilot.training.reconstruction.losses import log_depth_loss, photometric_loss
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
 from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
+from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.photometry import fit_gain
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
@@ -38,7 +40,7 @@ class Optimization:
         config: how.
         views: what to fit.
         held_out: withheld frames to measure with; may be empty.
-        background: (3,) colour behind everything.
+        background: of the scene, with which it is measured.
         initial: makes the Gaussians to start from; not called if there is a checkpoint.
         checkpoint: where to keep what was done.
         perceptual: LPIPS of two images (H, W, 3), or None.
@@ -50,7 +52,7 @@ class Optimization:
         config: ReconstructConfig,
         views: ReconstructionViews,
         held_out: ReconstructionViews | None,
-        background: tuple[float, float, float],
+        background: Background,
         initial: Callable[[], GaussianScene],
         checkpoint: Checkpoint,
         perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
@@ -60,7 +62,11 @@ class Optimization:
         self._checkpoint, self._perceptual = checkpoint, perceptual
         self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
         self._renderer = create_renderer(config.renderer_threads)
-        self._background = torch.tensor([background], device=config.device)  # (1, 3)
+        self._background = background
+        self._seen = []
+        if held_out is not None:
+            fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
+            self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
         self.center, self.extent = views.extent()
@@ -123,6 +129,7 @@ class Optimization:
         viewmat = self._viewmats[k : k + 1]
         part = self.step / config.iterations
         flat = config.representation == "2dgs"
+        backdrop = self._backdrop_of_step(self.step)
         rendering = render(
             config.representation,
             self._gaussians(),
@@ -130,13 +137,13 @@ class Optimization:
             self._K,
             self._views.width,
             self._views.height,
-            background=self._background,
+            background=backdrop,
             depth_mode=config.depth_mode,
             absgrad=config.absgrad and config.strategy == "default",
             distortion=flat and config.distortion_weight > 0 and part >= _DISTORTION_START,
             renderer=self._renderer,
         )
-        loss = self._loss(rendering, k, part)
+        loss = self._loss(rendering, k, part, backdrop)
         if self._strategy is not None:
             self._strategy.watch(rendering)
         loss.backward()
@@ -159,8 +166,10 @@ class Optimization:
         for k in range(len(views)):
             seen = self._render(views, k)
             images = (image.cpu().numpy() for image in (seen.color, seen.depth, seen.alpha))
-            truth = views.images[k].numpy(), views.depths[k].numpy()
-            found.append(measure_view(RenderedView(*images), *truth, views.vignetting))
+            view, frame = RenderedView(*images), views.frame(k)
+            found.append(
+                measure_view(view, self._background, frame, views.vignetting, self._seen[k])
+            )
         return HeldOutMeasures(tuple(found))
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -171,30 +180,30 @@ class Optimization:
     def _fit_gains(self) -> None:
         """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
         views = self._views
-        gains = [
-            fit_gain(self._render(views, k).color.cpu() * views.vignette[..., None], image)
-            for k, image in ((k, views.images[k] / 255) for k in range(len(views)))
-        ]
+        gains = []
+        for k, image in enumerate(views.images):
+            seen = self._render(views, k)
+            color, alpha = seen.color.cpu(), seen.alpha.cpu()[..., None]
+            gains.append(fit_gain(color * views.vignette[..., None], alpha * image / 255))
         log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
         self.gains = torch.exp(log_gains - log_gains.mean())
 
     def _render(self, views: ReconstructionViews, k: int) -> Rendering:
-        """Renders the Gaussians as view k sees them, with expected depth."""
+        """Renders the Gaussians as view k sees them, on black, with median depth."""
         return render(
             self._config.representation,
             self._gaussians(),
-            views.viewmats[k : k + 1].to(self._background.device),
-            views.K.to(self._background.device),
+            views.viewmats[k : k + 1].to(self._config.device),
+            views.K.to(self._config.device),
             views.width,
             views.height,
-            background=self._background,
-            depth_mode="ED",
+            depth_mode="MD",
             renderer=self._renderer,
         )
 
-    def _loss(self, rendering: Rendering, k: int, part: float) -> Tensor:
+    def _loss(self, rendering: Rendering, k: int, part: float, backdrop: Tensor) -> Tensor:
         config, device = self._config, self._config.device
-        target = self._views.target(k, self.gains[k]).to(device)
+        target = self._views.target(k, self.gains[k], backdrop.cpu()[0]).to(device)
         loss = photometric_loss(rendering.color, target, config.ssim_weight)
         if config.depth_weight > 0:
             loss = loss + config.depth_weight * log_depth_loss(
@@ -222,6 +231,12 @@ class Optimization:
         """All images in random order, then all again in another; it depends on the step alone."""
         n = len(self._views)
         return int(np.random.default_rng([self._config.seed, step // n]).permutation(n)[step % n])
+
+    def _backdrop_of_step(self, step: int) -> Tensor:
+        """(1, 3), a colour to have behind everything in this step alone: what looks right before
+        any colour is opaque. It depends on the step alone."""
+        color = np.random.default_rng([self._config.seed, step, 1]).random((1, 3), np.float32)
+        return torch.from_numpy(color).to(self._config.device)
 
     def _make_strategy(self) -> DefaultStrategy | McmcStrategy | None:
         if self._config.strategy == "default":

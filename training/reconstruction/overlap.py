@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.lens import back_project
+from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.vignette import radius_squared
 
 STRIDE = 2
@@ -28,7 +29,7 @@ class ThinnedFrame:
 
     X_WC: RigidTransform
     K: NDArray[np.float64]  # (3, 3) [px], of the whole frame
-    depth: NDArray[np.floating]  # (h, w) [m]; 0 where there is none
+    depth: NDArray[np.floating]  # (h, w) [m]; 0 where there is none, or what is infinitely far
     tolerance: NDArray[np.floating]  # (h, w) [m], difference of depth on the same surface
     pixel_size: NDArray[np.floating]  # (h, w) [m], longest extent of a whole pixel on the surface
     luminance: NDArray[np.floating]  # (h, w), 0 to 1
@@ -39,7 +40,7 @@ class ThinnedFrame:
         """Thins `frame`."""
         thin = (slice(None, None, STRIDE), slice(None, None, STRIDE))
         height, width = frame.depth.shape
-        depth = np.where(np.isfinite(frame.depth), frame.depth, 0).astype(np.float32)
+        depth = np.where(frame.depth < FAR, frame.depth, 0).astype(np.float32)
         with np.errstate(divide="ignore"):
             w = np.where(depth > 0, 1 / depth, 0)
         w_v, w_u = (_smaller_difference(w, axis)[thin] for axis in (0, 1))
@@ -121,6 +122,25 @@ def find_new_pixels(
         # Without the speckle where two views are about equally fine.
         new[i] = (cv2.medianBlur(keep.astype(np.uint8), 5) > 0) & (view.depth > 0)
     return [new[i] for i in range(len(views))]
+
+
+def seen_pixels(frame: CaptureFrame, views: Sequence[ThinnedFrame]) -> NDArray[np.bool_]:
+    """Returns the pixels (H, W) of a frame whose point one of the views has seen; and those without
+    depth, of which nobody can say."""
+    own = ThinnedFrame.of(frame)
+    p_WQ, pixel = own.points()
+    seen = own.depth.ravel() == 0
+    p_WC = own.X_WC.translation()
+    # The nearest first: most points are found there.
+    for view in sorted(views, key=lambda v: float(np.linalg.norm(v.X_WC.translation() - p_WC))):
+        number, _ = view.find(p_WQ)
+        seen[pixel[number]] = True
+        p_WQ, pixel = np.delete(p_WQ, number, axis=1), np.delete(pixel, number)
+    # With the speckle along edges, where depths of one point disagree.
+    image = seen.reshape(own.depth.shape).astype(np.uint8)
+    image = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    height, width = frame.depth.shape
+    return image.repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width] > 0
 
 
 def _overlapping(view: ThinnedFrame, views: Sequence[ThinnedFrame]) -> list[int]:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -19,6 +18,7 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.environment import learn_background
 from splatpilot.training.reconstruction.initialization import (
     detail_of,
     gaussians_from_depth,
@@ -111,12 +111,13 @@ def reconstruct(
         [ThinnedFrame.of(frame) for frame in tqdm(frames, "comparing brightness", unit="frame")],
         config.seed,
     )
+    background = learn_background(frames, photometry)
     gains = np.ones(len(capture))
     checkpoint = None
     measured = None
     if config.iterations == 0:
         gains[fitted] = photometry.gains
-        gaussians, background = gaussians_from_depth(frames, photometry, detail_of(config))
+        gaussians = gaussians_from_depth(frames, photometry, detail_of(config))
         how = "depth back-projected"
     else:
         views = ReconstructionViews(frames, photometry)
@@ -127,7 +128,6 @@ def reconstruct(
         checkpoint = Checkpoint(out, config, views)
         if restart:
             checkpoint.remove()
-        background = mean_color(views)
         optimization = Optimization(
             config,
             views,
@@ -201,12 +201,3 @@ def _start_and_goal(
         reason = str(error)
     p_WS, p_WG = (capture.X_WCs[i].translation() for i in (0, -1))
     return p_WS, p_WG, float("nan"), (f"this scene cannot be flown in: {reason}",)
-
-
-def mean_color(views: ReconstructionViews) -> tuple[float, float, float]:
-    """Returns the mean colour of the images, freed of gains and vignetting, in 0 to 1."""
-    means = torch.stack(
-        [views.target(k, views.gains[k]).mean(dim=(0, 1)) for k in range(len(views))]
-    )
-    red, green, blue = means.mean(dim=0).clamp(0, 1).tolist()
-    return red, green, blue

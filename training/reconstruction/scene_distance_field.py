@@ -15,11 +15,10 @@ from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
-# Rendered depth counts where at least this much of the light is stopped.
-_SOLID = 0.5
 # Fields are compared where the true one is at most this far from a surface [m].
 _NEAR = 0.5
 # The median depth of a scene of unknown scale is taken to be this [m].
@@ -53,8 +52,7 @@ def render_depth(
     X_WCs: Sequence[RigidTransform],
     threads: int,
 ) -> DepthSource:
-    """Returns what cameras would measure in the scene: expected depth, 0 where less than half of
-    the light is stopped."""
+    """Returns what cameras would measure in the scene: median depth, 0 where no surface is."""
     tensors = tuple(
         torch.from_numpy(getattr(gaussians, name))
         for name in ("means", "quats", "scales", "opacities", "sh")
@@ -71,24 +69,24 @@ def render_depth(
                 torch.from_numpy(K).float()[None],
                 width,
                 height,
-                depth_mode="ED",
+                depth_mode="MD",
                 renderer=renderer,
             )
-        return torch.where(rendering.alpha > _SOLID, rendering.depth, 0).numpy()
+        return rendering.depth.numpy()
 
     return DepthSource(load, K, X_WCs)
 
 
 def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
     """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
-    number measured nothing within range: there the space before the sky was seen to be free."""
+    number shows the infinitely far: there the space before the sky was seen to be free."""
     places = {number: k for k, number in enumerate(frames.numbers)}
 
     def load(i: int) -> NDArray[np.float32]:
         depth = rendered.load(i)
         if i not in places:
             return depth
-        return np.where((depth == 0) & np.isinf(frames[places[i]].depth), np.float32(np.inf), depth)
+        return np.where((depth == 0) & (frames[places[i]].depth >= FAR), np.float32(np.inf), depth)
 
     return DepthSource(load, rendered.K, rendered.X_WCs)
 
@@ -131,13 +129,15 @@ class FieldDifference:
         )
 
 
-def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference:
-    """Compares two fields on the same grid."""
+def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference | None:
+    """Compares two fields on the same grid; None if nothing near a surface is known in both."""
     d, d_true = field.distances, truth.distances
     known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
     free = known & (d_true > truth.voxel_size)
     occupied = known & (truth.states == FieldState.OCCUPIED)
     near = known & (np.abs(d_true) < _NEAR)
+    if not near.any():
+        return None
     error = (d - d_true)[near]
     return FieldDifference(
         mean=float(error.mean()),

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from splatpilot._native import Renderer
@@ -16,7 +17,7 @@ class Rendering:
     """One camera's images."""
 
     color: Tensor  # (H, W, 3)
-    depth: Tensor  # (H, W) [m], accumulated or expected
+    depth: Tensor  # (H, W) [m], accumulated, expected or median
     alpha: Tensor  # (H, W)
     meta: dict[str, Any]  # of the rasteriser
     normals: Tensor | None = None  # (H, W, 3) sum of weight and normal; surfels only
@@ -47,7 +48,8 @@ def render(
         K: (1, 3, 3) [px].
         width, height: [px].
         background: (1, 3), black if None.
-        depth_mode: "D", accumulated, or "ED", expected.
+        depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
+            is 0 where no surface is.
         absgrad: see `rasterize`.
         distortion: whether surfels render it.
         renderer: see `rasterize`.
@@ -56,18 +58,24 @@ def render(
     options: dict[str, Any] = {
         "sh_degree": degree_of(gaussians[4].shape[1]),
         "backgrounds": background,
-        "render_mode": f"RGB+{depth_mode}",
         "renderer": renderer,
     }
     if representation == "3dgs":
-        image, alpha, meta = rasterize(*scene, **options, absgrad=absgrad)
+        image, alpha, meta = rasterize(
+            *scene, **options, render_mode=f"RGB+{depth_mode}", absgrad=absgrad
+        )
         return Rendering(image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0], meta)
-    image, alpha, normals, surface_normals, distort, _, meta = rasterize_surfels(
-        *scene, **options, distloss=distortion
+    is_median = depth_mode == "MD"
+    image, alpha, normals, surface_normals, distort, median, meta = rasterize_surfels(
+        *scene,
+        **options,
+        render_mode="RGB+ED" if is_median else f"RGB+{depth_mode}",
+        distloss=distortion,
     )
+    surface = torch.where(alpha >= 0.5, median, 0)[0, ..., 0]
     return Rendering(
         image[0, ..., :3],
-        image[0, ..., 3],
+        surface if is_median else image[0, ..., 3],
         alpha[0, ..., 0],
         meta,
         normals[0],

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from torch import Tensor
 from tqdm import tqdm
 
 from splatpilot.training.captures.capture import Capture, CaptureFrame
-from splatpilot.training.reconstruction.losses import depth_edge_weights
+from splatpilot.training.reconstruction.losses import FAR, depth_edge_weights
 from splatpilot.training.reconstruction.photometry import Photometry
 
 # Depths within a pixel that differ by more than this fraction belong to different surfaces.
@@ -131,7 +132,14 @@ class ReconstructionViews:
         extent = 1.1 * float(np.linalg.norm(p_WCs - center, axis=1).max())
         return center, extent if extent > 1e-6 else 1.0
 
-    def target(self, k: int, gain: Tensor) -> Tensor:
-        """(H, W, 3), the image freed of its gain and vignetting: what the scene should look like,
-        about 0 to 1."""
-        return self.images[k] * (1 / (255 * gain * self.vignette))[..., None]
+    def frame(self, k: int) -> CaptureFrame:
+        """Returns a frame as it was given."""
+        X_WC = RigidTransform(self.viewmats[k].double().numpy()).inverse()
+        K = self.K[0].double().numpy()
+        return CaptureFrame(self.images[k].numpy(), self.depths[k].numpy(), X_WC, K)
+
+    def target(self, k: int, gain: Tensor, backdrop: Tensor) -> Tensor:
+        """(H, W, 3), what the scene should look like before a `backdrop` (3,): the image freed of
+        its gain and vignetting, about 0 to 1, and nothing where it shows the infinitely far."""
+        color = self.images[k] * (1 / (255 * gain * self.vignette))[..., None]
+        return torch.where(self.depths[k][..., None] < FAR, color, backdrop)

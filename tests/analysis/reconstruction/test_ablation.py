@@ -85,7 +85,18 @@ def test_photometric_arms_see_no_depth():
 
 
 def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
-    view = ViewMeasures(psnr, 0.9, None, mae, mae / 2, share, 1.0)
+    view = ViewMeasures(
+        psnr_db=psnr,
+        psnr_on_black_db=psnr - 1,
+        ssim=0.9,
+        lpips=None,
+        depth_mae_m=mae,
+        depth_relative=mae / 2,
+        floater_fraction=share,
+        hole_fraction=share / 10,
+        unseen_fraction=0.0,
+        gain=1.0,
+    )
     return SceneMeasures(True, 8, 8, {0: view}, "none")
 
 
@@ -98,7 +109,14 @@ def test_means_and_spreads():
     rows = {(row[0], row[1]): row[2:] for row in result.table()}
     assert rows["mean ± spread", "Vanilla 3DGS"][0] == "32.00 ± 2.83"
     assert rows["mean ± spread", "Vanilla 3DGS"][2] == "-"
-    assert rows["one", "3DGS + depth (ours)"] == ["29.75", "0.9000", "-", "0.100", "0.50%"]
+    assert rows["one", "3DGS + depth (ours)"] == [
+        *("29.75", "0.9000", "-", "0.100", "0.50%", "0.05%", "28.75")
+    ]
+    assert rows["paper", "Vanilla 3DGS"] == [
+        *("29.35", "0.8706", "0.215", "0.974", "11.50%"),
+        "-",
+        "-",
+    ]
     assert result.verdicts()[0] == (
         "one, 3DGS: depth supervision divides the depth error by 10.0 and floaters by 20.0, "
         "PSNR -0.25 dB"

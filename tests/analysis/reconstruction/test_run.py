@@ -15,7 +15,7 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 SMALL = ReconstructConfig(
-    iterations=4, image_width=0, voxel_size=0.2, initial_gaussians=2000, threads=1
+    iterations=60, image_width=0, voxel_size=0.2, initial_gaussians=20_000, threads=1
 )
 
 

@@ -15,6 +15,7 @@ from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.splats.background import EnvironmentMap, mean_color
 from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -115,6 +116,24 @@ def test_how_it_was_made_is_kept(tmp_path, world):
     write_scene_metadata(folder, measured)
     assert read_scene_metadata(folder) == measured
     assert read_scene(folder).name == world.name
+
+
+def test_an_environment_is_kept(tmp_path, world):
+    """What is seen infinitely far away by direction comes back to 8 bits; without its file the
+    scene is refused, and a scene in its place without one has none."""
+    folder = tmp_path / "scene"
+    texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
+    sky = replace(world, background=EnvironmentMap(texels))
+    metadata = write_scene_folder(folder, sky, provenance="")
+    back = read_scene(folder).background
+    assert isinstance(back, EnvironmentMap)
+    np.testing.assert_allclose(back.texels, texels, atol=0.5 / 255 + 1e-6)
+    assert metadata.background == pytest.approx(mean_color(sky.background))
+    (folder / "environment.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"environment\.png: does not exist"):
+        read_scene(folder)
+    write_scene_folder(folder, world, provenance="")
+    assert read_scene(folder).background == world.background
 
 
 def test_scene_from_before_these_fields(tmp_path, world):
@@ -227,7 +246,8 @@ def test_missing_scene(tmp_path):
     [
         ("metric: true", "metric: false", "scale of this scene is unknown"),
         ("metric: true", "metrik: true", "metrik"),
-        ("format_version: 1", "format_version: 2", "format version 2, this program knows 1"),
+        ("format_version: 2", "format_version: 3", "format version 3, this program knows 2"),
+        ("format_version: 2", "format_version: 1", "had no background .*; reconstruct the scene"),
         ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS is .*three finite numbers"),
         ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG is .*three finite numbers"),
         ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS is \[\]"),

@@ -71,6 +71,16 @@ def test_no_room_at_all():
         choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.7, 0.7))), RADIUS)
 
 
+def test_no_way_worth_a_flight():
+    """A place in which the vehicle cannot fly a metre is an error that names the longest way."""
+    cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.2, 1.2)))
+    for choose in (choose_start_and_goal, lambda *given: draw_start_and_goal(*given, seed=0)):
+        with pytest.raises(
+            ValueError, match=r"longest way .* is 0\.\d\d m, at least 1 m is needed"
+        ):
+            choose(cell, RADIUS)
+
+
 def test_same_field_same_choice():
     """The choice is deterministic."""
     esdf = corridors(ALONG_X, ALONG_Y)
@@ -87,5 +97,5 @@ def test_drawn_ends_are_as_far_apart_as_asked(seed):
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
     _, _, length = draw_start_and_goal(esdf, RADIUS, seed, least=0.8 * longest)
     assert 0.8 * longest <= length <= longest + 1e-9
-    with pytest.raises(ValueError, match=r"way of 50 m can be flown.*ask for less"):
+    with pytest.raises(ValueError, match=r"longest way .* is \d\.\d+ m, at least 50 m is needed"):
         draw_start_and_goal(esdf, RADIUS, seed, least=50.0)

@@ -5,30 +5,24 @@ import pytest
 
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.initialization import (
-    SHELL,
     Detail,
+    drop_far,
     gaussians_from_depth,
     gaussians_from_points,
-    put_on_shell,
     random_points,
 )
 from splatpilot.training.reconstruction.overlap import ThinnedFrame
 from splatpilot.training.reconstruction.photometry import estimate_photometry
 
 
-def test_what_is_beyond_range_stands_on_a_shell(write_room, tmp_path):
-    """Infinite depth becomes points at one distance from the camera; unknown depth stays unknown,
-    and all else as it is."""
+def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):
+    """Where a frame shows what is beyond 150 m, it puts no Gaussian; all else stays as it is."""
     frame = read_tartanair_v1(write_room(tmp_path / "room")).frame(0)
     depth = frame.depth.copy()
     depth[:10], depth[10:12], depth[12:14] = np.inf, 0, 1e4
-    far = put_on_shell(replace(frame, depth=depth))
-    rows, columns = np.mgrid[0:48, 0:64] + 0.5
-    distance = np.linalg.norm(far.back_project(columns, rows, far.depth), axis=-1)
-    beyond = (depth > SHELL) & (np.arange(48)[:, None] < 14)
-    np.testing.assert_allclose(distance[beyond], SHELL, rtol=1e-6)
-    assert (far.depth[10:12] == 0).all()
-    np.testing.assert_array_equal(far.depth[14:], frame.depth[14:])
+    near = drop_far(replace(frame, depth=depth))
+    assert (near.depth[:14] == 0).all()
+    np.testing.assert_array_equal(near.depth[14:], frame.depth[14:])
 
 
 def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
@@ -39,8 +33,8 @@ def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
     coarse = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
     detail = Detail(max_gaussians=100_000, optimized=True, **coarse)
-    every, _ = gaussians_from_depth(frames, photometry, detail)
-    some, _ = gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20))
+    every = gaussians_from_depth(frames, photometry, detail)
+    some = gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20))
     assert len(some) == 20 < len(every)
     assert set(map(tuple, some.means)) <= set(map(tuple, every.means))
     assert np.linalg.norm(some.scales, axis=1).mean() > np.linalg.norm(every.scales, axis=1).mean()

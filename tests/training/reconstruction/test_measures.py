@@ -4,6 +4,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.measures import (
     SceneRenderer,
     depth_mae_m,
@@ -11,6 +12,7 @@ from splatpilot.training.reconstruction.measures import (
     fit_exposure,
     floater_fraction,
     floaters,
+    hole_fraction,
     measure_view,
     psnr_db,
     ssim,
@@ -53,25 +55,33 @@ def test_depth_error_counts_pixels_with_true_depth():
     nothing = np.zeros((2, 2))
     assert depth_mae_m(nothing, nothing) is None
     assert depth_relative(nothing, nothing) is None
-    assert floater_fraction(nothing, nothing, nothing) is None
+    assert floater_fraction(nothing, nothing) is None
+    assert hole_fraction(nothing, nothing) is None
 
 
 def test_floaters_stand_in_front_by_the_margin_and_cover():
-    """A pixel is a floater beyond max(0.1 m, 10 %) in front, not behind, with alpha over 1/2."""
-    cases = [  # true depth, rendered depth, alpha, floater
-        (0.5, 0.41, 1.0, False),
-        (0.5, 0.39, 1.0, True),  # 0.1 m below 1 m
-        (5.0, 4.51, 1.0, False),
-        (5.0, 4.49, 1.0, True),  # 10 % above 1 m
-        (5.0, 9.0, 1.0, False),
-        (5.0, 1.0, 0.5, False),
-        (5.0, 1.0, 0.51, True),
-        (0.0, 1.0, 1.0, False),
-        (np.inf, 1.0, 1.0, False),
+    """A pixel is a floater beyond max(0.1 m, 10 %) in front, not behind, and no hole is one."""
+    cases = [  # true depth, rendered depth, floater
+        (0.5, 0.41, False),
+        (0.5, 0.39, True),  # 0.1 m below 1 m
+        (5.0, 4.51, False),
+        (5.0, 4.49, True),  # 10 % above 1 m
+        (5.0, 9.0, False),
+        (5.0, 0.0, False),
+        (5.0, 1.0, True),
+        (0.0, 1.0, False),
+        (np.inf, 1.0, False),
     ]
-    truth, depth, alpha, expected = map(np.array, zip(*cases, strict=True))
-    np.testing.assert_array_equal(floaters(depth, alpha, truth), expected.astype(bool))
-    assert floater_fraction(depth, alpha, truth) == pytest.approx(3 / 7)
+    truth, depth, expected = map(np.array, zip(*cases, strict=True))
+    np.testing.assert_array_equal(floaters(depth, truth), expected.astype(bool))
+    assert floater_fraction(depth, truth) == pytest.approx(3 / 7)
+
+
+def test_holes_are_where_nothing_is_seen_of_something():
+    """A hole is a pixel that has true depth but no depth; beyond range there is nothing to see."""
+    truth = np.array([[2.0, 4.0, 3.0, 9.0, 0.0, np.inf]])
+    depth = np.array([[2.0, 0.0, 1.0, 9.0, 0.0, 0.0]])
+    assert hole_fraction(depth, truth) == pytest.approx(1 / 4)
 
 
 def plane(distance: float, opacity: float = 0.99, size: float = 8.0) -> GaussianScene:
@@ -91,33 +101,22 @@ def plane(distance: float, opacity: float = 0.99, size: float = 8.0) -> Gaussian
 def test_a_plane_in_front_is_all_floater(representation):
     """A plane rendered in its place has no depth error and no floaters; one drawn half a metre in
     front errs by that and is a floater in every pixel."""
-    camera = (K, WIDTH, HEIGHT, RigidTransform(), (0.0, 0.0, 0.0))
+    camera = (K, WIDTH, HEIGHT, RigidTransform())
     truth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
     for distance, error, fraction in ((3.0, 0.0, 0.0), (2.5, 0.5, 1.0)):
         view = SceneRenderer(plane(distance), representation).render(*camera)
         assert view.alpha.min() > 0.99
         assert view.color == pytest.approx(np.full((HEIGHT, WIDTH, 3), 0.6), abs=0.01)
         assert depth_mae_m(view.depth, truth) == pytest.approx(error, abs=2e-3)
-        assert floater_fraction(view.depth, view.alpha, truth) == fraction
+        assert floater_fraction(view.depth, truth) == fraction
 
 
 @pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
 def test_both_representations_stand_where_the_camera_is_told(representation):
     """A camera moved towards a plane sees it nearer by that much, whatever the representation."""
     X_WC = RigidTransform([0.3, -0.2, 1.0])
-    view = SceneRenderer(plane(3.0), representation).render(K, WIDTH, HEIGHT, X_WC, (0, 0, 0))
+    view = SceneRenderer(plane(3.0), representation).render(K, WIDTH, HEIGHT, X_WC)
     np.testing.assert_allclose(view.depth, 2.0, atol=2e-3)
-
-
-def test_a_veil_that_draws_depth_forward_is_a_floater():
-    """Before a plane at 3 m, a veil at 1 m becomes a floater once it draws the expected depth
-    forward by 0.3 m: with 15 % of the weight or more, long before it is the median."""
-    truth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
-    found = []
-    for weight in (0.1, 0.2):
-        depth = weight * 1.0 + (1 - weight) * truth
-        found.append(floater_fraction(depth, np.ones_like(depth), truth))
-    assert found == [0.0, 1.0]
 
 
 def test_exposure_is_fitted():
@@ -144,15 +143,63 @@ def test_measures_of_a_view():
     image = np.round(255 * exposed).astype(np.uint8)
     near = depth.copy()
     near[:6] = 1.0  # a quarter
-    found = measure_view(
-        RenderedView(color, near, np.ones_like(depth)), image, depth, vignetting=-0.2
-    )
+    view = RenderedView(color, near, np.ones_like(depth))
+    frame = CaptureFrame(image, depth, RigidTransform(), K)
+    found = measure_view(view, (0.0, 0.0, 0.0), frame, vignetting=-0.2)
     assert found.psnr_db > 50 and found.ssim > 0.999
     assert found.gain == pytest.approx(1.2, rel=1e-3)
     assert found.lpips is None
     assert found.depth_mae_m == pytest.approx(0.25)
     assert found.depth_relative == pytest.approx(0.125)
     assert found.floater_fraction == pytest.approx(0.25)
+    assert found.hole_fraction == 0
+
+
+def test_a_translucent_surface_is_a_hole():
+    """A wall of alpha 0.4 that looks right before its background is a hole, as deep as the wall is
+    far, and looks wrong on black; the sky is not what makes black look wrong."""
+    gray = (0.5, 0.5, 0.5)
+    image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    depth[:12] = np.inf
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[12:, :16] = 0.4
+    alpha[12:, 16:] = 1.0
+    color = alpha[..., None] * np.float32([gray])
+    seen = RenderedView(color, np.where(alpha > 0.5, depth, 0), alpha)
+    frame = CaptureFrame(image, depth, RigidTransform(), K)
+    found = measure_view(seen, gray, frame)
+    assert found.hole_fraction == pytest.approx(0.5)
+    assert found.depth_mae_m == pytest.approx(1.0)
+    assert found.floater_fraction == 0
+    assert found.psnr_db > 50
+    assert found.psnr_on_black_db < 20
+    solid = np.float32(alpha > 0)
+    opaque = RenderedView(solid[..., None] * np.float32([gray]), depth, solid)
+    assert measure_view(opaque, gray, frame).psnr_on_black_db > 50
+
+
+def test_what_no_camera_saw_is_left_out():
+    """Pixels that are not to be measured have no part in any figure but their share."""
+    color = noise().astype(np.float32)
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    frame = CaptureFrame(np.round(255 * color).astype(np.uint8), depth, RigidTransform(), K)
+    seen = np.ones((HEIGHT, WIDTH), bool)
+    seen[:6] = False
+    wrong = RenderedView(
+        *(
+            np.where(seen.reshape(x.shape[:2] + (1,) * (x.ndim - 2)), x, 0)
+            for x in (color, depth, np.ones_like(depth))
+        )
+    )
+    found = measure_view(wrong, (0.0, 0.0, 0.0), frame, seen=seen)
+    assert found.psnr_db > 50 and found.psnr_on_black_db > 50 and found.ssim > 0.999
+    assert (found.depth_mae_m, found.hole_fraction) == (0, 0)
+    assert found.unseen_fraction == pytest.approx(0.25)
+    assert found.gain == pytest.approx(1, abs=1e-3)
+    everything = measure_view(wrong, (0.0, 0.0, 0.0), frame)
+    assert everything.hole_fraction == pytest.approx(0.25)
+    assert everything.unseen_fraction == 0
 
 
 def test_lpips_is_of_the_exposed_image():
@@ -161,9 +208,11 @@ def test_lpips_is_of_the_exposed_image():
     image = np.round(255 * 1.2 * color).astype(np.uint8)
     depth = np.ones((HEIGHT, WIDTH), np.float32)
     view = RenderedView(color, depth, np.ones((HEIGHT, WIDTH)))
+    frame = CaptureFrame(image, depth, RigidTransform(), K)
 
     def difference(a, b):
         assert a.shape == (HEIGHT, WIDTH, 3)
         return (a - b).abs().max()
 
-    assert measure_view(view, image, depth, lpips=difference).lpips == pytest.approx(0, abs=0.01)
+    found = measure_view(view, (0.0, 0.0, 0.0), frame, lpips=difference)
+    assert found.lpips == pytest.approx(0, abs=0.01)

@@ -21,7 +21,14 @@ from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-CONFIG = ReconstructConfig(iterations=60, image_width=0, hold_out=6, voxel_size=0.1, threads=1)
+CONFIG = ReconstructConfig(
+    iterations=60,
+    initial_gaussians=3000,
+    image_width=0,
+    hold_out=6,
+    voxel_size=0.1,
+    threads=1,
+)
 
 
 # A walk in small steps, with the frames 0 and 6, which will be withheld, in the midst of it.
@@ -39,7 +46,7 @@ def room(tmp_path, write_room):
 @pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
 def test_held_out_frames_come_out(tmp_path, room, representation):
     """Frames that nothing was fitted to are rendered with the right colours and depth."""
-    config = replace(CONFIG, representation=representation)
+    config = replace(CONFIG, representation=representation, iterations=200)
     start = reconstruct(read_capture(room), tmp_path / "start", replace(config, iterations=1))
     summary = reconstruct(read_capture(room), tmp_path / "scene", config)
     assert start.held_out is not None and summary.held_out is not None
@@ -59,6 +66,20 @@ def test_same_seed_same_scene_whatever_the_threads(tmp_path, room):
         reconstruct(read_capture(room), tmp_path / name, config)
     for file in ("gaussians.ply", "scene.yaml", "esdf.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_what_is_solid_is_opaque(tmp_path, room):
+    """Withheld frames look the same before black as before anything else, whatever the colour of
+    the walls, and none of their pixels is a hole."""
+    summary = reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, iterations=300))
+    assert summary.held_out is not None
+    for view in summary.held_out.views:
+        assert view.hole_fraction is not None and view.hole_fraction < 0.002
+    scene = read_scene(tmp_path / "scene")
+    for frame in read_capture(room).frames():
+        height, width = frame.depth.shape
+        alpha = scene.baked.render(frame.K, width, height, frame.X_WC).alpha
+        assert np.mean(alpha < 0.95) < 0.02
 
 
 def test_metric_depth_is_what_places_surfaces(tmp_path, room):

@@ -4,7 +4,12 @@ from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.tartanair import read_tartanair_v1
-from splatpilot.training.reconstruction.overlap import STRIDE, ThinnedFrame, find_new_pixels
+from splatpilot.training.reconstruction.overlap import (
+    STRIDE,
+    ThinnedFrame,
+    find_new_pixels,
+    seen_pixels,
+)
 
 
 @pytest.fixture
@@ -52,6 +57,27 @@ def test_hidden_and_outside_points_are_not_found(views):
     assert len(views[0].find(seen)[0]) == 1
     for p_CQ in ([0, 0, 20.0], [0, 0, 0.5], [0, 0, -2.0], [50.0, 0, 1.0]):
         assert len(views[0].find(X_WC.multiply(np.array(p_CQ)[:, None]))[0]) == 0
+
+
+def wall(x: float, depth: float = 2.0) -> CaptureFrame:
+    """A wall parallel to the image of a camera at `x` [m], 2 m wide there; sky above it."""
+    image = np.full((48, 64, 3), 128, np.uint8)
+    distances = np.full((48, 64), depth, np.float32)
+    distances[:8] = np.inf
+    K = np.array([[64.0, 0, 32], [0, 64.0, 24], [0, 0, 1]])
+    return CaptureFrame(image, distances, RigidTransform([x, 0.0, 0.0]), K)
+
+
+def test_seen_is_what_another_camera_saw():
+    """Of a wall, a camera to the left saw what lies in its image and nothing to the right of that;
+    one that saw another wall before it saw none of it. The sky counts as seen."""
+    frame, beside = wall(0.0), ThinnedFrame.of(wall(-0.5))
+    seen = seen_pixels(frame, [beside])
+    assert seen[:8].all()
+    assert seen[8:, :47].all() and not seen[8:, 49:].any()
+    other = ThinnedFrame.of(wall(0.0, depth=1.5))
+    assert not seen_pixels(frame, [other])[8:].any()
+    assert seen_pixels(frame, [other, beside, ThinnedFrame.of(wall(0.5))])[8:].all()
 
 
 def test_pixel_size_of_a_slanted_plane():
