@@ -20,7 +20,7 @@ four neighbours, 0.71 spacings away, each still covers half of what lies behind 
 THICKNESS = 0.001
 """[m], standard deviation of a splat across its surface."""
 
-RIM = 1.6
+RIM = 1.9
 """How many standard deviations beyond the centres of its outermost patches a closed layer ends. One
 layer lets half of the light through at 1.4, the two that meet at an edge a little farther out."""
 
