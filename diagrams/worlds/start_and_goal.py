@@ -23,8 +23,8 @@ def choose_start_and_goal(
     The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
     [m] to spare can fly through space known to be free, at least `SHORTEST`: in the largest
     connected part of a grid, the node farthest from any node, and the node farthest from that (the
-    double sweep, exact on trees). If no space has that much margin, half of it is tried, and then none. Paths longer than
-    `longest` [m] are not considered: a flight should end in good time.
+    double sweep, exact on trees). If no space has that much margin, half of it is tried, and then
+    none. Paths longer than `longest` [m] are not considered: a flight should end in good time.
 
     Raises:
         ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
