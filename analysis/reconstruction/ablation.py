@@ -54,7 +54,9 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     config = replace(config, representation=arm.representation, distance_field="captured")
     if arm.depth:
         return replace(config, initialization="depth")
-    return replace(config, initialization="points", depth_weight=0.0, strategy="default")
+    return replace(
+        config, initialization="points", depth_weight=0.0, surface_weight=0.0, strategy="default"
+    )
 
 
 def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> AblationResult:

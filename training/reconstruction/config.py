@@ -43,6 +43,8 @@ class ReconstructConfig:
     """lambda_d, the weight of the depth term; 0 looks at colours alone."""
     depth_mode: str = "ED"
     """The depth it compares: "ED", expected, or "D", accumulated, the paper's equation 2."""
+    surface_weight: float = 2.0
+    """Of the distance of each Gaussian from the surface that it is part of, see `surface_loss`."""
     ssim_weight: float = 0.2
     """Of structural similarity in the photometric loss; that of L1 is the rest."""
     lpips_weight: float = 0.0
@@ -82,7 +84,8 @@ class ReconstructConfig:
     """mcmc: strength of the random walk, relative to the learning rate of the means."""
 
     means_rate: float = 1.6e-4
-    """Learning rate of the means relative to the extent of the scene; falls to a hundredth."""
+    """Learning rate of the means relative to the extent of the scene; falls to a hundredth. A
+    quarter of it where they start on surfaces that depth shows."""
     scales_rate: float = 5e-3
     quats_rate: float = 1e-3
     opacities_rate: float = 5e-2
@@ -146,6 +149,7 @@ class ReconstructConfig:
             "image_width": 0,
             "hold_out": 0,
             "depth_weight": 0,
+            "surface_weight": 0,
             "lpips_weight": 0,
             "lpips_every": 1,
             "distortion_weight": 0,

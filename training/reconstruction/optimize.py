@@ -23,10 +23,13 @@ from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.photometry import fit_gain
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
+from splatpilot.training.reconstruction.surface_loss import surface_loss
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
 # The learning rate of the means falls to this fraction.
 _LAST_RATE = 0.01
+# Where they start from depth, it is this part of the learning rate from the beginning.
+_ON_SURFACE = 0.25
 # Unknown gains are fitted after these parts of all steps.
 _GAIN_FITS = (0.1, 0.2, 0.4)
 # Terms of 2D Gaussian splatting begin after these parts of all steps, as in its publication.
@@ -70,8 +73,10 @@ class Optimization:
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
         self.center, self.extent = views.extent()
+        near = _ON_SURFACE if config.initialization == "depth" else 1.0
+        self._means_rate = near * config.means_rate * self.extent
         rates = {
-            "means": config.means_rate * self.extent,
+            "means": self._means_rate,
             "quats": config.quats_rate,
             "log_scales": config.scales_rate,
             "logit_opacities": config.opacities_rate,
@@ -124,7 +129,7 @@ class Optimization:
         """Fits one image a little better."""
         config, splats = self._config, self.splats
         decay = _LAST_RATE ** (self.step / config.iterations)
-        splats.set_rate("means", config.means_rate * self.extent * decay)
+        splats.set_rate("means", self._means_rate * decay)
         k = self._image_of_step(self.step)
         viewmat = self._viewmats[k : k + 1]
         part = self.step / config.iterations
@@ -210,6 +215,13 @@ class Optimization:
                 rendering.depth,
                 self._views.depths[k].to(device),
                 self._views.edges[k].to(device).float(),
+            )
+        if config.surface_weight > 0:
+            loss = loss + config.surface_weight * surface_loss(
+                rendering,
+                self.splats["means"],
+                self._viewmats[k : k + 1],
+                self._views.depths[k].to(device),
             )
         late = part >= 1 - config.lpips_fraction and self.step % config.lpips_every == 0
         if self._perceptual is not None and late:

@@ -72,13 +72,14 @@ def test_photometric_arms_see_no_depth():
         settings = arm_config(arm, config)
         assert settings.representation == arm.representation
         assert (settings.iterations, settings.hold_out) == (123, config.hold_out)
-        assert (settings.depth_weight > 0) == arm.depth
+        assert (settings.depth_weight > 0) == (settings.surface_weight > 0) == arm.depth
         assert settings.initialization == ("depth" if arm.depth else "points")
         changed = {k for k, v in asdict(config).items() if asdict(settings)[k] != v}
         assert changed <= {
             "representation",
             "initialization",
             "depth_weight",
+            "surface_weight",
             "strategy",
             "distance_field",
         }
