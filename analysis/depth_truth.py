@@ -114,7 +114,8 @@ def frames_along_flight(
             camera.GetInputPort("body_pose").FixValue(context, X_WB)
             image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
             X_WC = X_WB @ config.X_BC()
-            frames[-1].append(DepthFrame(image.data[..., 0].copy(), truth.image(config, X_WC)))
+            depth = np.array(image.data)[..., 0]
+            frames[-1].append(DepthFrame(depth, truth.image(config, X_WC)))
     return frames
 
 

@@ -78,9 +78,10 @@ def test_frontier_is_seen_where_it_is_hit(captured, closed):
     for yaw in np.arange(4) * np.pi / 2:
         X_WC = looking(yaw, [2.8, 2.0, 1.5])
         way, depth = rays(X_WC), np.zeros((120, 160))
+        p_WQ = np.tile(X_WC.translation(), (120, 160, 1))
         for _ in range(60):
-            p_WQ = X_WC.translation() + depth[..., None] * way
             depth += 0.7 * np.clip(np.nan_to_num(distances.distance(p_WQ)), 0.0, None)
+            p_WQ = X_WC.translation() + depth[..., None] * way
         at_frontier = (np.abs(distances.distance(p_WQ)) < 0.02) & (field.distance(p_WQ) > 0.1)
         ends += at_frontier.sum()
         missed += (at_frontier & (seen_depth(frontier, X_WC) > depth + 2 * VOXEL)).sum()

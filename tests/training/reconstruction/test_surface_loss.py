@@ -36,4 +36,5 @@ def test_without_true_depth_there_is_no_loss():
     image = torch.zeros(HEIGHT, WIDTH)
     loss = surface_loss(Rendering(image, image, image, seen), means, torch.eye(4)[None], image)
     loss.backward()
+    assert means.grad is not None
     assert loss.item() == 0 and not means.grad.any()

@@ -16,6 +16,7 @@ from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import Capsule, Sphere
+from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -62,7 +63,7 @@ def _digest(world: World) -> str:
     for array in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh):
         digest.update(array.tobytes())
     digest.update(world.distance_field.distance(_inside(world)[::50]).tobytes())
-    digest.update(np.array([*world.background, *world.p_WS, *world.p_WG]).tobytes())
+    digest.update(np.array([*mean_color(world.background), *world.p_WS, *world.p_WG]).tobytes())
     return digest.hexdigest()
 
 
