@@ -6,7 +6,6 @@ import pytest
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.initialization import (
     Detail,
-    drop_far,
     gaussians_from_depth,
     gaussians_from_points,
     random_points,
@@ -14,15 +13,26 @@ from splatpilot.training.reconstruction.initialization import (
 from splatpilot.training.reconstruction.overlap import ThinnedFrame
 from splatpilot.training.reconstruction.photometry import estimate_photometry
 
+COARSE = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
+
 
 def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):
-    """Where a frame shows what is beyond 150 m, it puts no Gaussian; all else stays as it is."""
-    frame = read_tartanair_v1(write_room(tmp_path / "room")).frame(0)
-    depth = frame.depth.copy()
-    depth[:10], depth[10:12], depth[12:14] = np.inf, 0, 1e4
-    near = drop_far(replace(frame, depth=depth))
-    assert (near.depth[:14] == 0).all()
-    np.testing.assert_array_equal(near.depth[14:], frame.depth[14:])
+    """Where frames show what is beyond 150 m they put no Gaussian: all stand in the room."""
+    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+
+    def with_sky(frame):
+        depth = frame.depth.copy()
+        depth[:10], depth[10:14] = np.inf, 1e4
+        return replace(frame, depth=depth)
+
+    detail = Detail(max_gaussians=100_000, optimized=True, **COARSE)
+    scenes = []
+    for frames in (list(capture.frames()), [with_sky(frame) for frame in capture.frames()]):
+        photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
+        scenes.append(gaussians_from_depth(frames, photometry, detail))
+    whole, below = scenes
+    assert 0 < len(below) < len(whole)
+    assert np.abs(below.means).max() <= np.abs(whole.means).max() + 0.1
 
 
 def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
@@ -31,8 +41,7 @@ def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     frames = list(capture.frames())
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
-    coarse = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
-    detail = Detail(max_gaussians=100_000, optimized=True, **coarse)
+    detail = Detail(max_gaussians=100_000, optimized=True, **COARSE)
     every = gaussians_from_depth(frames, photometry, detail)
     some = gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20))
     assert len(some) == 20 < len(every)
