@@ -1,24 +1,13 @@
 // Alpha compositing of one tile, front to back, 16 pixels at a time.
 #pragma once
 
+#include "footprints.hpp"
 #include "mathematics.hpp"
 #include "types.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
 constexpr int kStageWords = kStageSize / 64;
-
-// A splat in the tile's own coordinates: u = ux x + uy y + u0, v = vy y + v0.
-struct StagedSplat {
-  float ux, uy, u0, vy, v0, log2_opacity;
-  float red, green, blue, depth;
-};
-
-// A DepthPlane in the tile's own coordinates.
-struct StagedPlane {
-  float ux, uy, u0, vy, v0;
-  float w_x, w_y, w;
-};
 
 // Running sums of the 16 pixels of a block. Transmittance never grows, so a pixel whose next value
 // would not exceed the limit is finished for good: that one comparison takes the place of a mask
@@ -35,20 +24,6 @@ struct alignas(64) StagedTile {
   StagedPlane planes[kStageSize];
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
 };
-
-SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
-  const float x = s.mean_x - left, y = s.mean_y - top;
-  return {s.ux,       s.uy,        -(s.ux * x + s.uy * y),
-          s.vy,       -(s.vy * y), s.log2_opacity,
-          s.color[0], s.color[1],  s.color[2],
-          s.depth};
-}
-
-SP_INLINE StagedPlane in_tile(const DepthPlane& p, const Splat& s, float left, float top) {
-  const float x = s.mean_x - left, y = s.mean_y - top;
-  return {p.ux,  p.uy,  -(p.ux * x + p.uy * y),       p.vy, -(p.vy * y),
-          p.w_x, p.w_y, p.w - (p.w_x * x + p.w_y * y)};
-}
 
 // From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
 // transposed 16 splats at a time: one shifted into the sign shows in the lane bits. `blocks` has
@@ -88,19 +63,6 @@ SP_INLINE void stage(const RasterInput& in, bool planes, size_t begin, int count
   transpose_blocks(blocks, count, staged.touching);
 }
 
-// The exponent of alpha, in base 2, of a StagedSplat or StagedPlane.
-template <typename Footprint>
-SP_INLINE F16 exponent_at(const Footprint& at, float log2_opacity, const F16& x, const F16& y) {
-  const F16 u = F16(at.ux) * x + (F16(at.uy) * y + F16(at.u0));
-  const F16 v = F16(at.vy) * y + F16(at.v0);
-  return (F16(log2_opacity) - u * u) - v * v;
-}
-
-SP_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
-  const F16 exponent = exponent_at(splat, splat.log2_opacity, x, y);
-  return zero_unless(exponent >= F16(kLog2AlphaCut), min(exp2(exponent), F16(kMaxAlpha)));
-}
-
 // Pixel centres of the 16 lanes of a block, from its corner.
 struct LaneCentres {
   F16 x, y;
@@ -121,19 +83,6 @@ SP_INLINE LaneCentres block_centres(const LaneCentres& centres, int b) {
           centres.y + F16(static_cast<float>(kBlockSize * (b / 4)))};
 }
 
-// Lets the light through one splat without blur; returns whether any pixel has half of it left.
-// Those that do take the splat's depth, in case it takes the half.
-SP_INLINE bool seek_median(const StagedPlane& plane, float log2_opacity, const LaneCentres& pixel,
-                           BlockState& s) {
-  const F16 half = F16(0.5f);
-  const F16 exponent = exponent_at(plane, log2_opacity, pixel.x, pixel.y);
-  const F16 alpha = zero_unless(exponent >= F16(kLog2AlphaCut), exp2(exponent));
-  const F16 w = F16(plane.w_x) * pixel.x + (F16(plane.w_y) * pixel.y + F16(plane.w));
-  s.median_w = select(s.sharp_transmittance > half, w, s.median_w);
-  s.sharp_transmittance = s.sharp_transmittance - s.sharp_transmittance * alpha;
-  return any(s.sharp_transmittance > half);
-}
-
 // Composites the staged splats of one block; returns whether any pixel is still open. A pixel whose
 // colour is finished is open while its median depth is sought.
 template <bool kColor, bool kDepth, bool kMedian>
@@ -146,7 +95,9 @@ SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneC
       const int i = 64 * word + __builtin_ctzll(bits);
       const StagedSplat& splat = staged.splats[i];
       if constexpr (kMedian) {
-        if (seeking) seeking = seek_median(staged.planes[i], splat.log2_opacity, pixel, s);
+        if (seeking)
+          seeking = seek_median(staged.planes[i], splat.log2_opacity, pixel.x, pixel.y,
+                                s.sharp_transmittance, s.median_w);
       }
       const F16 alpha = alpha_at(splat, pixel.x, pixel.y);
       const F16 rest = s.transmittance * (F16(1.0f) - alpha);

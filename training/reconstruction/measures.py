@@ -97,7 +97,9 @@ def depth_mae_m(depth: NDArray, truth: NDArray) -> float | None:
     hole, which so is wrong by all of its depth.
     """
     valid = has_true_depth(truth)
-    return float(np.abs(depth - truth)[valid].mean(dtype=np.float64)) if valid.any() else None
+    if not valid.any():
+        return None
+    return float(np.abs(depth[valid] - truth[valid]).mean(dtype=np.float64))
 
 
 def depth_relative(depth: NDArray, truth: NDArray) -> float | None:
@@ -105,7 +107,8 @@ def depth_relative(depth: NDArray, truth: NDArray) -> float | None:
     valid = has_true_depth(truth)
     if not valid.any():
         return None
-    return float((np.abs(depth - truth)[valid] / truth[valid]).mean(dtype=np.float64))
+    error = np.abs(depth[valid] - truth[valid])
+    return float((error / truth[valid]).mean(dtype=np.float64))
 
 
 def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
