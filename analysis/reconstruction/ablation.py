@@ -55,7 +55,12 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     if arm.depth:
         return replace(config, initialization="depth")
     return replace(
-        config, initialization="points", depth_weight=0.0, surface_weight=0.0, strategy="default"
+        config,
+        initialization="points",
+        depth_weight=0.0,
+        surface_weight=0.0,
+        outline_weight=0.0,
+        strategy="default",
     )
 
 

@@ -45,6 +45,9 @@ class ReconstructConfig:
     """The depth it compares: "ED", expected, or "D", accumulated, the paper's equation 2."""
     surface_weight: float = 2.0
     """Of the distance of each Gaussian from the surface that it is part of, see `surface_loss`."""
+    outline_weight: float = 1.0
+    """Of the outlines of what is solid, see `outline_loss`: one step in three fits them, and depth,
+    in place of colours. 0 for none."""
     ssim_weight: float = 0.2
     """Of structural similarity in the photometric loss; that of L1 is the rest."""
     lpips_weight: float = 0.0
@@ -150,6 +153,7 @@ class ReconstructConfig:
             "hold_out": 0,
             "depth_weight": 0,
             "surface_weight": 0,
+            "outline_weight": 0,
             "lpips_weight": 0,
             "lpips_every": 1,
             "distortion_weight": 0,

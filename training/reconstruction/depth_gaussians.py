@@ -26,7 +26,7 @@ _UNDERLAY_SIZE = 4
 # Thickness of a Gaussian as a fraction of its other standard deviations.
 _THICKNESS = 0.1
 # Longest to shortest side of a cell on its surface, for surfaces seen at grazing angles.
-_MAX_STRETCH = 4.0
+_MAX_STRETCH = 8.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,20 +10,21 @@ from tqdm import tqdm
 from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.rasterization import EPS2D
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.event_log import event_log
 from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.densification import DefaultStrategy
-from splatpilot.training.reconstruction.losses import log_depth_loss, photometric_loss
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
 from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
+from splatpilot.training.reconstruction.objective import Objective
 from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.photometry import fit_gain
+from splatpilot.training.reconstruction.smallest_scales import smallest_scales
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
-from splatpilot.training.reconstruction.surface_loss import surface_loss
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
 # The learning rate of the means falls to this fraction.
@@ -32,8 +33,10 @@ _LAST_RATE = 0.01
 _ON_SURFACE = 0.25
 # Unknown gains are fitted after these parts of all steps.
 _GAIN_FITS = (0.1, 0.2, 0.4)
-# Terms of 2D Gaussian splatting begin after these parts of all steps, as in its publication.
-_DISTORTION_START, _NORMAL_START = 0.1, 7 / 30
+# Steps from one time that the smallest scales are found to the next.
+_FIND_SMALLEST = 500
+# One step in so many fits what depth cameras see.
+_SHARP_EVERY = 3
 
 
 class Optimization:
@@ -62,7 +65,7 @@ class Optimization:
         fit_gains: bool = False,
     ):
         self._config, self._views, self._held_out = config, views, held_out
-        self._checkpoint, self._perceptual = checkpoint, perceptual
+        self._checkpoint = checkpoint
         self._gain_steps = [int(f * config.iterations) for f in _GAIN_FITS] if fit_gains else []
         self._renderer = create_renderer(config.renderer_threads)
         self._background = background
@@ -70,6 +73,8 @@ class Optimization:
         if held_out is not None:
             fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
             self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
+        self._outlines = config.outline_weight > 0 and bool((views.depths > 0).any())
+        self._objective = Objective(config, views, perceptual)
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
         self.center, self.extent = views.extent()
@@ -90,6 +95,7 @@ class Optimization:
             self.splats = SplatParameters.of_scene(
                 initial(), config.sh_degree, rates, config.device
             )
+            self._find_smallest()
         else:
             self.step = kept["step"]
             self.splats = SplatParameters(**kept["splats"], rates=rates)
@@ -126,15 +132,18 @@ class Optimization:
                     self._save()
 
     def take_step(self) -> None:
-        """Fits one image a little better."""
-        config, splats = self._config, self.splats
+        """Fits one image a little better.
+
+        Where depth is known, one step in three fits what depth cameras see instead of colours,
+        drawn as they see it, without the blur of colour cameras.
+        """
+        config, splats, count = self._config, self.splats, len(self.splats)
         decay = _LAST_RATE ** (self.step / config.iterations)
         splats.set_rate("means", self._means_rate * decay)
         k = self._image_of_step(self.step)
         viewmat = self._viewmats[k : k + 1]
-        part = self.step / config.iterations
-        flat = config.representation == "2dgs"
         backdrop = self._backdrop_of_step(self.step)
+        sharp = self._outlines and self.step % _SHARP_EVERY == _SHARP_EVERY - 1
         rendering = render(
             config.representation,
             self._gaussians(),
@@ -144,11 +153,16 @@ class Optimization:
             self._views.height,
             background=backdrop,
             depth_mode=config.depth_mode,
+            eps2d=0.0 if sharp else EPS2D,
             absgrad=config.absgrad and config.strategy == "default",
-            distortion=flat and config.distortion_weight > 0 and part >= _DISTORTION_START,
+            distortion=self._objective.wants_distortion(self.step),
             renderer=self._renderer,
         )
-        loss = self._loss(rendering, k, part, backdrop)
+        loss = self._objective.loss(
+            rendering, self._gaussians(), k, self.gains[k], self.step, backdrop, sharp
+        )
+        if config.strategy == "mcmc":
+            loss = loss + mcmc.penalty(splats)
         if self._strategy is not None:
             self._strategy.watch(rendering)
         loss.backward()
@@ -160,6 +174,8 @@ class Optimization:
             self._fit_gains()
         if self._strategy is not None:
             self._strategy.refine(self.step, splats)
+        if self.step % _FIND_SMALLEST == 0 or len(splats) != count:
+            self._find_smallest()
 
     @torch.no_grad()
     def measure(self) -> HeldOutMeasures | None:
@@ -176,6 +192,9 @@ class Optimization:
                 measure_view(view, self._background, frame, views.vignetting, self._seen[k])
             )
         return HeldOutMeasures(tuple(found))
+
+    def _find_smallest(self) -> None:
+        self.splats.smallest = smallest_scales(self.splats["means"], self._views)
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         splats = self.splats
@@ -205,39 +224,6 @@ class Optimization:
             depth_mode="MD",
             renderer=self._renderer,
         )
-
-    def _loss(self, rendering: Rendering, k: int, part: float, backdrop: Tensor) -> Tensor:
-        config, device = self._config, self._config.device
-        target = self._views.target(k, self.gains[k], backdrop.cpu()[0]).to(device)
-        loss = photometric_loss(rendering.color, target, config.ssim_weight)
-        if config.depth_weight > 0:
-            loss = loss + config.depth_weight * log_depth_loss(
-                rendering.depth,
-                self._views.depths[k].to(device),
-                self._views.edges[k].to(device).float(),
-            )
-        if config.surface_weight > 0:
-            loss = loss + config.surface_weight * surface_loss(
-                rendering,
-                self.splats["means"],
-                self._viewmats[k : k + 1],
-                self._views.depths[k].to(device),
-            )
-        late = part >= 1 - config.lpips_fraction and self.step % config.lpips_every == 0
-        if self._perceptual is not None and late:
-            weight = config.lpips_weight * config.lpips_every
-            loss = loss + weight * self._perceptual(rendering.color.clamp(0, 1), target.clamp(0, 1))
-        if rendering.normals is not None and rendering.surface_normals is not None:
-            assert rendering.distortion is not None
-            if config.distortion_weight > 0 and part >= _DISTORTION_START:
-                loss = loss + config.distortion_weight * rendering.distortion.mean()
-            if config.normal_weight > 0 and part >= _NORMAL_START:
-                surface = rendering.surface_normals * rendering.alpha.detach()[..., None]
-                cosine = (rendering.normals * surface).sum(dim=-1)
-                loss = loss + config.normal_weight * (1 - cosine).mean()
-        if config.strategy == "mcmc":
-            loss = loss + mcmc.penalty(self.splats)
-        return loss
 
     def _image_of_step(self, step: int) -> int:
         """All images in random order, then all again in another; it depends on the step alone."""

@@ -1,6 +1,7 @@
 """What is optimised: the parameters of Gaussians, and Adam's memory of each."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,8 @@ class SplatParameters:
     """N Gaussians as unconstrained tensors, with an Adam of a learning rate for each kind.
 
     `means` (N, 3) [m]; `quats` (N, 4) wxyz of any length; `log_scales` (N, 3); `logit_opacities`
-    (N,); `sh_0` (N, 1, 3) and, if the degree is not 0, `sh_rest` (N, K - 1, 3).
+    (N,); `sh_0` (N, 1, 3) and, if the degree is not 0, `sh_rest` (N, K - 1, 3). Beside them
+    `smallest` (N,) [m], which is no parameter: see `scales`.
     """
 
     def __init__(
@@ -28,6 +30,7 @@ class SplatParameters:
         tensors: Mapping[str, Tensor],
         rates: Mapping[str, float],
         state: Mapping[str, Mapping[str, Tensor]] | None = None,
+        smallest: Tensor | None = None,
     ):
         groups = [
             {"params": [tensor.clone().requires_grad_()], "lr": rates[name], "name": name}
@@ -38,6 +41,9 @@ class SplatParameters:
         self._groups = {group["name"]: group for group in self.optimizer.param_groups}
         for name, parameter_state in (state or {}).items():
             self.optimizer.state[self[name]] = {k: v.clone() for k, v in parameter_state.items()}
+        self.smallest = torch.zeros_like(tensors["logit_opacities"])
+        if smallest is not None:
+            self.smallest = smallest
 
     @classmethod
     def of_scene(
@@ -78,8 +84,8 @@ class SplatParameters:
 
     @property
     def scales(self) -> Tensor:
-        """(N, 3) [m]."""
-        return torch.exp(self["log_scales"])
+        """(N, 3) [m], never less than the `smallest`: their squares are added."""
+        return torch.sqrt(torch.exp(2 * self["log_scales"]) + self.smallest[:, None] ** 2)
 
     @property
     def opacities(self) -> Tensor:
@@ -100,7 +106,10 @@ class SplatParameters:
     @torch.no_grad()
     def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
         """Keeps the Gaussians `rows` (indices), in that order, and appends those `added`, of which
-        Adam remembers nothing."""
+        Adam remembers nothing and whose `smallest` is 0."""
+        count = 0 if added is None else len(added["means"])
+        kept = self.smallest[rows]
+        self.smallest = torch.cat([kept, kept.new_zeros(count)])
         for name in self.names:
             old = self[name]
             extra = old[:0] if added is None else added[name]
@@ -120,7 +129,7 @@ class SplatParameters:
             if key != "step":
                 value[rows] = 0
 
-    def state(self) -> dict[str, dict]:
+    def state(self) -> dict[str, Any]:
         """Returns all that makes these parameters and their Adam again, see `__init__`."""
         return {
             "tensors": {name: self[name].detach().clone() for name in self.names},
@@ -128,6 +137,7 @@ class SplatParameters:
                 name: {k: v.clone() for k, v in self.optimizer.state[self[name]].items()}
                 for name in self.names
             },
+            "smallest": self.smallest,
         }
 
     @torch.no_grad()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpilot._native import Renderer
-from splatpilot.systems.splats.rasterization import rasterize
+from splatpilot.systems.splats.rasterization import EPS2D, rasterize
 from splatpilot.systems.splats.spherical_harmonics import degree_of
 from splatpilot.systems.splats.surfels import rasterize_surfels
 
@@ -35,6 +35,7 @@ def render(
     *,
     background: Tensor | None = None,
     depth_mode: str = "D",
+    eps2d: float = EPS2D,
     absgrad: bool = False,
     distortion: bool = False,
     renderer: Renderer | None = None,
@@ -50,6 +51,7 @@ def render(
         background: (1, 3), black if None.
         depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
             is 0 where no surface is.
+        eps2d: of Gaussians, see `rasterize`; surfels have a blur of their own.
         absgrad: see `rasterize`.
         distortion: whether surfels render it.
         renderer: see `rasterize`.
@@ -62,7 +64,7 @@ def render(
     }
     if representation == "3dgs":
         image, alpha, meta = rasterize(
-            *scene, **options, render_mode=f"RGB+{depth_mode}", absgrad=absgrad
+            *scene, **options, render_mode=f"RGB+{depth_mode}", eps2d=eps2d, absgrad=absgrad
         )
         return Rendering(image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0], meta)
     is_median = depth_mode == "MD"

@@ -73,6 +73,7 @@ def test_photometric_arms_see_no_depth():
         assert settings.representation == arm.representation
         assert (settings.iterations, settings.hold_out) == (123, config.hold_out)
         assert (settings.depth_weight > 0) == (settings.surface_weight > 0) == arm.depth
+        assert (settings.outline_weight > 0) == arm.depth
         assert settings.initialization == ("depth" if arm.depth else "points")
         changed = {k for k, v in asdict(config).items() if asdict(settings)[k] != v}
         assert changed <= {
@@ -80,6 +81,7 @@ def test_photometric_arms_see_no_depth():
             "initialization",
             "depth_weight",
             "surface_weight",
+            "outline_weight",
             "strategy",
             "distance_field",
         }
