@@ -43,11 +43,11 @@ class ReconstructConfig:
     """lambda_d, the weight of the depth term; 0 looks at colours alone."""
     depth_mode: str = "ED"
     """The depth it compares: "ED", expected, or "D", accumulated, the paper's equation 2."""
-    surface_weight: float = 2.0
+    surface_weight: float = 1.0
     """Of the distance of each Gaussian from the surface that it is part of, see `surface_loss`."""
     outline_weight: float = 1.0
-    """Of the outlines of what is solid, see `outline_loss`: one step in three fits them, and depth,
-    in place of colours. 0 for none."""
+    """Of the outlines of things before the infinitely far, see `outline_loss`: every other step of a
+    view that has some fits them in place of colours. 0 for none."""
     ssim_weight: float = 0.2
     """Of structural similarity in the photometric loss; that of L1 is the rest."""
     lpips_weight: float = 0.0

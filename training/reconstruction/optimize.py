@@ -17,6 +17,7 @@ from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.densification import DefaultStrategy
+from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
 from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
 from splatpilot.training.reconstruction.objective import Objective
@@ -35,8 +36,8 @@ _ON_SURFACE = 0.25
 _GAIN_FITS = (0.1, 0.2, 0.4)
 # Steps from one time that the smallest scales are found to the next.
 _FIND_SMALLEST = 500
-# One step in so many fits what depth cameras see.
-_SHARP_EVERY = 3
+# One step in so many of a view with outlines before the infinitely far fits these.
+_SHARP_EVERY = 2
 
 
 class Optimization:
@@ -73,7 +74,10 @@ class Optimization:
         if held_out is not None:
             fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
             self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
-        self._outlines = config.outline_weight > 0 and bool((views.depths > 0).any())
+        far = views.depths >= FAR
+        solid = (views.depths > 0) & ~far
+        both = far.flatten(1).any(dim=1) & solid.flatten(1).any(dim=1)
+        self._outlined = both.tolist() if config.outline_weight > 0 else [False] * len(views)
         self._objective = Objective(config, views, perceptual)
         self._viewmats = views.viewmats.to(config.device)
         self._K = views.K.to(config.device)
@@ -134,8 +138,8 @@ class Optimization:
     def take_step(self) -> None:
         """Fits one image a little better.
 
-        Where depth is known, one step in three fits what depth cameras see instead of colours,
-        drawn as they see it, without the blur of colour cameras.
+        Where something stands out against the infinitely far, every other step fits its outline
+        instead of colours, drawn as depth cameras see it: without the blur of colour cameras.
         """
         config, splats, count = self._config, self.splats, len(self.splats)
         decay = _LAST_RATE ** (self.step / config.iterations)
@@ -143,7 +147,7 @@ class Optimization:
         k = self._image_of_step(self.step)
         viewmat = self._viewmats[k : k + 1]
         backdrop = self._backdrop_of_step(self.step)
-        sharp = self._outlines and self.step % _SHARP_EVERY == _SHARP_EVERY - 1
+        sharp = self._outlined[k] and self.step % _SHARP_EVERY == _SHARP_EVERY - 1
         rendering = render(
             config.representation,
             self._gaussians(),
