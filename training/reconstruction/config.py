@@ -46,8 +46,8 @@ class ReconstructConfig:
     surface_weight: float = 1.0
     """Of the distance of each Gaussian from the surface that it is part of, see `surface_loss`."""
     outline_weight: float = 1.0
-    """Of the outlines of things before the infinitely far, see `outline_loss`: every other step of a
-    view that has some fits them in place of colours. 0 for none."""
+    """Of the outlines of things before the infinitely far, see `outline_loss`: every other step of
+    a view that has some fits them in place of colours. 0 for none."""
     ssim_weight: float = 0.2
     """Of structural similarity in the photometric loss; that of L1 is the rest."""
     lpips_weight: float = 0.0
