@@ -143,10 +143,11 @@ inline int32_t radius_of(float extent) {
 }
 
 // Add to the module: the backward pass of Gaussians, the renderer of surfels, the rendering of
-// projected Gaussians, the losses.
+// projected Gaussians, the losses, the casting of rays.
 void bind_gradients(nb::module_& m);
 void bind_surfels(nb::module_& m);
 void bind_projected(nb::module_& m);
 void bind_losses(nb::module_& m);
+void bind_ray_casting(nb::module_& m);
 
 }  // namespace splatpilot

@@ -189,6 +189,7 @@ NB_MODULE(_native, m) {
         "depth"_a, "alpha"_a, "Writes colour, median depth and alpha.");
 
   bind_losses(m);
+  bind_ray_casting(m);
   bind_gradients(m);
   bind_surfels(m);
   bind_projected(m);

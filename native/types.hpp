@@ -199,12 +199,14 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
 
 struct SurfelKernels;
 struct LossKernels;
+struct CastingKernels;
 
 // Of one SIMD level.
 struct Kernels {
   const char* name;
   const SurfelKernels* surfels;
   const LossKernels* losses;
+  const CastingKernels* casting;
   // Projects Gaussians [begin, end); writes visible ones, their planes if these are not null, and
   // the bits of their depths in input order; returns how many.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,

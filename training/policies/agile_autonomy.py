@@ -186,7 +186,7 @@ class AgileAutonomyTrainer:
         config, worlds = self._config, self._worlds
         N, device = config.environments, config.device
         world = (first_world + torch.arange(N, device=device)) % len(worlds)
-        primitives, p_WG = worlds.primitives.select(world), worlds.p_WG[world]
+        p_WG = worlds.p_WG[world]
         which = torch.randint(len(config.speeds), (N,), generator=self._generator, device=device)
         speed = torch.tensor(config.speeds, device=device)[which]
         control = FlatnessControllerConfig()
@@ -196,8 +196,8 @@ class AgileAutonomyTrainer:
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
         for step in range(config.steps):
-            distances, _ = primitives.near(vehicle.p)
-            ended = (distances.amin(1) < VEHICLE_RADIUS) | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
+            distances, _ = worlds.geometry.nearest(vehicle.p, world, 1)
+            ended = (distances[:, 0] < VEHICLE_RADIUS) | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
             inside = (vehicle.p > worlds.lower_W[world]) & (vehicle.p < worlds.upper_W[world])
             ended |= ~inside.all(1)
             if ended.any():
@@ -206,10 +206,9 @@ class AgileAutonomyTrainer:
                 past = choose_rows(ended, remembered(fresh, latency), past)
                 by_student = torch.where(ended, flown, by_student)
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
-                distances, _ = primitives.near(vehicle.p)
             past, R_WB = remember(past, vehicle), vehicle.attitude()
-            depth = render_depth(delayed(past, latency), primitives, self._agent.grid, distances)
-            seen = Observation(depth, vehicle, R_WB, p_WG, speed)
+            depth = render_depth(delayed(past, latency), worlds.geometry, self._agent.rays, world)
+            seen = Observation(depth, vehicle, p_WG, speed)
             asked = step % config.ask_every == 0
             if asked:
                 valid, experts, costs = self._ask(vehicle, world, which)

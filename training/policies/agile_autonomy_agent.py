@@ -14,7 +14,7 @@ from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerCon
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, target_velocity
-from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.vehicles import BodyRate, Vehicle
 
 LOOKAHEAD = 3
@@ -29,7 +29,7 @@ class AgileAutonomyAgent:
     def __init__(self, network: TrajectoryModule, device: torch.device | str = "cpu") -> None:
         spec = network.spec
         self.network = network
-        self.grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X, device)
+        self.rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
         self._device = device
 
     def initial_memory(self, count: int) -> Tensor:
@@ -37,7 +37,7 @@ class AgileAutonomyAgent:
 
     def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
         """Images (N, 24, 32) and states (N, 18)."""
-        spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.R_WB
+        spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.vehicle.attitude()
         image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
         rates = (
             QuadrotorState.of(vehicle.state).w_WB_B
@@ -59,7 +59,7 @@ class AgileAutonomyAgent:
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         waypoints, costs = self.hypotheses(seen)
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
-        p_WR = seen.vehicle.p + (seen.R_WB @ best[:, LOOKAHEAD, :, None])[:, :, 0]
+        p_WR = seen.vehicle.p + (seen.vehicle.attitude() @ best[:, LOOKAHEAD, :, None])[:, :, 0]
         return reaching_acceleration(p_WR, seen.vehicle), None, memory
 
 

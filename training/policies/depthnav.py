@@ -31,10 +31,10 @@ from splatpilot.systems.policies.depthnav_inference import (
 )
 from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
 from splatpilot.training.policies import observation
-from splatpilot.training.policies.differentiable_rollout import RolloutConfig, Transition
+from splatpilot.training.policies.differentiable_rollout import RolloutConfig, Transitions
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import Observation
-from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollout_trainer import RolloutTraining
 from splatpilot.training.policies.trainer import Schedule
 
@@ -76,11 +76,10 @@ class DepthNavLearner:
 
     def __init__(self, loss: DepthNavLoss, device: torch.device | str = "cpu") -> None:
         spec = DEPTHNAV_NETWORK
-        self.grid = PinholeGrid.of(
+        self.rays = PixelRays.of(
             spec.image_width,
             spec.image_height,
             FOV_X,
-            device,
             cell_aspect=(IMAGE_SIZE[1] / spec.image_height) / (IMAGE_SIZE[0] / spec.image_width),
         )
         self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
@@ -99,7 +98,7 @@ class DepthNavLearner:
         R_WS = observation.heading_frame(start_yaw)
         image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
         v_target = observation.target_velocity(vehicle.p, seen.p_WG, speed)
-        q_SB = quaternion_from_rotation(R_WS.mT @ seen.R_WB)
+        q_SB = quaternion_from_rotation(R_WS.mT @ vehicle.attitude())
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)
         output, hidden = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
@@ -113,23 +112,23 @@ class DepthNavLearner:
             torch.cat([hidden, start_yaw[:, None]], 1),
         )
 
-    def losses(self, transition: Transition) -> dict[str, Tensor]:
+    def losses(self, transitions: Transitions) -> dict[str, Tensor]:
         weights = self._loss
-        d, approach = transition.clearance[:, 0], transition.approach[:, 0].clamp(min=0.0)
+        d, approach = transitions.clearance[:, 0], transitions.approach[:, 0].clamp(min=0.0)
         collision = approach * (1.0 - d).clamp(min=0.0).square()
         collision = collision + 2.5 * torch.nn.functional.softplus(-6.0 * d)
         velocity = torch.nn.functional.smooth_l1_loss(
-            transition.v_mean, transition.v_target, reduction="none"
+            transitions.v_mean, transitions.v_target, reduction="none"
         )
-        assert transition.heading is not None
-        way = torch.atan2(transition.v_target[:, 1], transition.v_target[:, 0])
+        assert transitions.heading is not None
+        way = torch.atan2(transitions.v_target[:, 1], transitions.v_target[:, 0])
         terms = {
             "velocity": velocity.sum(1),
             "collision": collision,
-            "acceleration": transition.a.square().sum(1),
-            "jerk": transition.jerk.square().sum(1),
-            "rate": transition.jerk[:, :2].square().sum(1) / GRAVITY**2,
-            "yaw": 1.0 - torch.cos(transition.heading - way),
+            "acceleration": transitions.a.square().sum(1),
+            "jerk": transitions.jerk.square().sum(1),
+            "rate": transitions.jerk[:, :2].square().sum(1) / GRAVITY**2,
+            "yaw": 1.0 - torch.cos(transitions.heading - way),
         }
         return {name: getattr(weights, name) * term.mean() for name, term in terms.items()}
 

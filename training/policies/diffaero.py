@@ -30,10 +30,10 @@ from splatpilot.systems.policies.diffaero_inference import (
     RATE,
 )
 from splatpilot.training.policies import observation
-from splatpilot.training.policies.differentiable_rollout import Transition
+from splatpilot.training.policies.differentiable_rollout import Transitions
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import Observation
-from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollout_trainer import RolloutTraining
 from splatpilot.training.policies.trainer import Schedule
 
@@ -71,7 +71,7 @@ class DiffAeroLearner:
 
     def __init__(self, loss: DiffAeroLoss, device: torch.device | str = "cpu") -> None:
         spec = DIFFAERO_NETWORK
-        self.grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X, device)
+        self.rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
         self.network = TrainableNetwork(spec).to(device)
         self._loss = loss
         self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
@@ -90,19 +90,19 @@ class DiffAeroLearner:
         a_H = observation.limit_acceleration(output, self._limits)
         return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
 
-    def losses(self, transition: Transition) -> dict[str, Tensor]:
+    def losses(self, transitions: Transitions) -> dict[str, Tensor]:
         weights = self._loss
-        d = transition.clearance - weights.margin
-        approach = transition.approach.clamp(min=0.0)
+        d = transitions.clearance - weights.margin
+        approach = transitions.approach.clamp(min=0.0)
         clearance = (approach * (1.0 - d).clamp(min=0.0).square()).sum(1).mean()
         contact = (approach * torch.nn.functional.softplus(-32.0 * d) / 4.0).sum(1).mean()
         velocity = torch.nn.functional.smooth_l1_loss(
-            transition.v_mean, transition.v_target, reduction="none"
+            transitions.v_mean, transitions.v_target, reduction="none"
         )
         return {
             "velocity": weights.velocity * velocity.sum(1).mean(),
             "clearance": weights.clearance * clearance,
             "contact": weights.contact * contact,
-            "acceleration": weights.acceleration * transition.a.square().sum(1).mean(),
-            "jerk": weights.jerk * transition.jerk.square().sum(1).mean(),
+            "acceleration": weights.acceleration * transitions.a.square().sum(1).mean(),
+            "jerk": weights.jerk * transitions.jerk.square().sum(1).mean(),
         }

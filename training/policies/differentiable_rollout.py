@@ -1,5 +1,6 @@
 """Rollouts of many vehicles whose loss is differentiated through the dynamics of flight."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -18,6 +19,7 @@ from splatpilot.training.policies.observation import (
     training_noise,
     validate_training_noise,
 )
+from splatpilot.training.policies.ray_casting import Geometry
 from splatpilot.training.policies.vehicles import PointMass, choose_rows, where_rows
 from splatpilot.training.policies.world_batch import STARTS, WorldBatch
 
@@ -25,16 +27,17 @@ NEAREST = 4
 """Obstacles that the loss looks at, the nearest ones at each step."""
 
 
-class Transition(NamedTuple):
-    """What a loss is made of: N vehicles after one step, everything in W and with gradients."""
+class Transitions(NamedTuple):
+    """What a loss is made of: M steps of vehicles and what they are after each, everything in W and
+    with gradients."""
 
-    v_mean: Tensor  # (N, 3) [m/s], moving average of v_WB
-    v_target: Tensor  # (N, 3) [m/s], along the way to the goal
-    a: Tensor  # (N, 3) [m/s^2]
-    jerk: Tensor  # (N, 3) [m/s^3]
-    clearance: Tensor  # (N, 4) [m], beyond the vehicle's radius, of the nearest obstacles
-    approach: Tensor  # (N, 4) [m/s], velocity towards them
-    heading: Tensor | None  # (N,) [rad], asked for
+    v_mean: Tensor  # (M, 3) [m/s], moving average of v_WB
+    v_target: Tensor  # (M, 3) [m/s], along the way to the goal
+    a: Tensor  # (M, 3) [m/s^2]
+    jerk: Tensor  # (M, 3) [m/s^3]
+    clearance: Tensor  # (M, K) [m], beyond the vehicle's radius, of the K <= 4 nearest obstacles
+    approach: Tensor  # (M, K) [m/s], velocity towards them
+    heading: Tensor | None  # (M,) [rad], asked for
 
 
 class Learner(Agent, Protocol):
@@ -42,8 +45,8 @@ class Learner(Agent, Protocol):
 
     network: TrainableNetwork
 
-    def losses(self, transition: Transition) -> dict[str, Tensor]:
-        """The weighted terms of the loss, by name, each a mean over the vehicles."""
+    def losses(self, transitions: Transitions) -> dict[str, Tensor]:
+        """The weighted terms of the loss, by name, each a mean over the transitions."""
         ...
 
 
@@ -163,7 +166,7 @@ class DifferentiableRollout:
     def _restart_ended(self, episodes: Episodes) -> Episodes:
         """Episodes that have ended begin anew."""
         worlds, world, p = self.worlds, episodes.world, episodes.vehicle.p
-        clearance = worlds.primitives.select(world).near(p)[0].amin(1) - VEHICLE_RADIUS
+        clearance = worlds.geometry.nearest(p, world, 1)[0][:, 0] - VEHICLE_RADIUS
         inside = (p > worlds.lower_W[world]) & (p < worlds.upper_W[world])
         ended = (
             (clearance < 0.0)
@@ -180,43 +183,29 @@ class DifferentiableRollout:
         return Episodes(vehicle, past, *(where_rows(ended, a, b) for a, b in others))
 
     def losses(self) -> dict[str, Tensor]:
-        """Flies on for `steps` and returns the mean of each term of the loss, differentiable."""
+        """Flies on for `steps` and returns the terms of the loss, differentiable."""
         config, learner, worlds = self.config, self.learner, self.worlds
         dt = 1.0 / learner.rate
         keep = config.gradient_decay**dt
-        forget = 1.0 - torch.exp(torch.tensor(-dt / config.averaging))
+        forget = 1.0 - math.exp(-dt / config.averaging)
         with torch.no_grad():
             episodes = self._restart_ended(self.episodes)
         vehicle, past, world, v_mean, memory, speed, age = episodes
-        primitives, p_WG = worlds.primitives.select(world), worlds.p_WG[world]
-        totals: dict[str, Tensor] = {}
-        distances, normals = primitives.near(vehicle.p)
+        p_WG = worlds.p_WG[world]
+        vehicles, v_means, headings = [vehicle], [], []
         for _ in range(config.steps):
             past = remember(past, vehicle)
-            depth = render_depth(delayed(past, self._latency), primitives, learner.grid, distances)
+            depth = render_depth(delayed(past, self._latency), worlds.geometry, learner.rays, world)
             depth = noisy_depth(depth, config.noise, self.generator)
-            seen = Observation(depth, vehicle, vehicle.attitude(), p_WG, speed)
-            a_cmd, heading, memory = learner.decide(seen, memory)
-            before = vehicle
-            vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, self._control, heading)
-            v_mean = v_mean + forget * (vehicle.v - v_mean)
-            distances, normals = primitives.near(vehicle.p)
-            clearance, approach = _nearest_obstacles(vehicle, distances, normals)
-            with torch.no_grad():
-                to_goal = (p_WG - vehicle.p).norm(dim=1)
-                way = worlds.way(vehicle.p, world)
-                v_target = way * torch.minimum(speed, to_goal)[:, None]
-            transition = Transition(
-                v_mean,
-                v_target,
-                vehicle.a,
-                (vehicle.a - before.a) / dt,
-                clearance,
-                approach,
-                heading,
+            a_cmd, heading, memory = learner.decide(
+                Observation(depth, vehicle, p_WG, speed), memory
             )
-            for name, term in learner.losses(transition).items():
-                totals[name] = totals.get(name, 0.0) + term / config.steps
+            vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, self._control, heading)
+            v_mean = torch.lerp(v_mean, vehicle.v, forget)
+            vehicles.append(vehicle)
+            v_means.append(v_mean)
+            if heading is not None:
+                headings.append(heading)
         self.episodes = Episodes(
             vehicle.detach(),
             past,
@@ -226,20 +215,29 @@ class DifferentiableRollout:
             speed,
             age + config.steps * dt,
         )
-        return totals
+        p, v = (torch.cat([getattr(step, name) for step in vehicles[1:]]) for name in "pv")
+        a = torch.stack([step.a for step in vehicles])  # (steps + 1, N, 3)
+        everyone = torch.arange(len(world), device=world.device).repeat(config.steps)
+        world, p_WG, speed = world[everyone], p_WG[everyone], speed[everyone]
+        clearance, approach = _obstacles(worlds.geometry, p, v, world)
+        with torch.no_grad():
+            v_target = worlds.way(p, world) * torch.minimum(speed, (p_WG - p).norm(dim=1))[:, None]
+        transitions = Transitions(
+            torch.cat(v_means),
+            v_target,
+            a[1:].flatten(0, 1),
+            (a.diff(dim=0) / dt).flatten(0, 1),
+            clearance,
+            approach,
+            torch.cat(headings) if headings else None,
+        )
+        return learner.losses(transitions)
 
 
-def _nearest_obstacles(
-    vehicle: PointMass, distances: Tensor, normals: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Clearance (N, 4) [m] and velocity of approach (N, 4) [m/s] of the nearest obstacles.
-
-    Args:
-      distances, normals: (N, M) and (N, 3, M) of all obstacles.
-    """
-    nearest = distances.topk(min(NEAREST, distances.shape[1]), dim=1, largest=False)
-    n = normals.gather(2, nearest.indices[:, None].expand(-1, 3, -1))  # (N, 3, 4)
+def _obstacles(geometry: Geometry, p: Tensor, v: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
+    """Clearance (M, K) [m] and velocity of approach (M, K) [m/s] of the nearest obstacles of
+    vehicles at p (M, 3) [m] with velocities v (M, 3) [m/s] in `world` (M,)."""
+    distances, normals = geometry.nearest(p, world, NEAREST)
     # The value is the distance, and the gradient its normal.
-    along = ((vehicle.p - vehicle.p.detach())[:, :, None] * n).sum(1)
-    approach = -(vehicle.v[:, :, None] * n).sum(1)
-    return nearest.values + along - VEHICLE_RADIUS, approach
+    moved, approach = (normals @ torch.stack([p - p.detach(), -v], 2)).unbind(2)
+    return distances + moved - VEHICLE_RADIUS, approach

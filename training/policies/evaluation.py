@@ -11,8 +11,7 @@ from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerCon
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
 from splatpilot.training.policies.observation import Observation, noisy_depth
-from splatpilot.training.policies.primitives import Primitives
-from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.ray_casting import Geometry, PixelRays
 from splatpilot.training.policies.vehicles import BodyRate, PointMass, Vehicle
 from splatpilot.training.policies.world_batch import WorldBatch
 
@@ -24,7 +23,7 @@ class Agent(Protocol):
     """What observes through a camera and decides, for N vehicles at once."""
 
     rate: float  # [Hz]
-    grid: PinholeGrid
+    rays: PixelRays
 
     def initial_memory(self, count: int) -> Tensor:
         """What N vehicles remember at first, (N, ...)."""
@@ -36,13 +35,11 @@ class Agent(Protocol):
 
 
 @torch.no_grad()
-def render_depth(
-    vehicle: Vehicle, primitives: Primitives, grid: PinholeGrid, distances: Tensor
-) -> Tensor:
-    """Depth (N, R) [m] from the vehicles' cameras; see `Primitives.depth`."""
+def render_depth(vehicle: Vehicle, geometry: Geometry, rays: PixelRays, world: Tensor) -> Tensor:
+    """Depth (N, R) [m] from the vehicles' cameras, each in its `world` (N,)."""
     x, y, z = vehicle.attitude().unbind(2)
     R_WC = torch.stack([-y, -z, x], 2)
-    return primitives.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, grid, distances)
+    return geometry.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, rays, world)
 
 
 class Outcomes(NamedTuple):
@@ -118,12 +115,11 @@ def evaluate_agent(
     clearance = torch.full((count,), torch.inf, device=device)
     path, time = torch.zeros(count, device=device), torch.zeros(count, device=device)
     flying = torch.arange(count, device=device)
-    primitives = worlds.primitives.select(flying)
     limit = conditions.patience * to_goal.norm(dim=1) / conditions.speed
     dt = 1.0 / agent.rate
     while len(flying):
-        distances, _ = primitives.near(vehicle.p)
-        here = distances.amin(1) - VEHICLE_RADIUS
+        distances, _ = worlds.geometry.nearest(vehicle.p, flying, 1)
+        here = distances[:, 0] - VEHICLE_RADIUS
         clearance[flying] = torch.minimum(clearance[flying], here)
         inside = (vehicle.p > worlds.lower_W[flying]) & (vehicle.p < worlds.upper_W[flying])
         collided[flying] = here < 0.0
@@ -133,14 +129,13 @@ def evaluate_agent(
         ended = (reached | collided | left | (time > limit))[flying]
         if ended.any():
             keep = (~ended).nonzero()[:, 0]
-            flying, memory, distances = flying[keep], memory[keep], distances[keep]
+            flying, memory = flying[keep], memory[keep]
             vehicle, past = (type(vehicle)(*(x[keep] for x in of)) for of in (vehicle, past))
-            primitives = worlds.primitives.select(flying)
             continue
         past = remember(past, vehicle)
-        depth = render_depth(delayed(past, latency), primitives, agent.grid, distances)
+        depth = render_depth(delayed(past, latency), worlds.geometry, agent.rays, flying)
         depth = noisy_depth(depth, noise, generator)
-        seen = Observation(depth, vehicle, vehicle.attitude(), p_WG[flying], speed[flying])
+        seen = Observation(depth, vehicle, p_WG[flying], speed[flying])
         a_cmd, heading, memory = agent.decide(seen, memory)
         before = vehicle.p
         vehicle = vehicle.step(a_cmd, dt, control, heading)

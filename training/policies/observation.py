@@ -14,7 +14,6 @@ class Observation(NamedTuple):
 
     depth: Tensor  # (N, R) [m], planar, inf beyond
     vehicle: Vehicle
-    R_WB: Tensor  # (N, 3, 3), the vehicle's attitude
     p_WG: Tensor  # (N, 3) [m]
     speed: Tensor  # (N,) [m/s], asked for
 
@@ -76,7 +75,7 @@ def heading_frame(yaw: Tensor) -> Tensor:
 def heading_observation(seen: Observation, R_WH: Tensor) -> Tensor:
     """(N, 9) target velocity, velocity and the body's z axis in the heading frame."""
     v_target = target_velocity(seen.vehicle.p, seen.p_WG, seen.speed)
-    rows = torch.stack([v_target, seen.vehicle.v, seen.R_WB[:, :, 2]], 1)
+    rows = torch.stack([v_target, seen.vehicle.v, seen.vehicle.body_z()], 1)
     return (rows @ R_WH).flatten(1)
 
 

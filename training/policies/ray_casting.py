@@ -1,137 +1,195 @@
-"""Rays of small depth cameras cast at batches of shapes, in torch.
+"""What cameras see of many worlds and how near points are to them, by native code.
 
-A pixel sees what any part of it sees, as in the least of a finer image: shapes are hit by rays that
-pass within half a pixel, at the depth where the widened shape begins plus what it was widened by.
+Nothing here is differentiable: images carry no gradient, and the gradient of a distance is the
+normal that is returned with it. Tensors may be on any device; what is asked is computed on the CPU.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
-_GRAZE, MISS = 1e-4, 1e6
-"""[m], a shorter way through a shape counts as a miss, whose depth is at least this."""
+from splatpilot import _native
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.shapes import Shape
 
-_PARALLEL = 1e-9
-"""Added to cosines that are divided by: 1 / 0 - 1 / 0 is not a number."""
+_KINDS = {kind: number for number, kind in enumerate(get_args(Shape))}
+_SHAPE_SIZE = 15
+"""Numbers that describe a shape, those of a box; others have zeros after their own."""
 
 
-class PinholeGrid(NamedTuple):
+class PixelRays(NamedTuple):
     """The rays of a small depth camera that looks along body x."""
 
-    directions_C: Tensor  # (R, 3), camera frame, z = 1, row by row
+    directions_C: np.ndarray  # (R, 3) float32, camera frame, z = 1, row by row
     half_pixel: float  # half the width of a pixel at depth 1; of oblong ones, of their mean width
 
     @classmethod
-    def of(
-        cls,
-        width: int,
-        height: int,
-        fov_x: float,
-        device: torch.device | str = "cpu",
-        cell_aspect: float = 1.0,
-    ) -> "PinholeGrid":
+    def of(cls, width: int, height: int, fov_x: float, cell_aspect: float = 1.0) -> "PixelRays":
         """The camera of `width` x `height` pixels, `cell_aspect` times as high as wide.
 
         `fov_x` is the horizontal field of view [deg].
         """
         half = math.tan(math.radians(0.5 * fov_x)) / width
-        x = half * (2 * torch.arange(width, device=device) + 1 - width)
-        y = half * cell_aspect * (2 * torch.arange(height, device=device) + 1 - height)
-        y, x = torch.meshgrid(y, x, indexing="ij")
-        directions = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
-        return cls(directions, 0.5 * half * (1.0 + cell_aspect))
+        x = half * (2 * np.arange(width) + 1 - width)
+        y = half * cell_aspect * (2 * np.arange(height) + 1 - height)
+        directions = np.ones((height, width, 3), np.float32)
+        directions[..., 0], directions[..., 1] = x, y[:, None]
+        return cls(directions.reshape(-1, 3), 0.5 * half * (1.0 + cell_aspect))
 
 
-def _footprint(away: Tensor, forward: Tensor, half_pixel: float) -> Tensor:
-    """Half the width of a pixel (N, M) [m] across the way to points `away` (N, 3, M)."""
-    planar = (away * forward[:, :, None]).sum(1).clamp(min=0.0)
-    return half_pixel * planar.square() / away.square().sum(1).sqrt().clamp(min=1e-3)
+class Geometry(Protocol):
+    """The surfaces of several worlds. Row n of each query is about world `world[n]`, (N,) int64."""
+
+    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
+        """Planar depth (N, R) [m] from cameras at p_WC (N, 3) [m], infinite where nothing is.
+
+        A pixel sees what any part of it sees, as in the least of a finer image: surfaces are hit by
+        rays that pass within half a pixel, at the depth where the widened surface begins plus what
+        it was widened by.
+        """
+        ...
+
+    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Signed distances (N, K) [m] at p_WQ (N, 3) [m] of the K <= `count` nearest obstacles,
+        nearest first, and their gradients (N, K, 3); infinite and 0 for those that there are not.
+        """
+        ...
 
 
-def cast_spheres(p: Tensor, R: Tensor, rays: Tensor, spheres: Tensor, half_pixel: float) -> Tensor:
-    """Depth (N, R) [m] along rays to spheres, at least `MISS` where none is hit.
-
-    As all casts it works on arrays (N, M, R), a ray's step from one number to the next: that is
-    fastest on CPUs.
+class ShapeGeometry:
+    """Worlds of analytic shapes, exactly those that the benchmark's worlds are made of.
 
     Args:
-        p, R: (N, 3) [m] and (N, 3, 3), the cameras.
-        rays: (N, 3, R), in W and of depth 1.
-        spheres: (N, 4, M): centre and radius [m].
-        half_pixel: half the width of a pixel at depth 1.
+      worlds: the shapes of each.
+      threads: cores that images are cast on; the images are the same for any number.
+      simd: the instructions used, of `_native.simd_levels()`, which all give the same; by default
+        the widest.
+
+    Raises:
+      ValueError: on a shape out of range, or a query about a world that there is not.
     """
-    m = p[:, :, None] - spheres[:, :3]  # (N, 3, M)
-    extra = _footprint(-m, R[:, :, 2], half_pixel)
-    c = m.square().sum(1) - (spheres[:, 3] + extra).square()  # (N, M)
-    a = rays.square().sum(1, keepdim=True)  # (N, 1, R)
-    b = torch.bmm(m.mT, rays)  # (N, M, R)
-    root = torch.addcmul(b.square(), a, c[:, :, None], value=-1.0).clamp_(min=0.0).sqrt_()
-    leave = (root - b).clamp_(min=0.0)
-    enter = root.add_(b).neg_().clamp_(min=0.0)
-    return _nearest(enter, leave, enter / a, extra)
+
+    def __init__(self, worlds: Sequence[Sequence[Shape]], threads: int = 1, simd: str = "") -> None:
+        shapes = [shape for world in worlds for shape in world]
+        rows = np.zeros((len(shapes), _SHAPE_SIZE), np.float32)
+        for row, shape in zip(rows, shapes, strict=True):
+            numbers = np.concatenate([np.ravel(number) for number in shape.parameters()])
+            row[: len(numbers)] = numbers
+        self._native = _native.ShapeWorlds(
+            shapes=rows,
+            kinds=np.array([_KINDS[type(shape)] for shape in shapes], np.uint8),
+            first=np.cumsum([0, *map(len, worlds)]),
+            threads=threads,
+            simd=simd,
+        )
+
+    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
+        return _depth(self._native, p_WC, R_WC, rays, world)
+
+    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        distances = torch.empty(len(p_WQ), count)
+        gradients = torch.empty(len(p_WQ), count, 3)
+        self._native.nearest(
+            p_WQ=_array(p_WQ),
+            world=_array(world),
+            distances=distances.numpy(),
+            gradients=gradients.numpy(),
+        )
+        return distances.to(p_WQ.device), gradients.to(p_WQ.device)
 
 
-def cast_cylinders(
-    p: Tensor, R: Tensor, rays: Tensor, cylinders: Tensor, half_pixel: float
+class Grids:
+    """Values over the voxels of several worlds, interpolated trilinearly.
+
+    Args:
+      values: (nx, ny, nz) of each, at the centres of voxels, at least two along each axis.
+      lower_W: (W, 3) [m], lower corners.
+      voxel_sizes: (W,) [m].
+      threads, simd: see `ShapeGeometry`.
+
+    Raises:
+      ValueError: on grids out of range, or a query about a world that there is not.
+    """
+
+    def __init__(
+        self,
+        values: Sequence[np.ndarray],
+        lower_W: Sequence[np.ndarray] | np.ndarray,
+        voxel_sizes: Sequence[float] | np.ndarray,
+        threads: int = 1,
+        simd: str = "",
+    ) -> None:
+        self._native = _native.GridWorlds(
+            values=np.concatenate([np.ravel(grid) for grid in values], dtype=np.float32),
+            shapes=np.array([grid.shape for grid in values], np.int64),
+            lower_W=np.array(lower_W, np.float32),
+            voxel_sizes=np.array(voxel_sizes, np.float32),
+            threads=threads,
+            simd=simd,
+        )
+
+    def interpolate(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; beyond the outermost centres
+        of voxels those at the nearest point between them."""
+        values, gradients = torch.empty(len(p_WQ)), torch.empty(len(p_WQ), 3)
+        self._native.interpolate(
+            p_WQ=_array(p_WQ),
+            world=_array(world),
+            values=values.numpy(),
+            gradients=gradients.numpy(),
+        )
+        return values.to(p_WQ.device), gradients.to(p_WQ.device)
+
+
+class EsdfGeometry(Grids):
+    """Worlds known by their distance fields, as captured ones are; each is one obstacle.
+
+    Where a field counts unknown space and its bounds as occupied, cameras see them so too.
+
+    Args:
+      fields: one for each world.
+      threads, simd: see `ShapeGeometry`.
+    """
+
+    def __init__(self, fields: Sequence[Esdf], threads: int = 1, simd: str = "") -> None:
+        super().__init__(
+            [field.distances for field in fields],
+            [field.lower_W for field in fields],
+            [field.voxel_size for field in fields],
+            threads,
+            simd,
+        )
+
+    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
+        return _depth(self._native, p_WC, R_WC, rays, world)
+
+    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        distances, gradients = self.interpolate(p_WQ, world)
+        return distances[:, None], gradients[:, None]
+
+
+def _depth(
+    worlds: _native.ShapeWorlds | _native.GridWorlds,
+    p_WC: Tensor,
+    R_WC: Tensor,
+    rays: PixelRays,
+    world: Tensor,
 ) -> Tensor:
-    """Depth (N, R) [m] to cylinders (N, 8, M): centre [m], axis, half length and radius [m]; see
-    `cast_spheres`."""
-    axis, half, radius = cylinders[:, 3:6], cylinders[:, 6], cylinders[:, 7]
-    m = p[:, :, None] - cylinders[:, :3]
-    along = (m * axis).sum(1)  # (N, M)
-    across = m - along[:, None] * axis
-    nearest = across + (along - torch.minimum(torch.maximum(along, -half), half))[:, None] * axis
-    extra = _footprint(-nearest, R[:, :, 2], half_pixel)
-    # Between the flat ends...
-    slope = torch.bmm(axis.mT, rays)  # (N, M, R)
-    a = torch.addcmul(rays.square().sum(1, keepdim=True), slope, slope, value=-1.0)
-    slope.add_(_PARALLEL).reciprocal_()
-    middle = along[:, :, None] * slope
-    width = slope.abs_().mul_((half + extra)[:, :, None])
-    # ... and inside the endless cylinder.
-    b = torch.bmm(across.mT, rays)
-    c = across.square().sum(1) - (radius + extra).square()
-    root = torch.addcmul(b.square(), a, c[:, :, None], value=-1.0).clamp_(min=0.0).sqrt_()
-    a.reciprocal_()
-    leave = torch.minimum((root - b).mul_(a), width - middle)
-    enter = torch.maximum(root.add_(b).neg_().mul_(a), width.add_(middle).neg_()).clamp_(min=0.0)
-    return _nearest(enter, leave, enter, extra)
+    depth = torch.empty(len(p_WC), len(rays.directions_C))
+    worlds.depth(
+        p_WC=_array(p_WC),
+        R_WC=_array(R_WC),
+        world=_array(world),
+        directions_C=rays.directions_C,
+        half_pixel=rays.half_pixel,
+        depth=depth.numpy(),
+    )
+    return depth.to(p_WC.device)
 
 
-def cast_boxes(p: Tensor, R: Tensor, rays: Tensor, boxes: Tensor, half_pixel: float) -> Tensor:
-    """Depth (N, R) [m] to boxes (N, 15, M): centre [m], rotation (world by own axes) row by row and
-    half sizes [m]; see `cast_spheres`."""
-    N, _, M = boxes.shape
-    rotation = boxes[:, 3:12].reshape(N, 3, 3, M)
-    m = p[:, :, None] - boxes[:, :3]
-    local = (m[:, :, None] * rotation).sum(1)  # (N, 3, M)
-    beyond = local - torch.minimum(torch.maximum(local, -boxes[:, 12:15]), boxes[:, 12:15])
-    nearest = (rotation * beyond[:, None]).sum(2)
-    extra = _footprint(-nearest, R[:, :, 2], half_pixel)
-    enter = torch.zeros(N, M, rays.shape[2], device=p.device)
-    leave = torch.full_like(enter, torch.inf)
-    for axis in range(3):
-        slope = torch.bmm(rotation[:, :, axis].mT, rays).add_(_PARALLEL).reciprocal_()
-        middle = local[:, axis, :, None] * slope
-        width = slope.abs_().mul_((boxes[:, 12 + axis] + extra)[:, :, None])
-        torch.minimum(leave, width - middle, out=leave)
-        torch.maximum(enter, width.add_(middle).neg_(), out=enter)
-    return _nearest(enter, leave, enter, extra)
-
-
-def cast_planes(p: Tensor, R: Tensor, rays: Tensor, planes: Tensor, half_pixel: float) -> Tensor:
-    """Depth (N, R) [m] to half spaces (N, 4, M): outward normal and offset [m]; infinite where
-    none is hit; see `cast_spheres`."""
-    normal = planes[:, :3]
-    height = (p[:, :, None] * normal).sum(1) - planes[:, 3]  # (N, M)
-    tilt = torch.bmm(normal.mT, R[:, :, :2]).abs().sum(2)  # a pixel's corner looks further down
-    fall = half_pixel * tilt[:, :, None] - torch.bmm(normal.mT, rays)
-    return torch.where(fall > 1e-6, height.clamp(min=0.0)[:, :, None] / fall, torch.inf).amin(1)
-
-
-def _nearest(enter: Tensor, leave: Tensor, depth: Tensor, extra: Tensor) -> Tensor:
-    """The least depth (N, R), of rays that enter a shape before they leave it; large otherwise."""
-    missed = (enter - leave).add_(_GRAZE).clamp_(min=0.0)
-    return missed.mul_(MISS / _GRAZE).add_(depth).add_(extra[:, :, None]).amin(1)
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().contiguous().numpy()

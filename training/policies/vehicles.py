@@ -30,9 +30,16 @@ class PointMass(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3): z along the thrust that this acceleration takes, x where yaw points."""
+        return attitude_from_thrust(self._thrust(), self.yaw)
+
+    def body_z(self) -> Tensor:
+        """The z axes (N, 3) of the body in W."""
+        return torch.nn.functional.normalize(self._thrust(), dim=1)
+
+    def _thrust(self) -> Tensor:
         params = QuadrotorParams()
-        thrust = self.a + params.drag * self.v
-        return attitude_from_thrust(thrust + _up(thrust, params.gravity), self.yaw)
+        thrust = torch.add(self.a, self.v, alpha=params.drag)
+        return thrust + _up(thrust, params.gravity)
 
     def step(
         self,
@@ -48,16 +55,14 @@ class PointMass(NamedTuple):
         """
         decay = torch.exp(-dt / self.lag)
         behind = self.a - a_cmd
-        v = self.v + dt * a_cmd + self.lag * (1.0 - decay) * behind
-        p = (
-            self.p
-            + dt * self.v
-            + 0.5 * dt**2 * a_cmd
-            + self.lag * (dt - self.lag * (1.0 - decay)) * behind
-        )
+        # Sums with a factor are one operation: for so few vehicles their number is what costs.
+        coasting = self.lag * (1.0 - decay)  # (N, 1) [s]
+        v = torch.addcmul(torch.add(self.v, a_cmd, alpha=dt), coasting, behind)
+        p = torch.add(torch.add(self.p, self.v, alpha=dt), a_cmd, alpha=0.5 * dt**2)
+        p = torch.addcmul(p, self.lag * (dt - coasting), behind)
         with torch.no_grad():
             yaw = self.yaw + dt * yaw_rate(self.yaw, v, control, heading)
-        return PointMass(p, v, a_cmd + decay * behind, yaw, self.lag)
+        return PointMass(p, v, torch.addcmul(a_cmd, decay, behind), yaw, self.lag)
 
     def decay_gradient(self, factor: float) -> "PointMass":
         """The same state, its gradient multiplied by `factor` on the way back."""
@@ -101,6 +106,10 @@ class BodyRate(NamedTuple):
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3)."""
         return rotation_matrix(QuadrotorState.of(self.state).q_WB)
+
+    def body_z(self) -> Tensor:
+        """The z axes (N, 3) of the body in W."""
+        return self.attitude()[:, :, 2]
 
     def step(
         self,
@@ -219,4 +228,4 @@ def _up(like: Tensor, size: float) -> Tensor:
 
 
 def _decay_gradient(x: Tensor, factor: float) -> Tensor:
-    return x.detach() + factor * (x - x.detach())
+    return torch.lerp(x.detach(), x, factor)

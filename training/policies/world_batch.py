@@ -12,11 +12,10 @@ from torch import Tensor
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Shape
-from splatpilot.systems.collision.trilinear import trilinear_with_gradient
+from splatpilot.systems.collision.shapes import HalfSpace, Shape
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.primitives import Primitives
+from splatpilot.training.policies.ray_casting import Grids, ShapeGeometry
 
 STARTS = 256
 """Places that flights of training start from, in each world."""
@@ -61,34 +60,30 @@ class WorldBatch:
         self.p_WS, self.p_WG = (
             tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
-        self.primitives = Primitives(
-            [world.shapes for world in worlds],
-            np.array([world.lower_W for world in worlds]),
-            np.array([world.upper_W for world in worlds]),
-            device,
-        )
-        self._voxel_size = voxel_size
+        self._shapes = [world.shapes for world in worlds]
+        self.geometry = ShapeGeometry(self._shapes)
         self._times = None
         if voxel_size is not None:
             grids = [_march(world, voxel_size, seed) for seed, world in enumerate(worlds)]
             self.maps = [(grid.esdf, grid.toa) for grid in grids]
-            shapes = np.array([grid.toa.times.shape for grid in grids])
-            sizes = shapes.prod(1)
-            self._distances = tensor(
-                np.concatenate([grid.esdf.distances.ravel() for grid in grids])
-            )
-            self._times = tensor(np.concatenate([grid.toa.times.ravel() for grid in grids]))
-            self._first = torch.tensor(np.cumsum(sizes) - sizes, device=device)  # (W,)
-            self._shape = torch.tensor(shapes, device=device)  # (W, 3)
+
+            def on_grids(values: list[np.ndarray]) -> Grids:
+                lower_W = [world.lower_W for world in worlds]
+                return Grids(values, lower_W, [voxel_size] * len(worlds))
+
+            self._distances = on_grids([grid.esdf.distances for grid in grids])
+            self._times = on_grids([grid.toa.times for grid in grids])
             self.starts_W = tensor([grid.starts_W for grid in grids])  # (W, STARTS, 3) [m]
 
     def __len__(self) -> int:
         return len(self.p_WG)
 
     def without_obstacles(self) -> "WorldBatch":
-        """The same volumes, starts and goals without shapes, and straight ways."""
+        """The same volumes, starts and goals with nothing but ground, and straight ways."""
         empty = copy(self)
-        empty.primitives = self.primitives.without_obstacles()
+        empty.geometry = ShapeGeometry(
+            [[s for s in shapes if isinstance(s, HalfSpace)] for shapes in self._shapes]
+        )
         empty._times = None
         return empty
 
@@ -101,34 +96,15 @@ class WorldBatch:
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
             return torch.nn.functional.normalize(to_goal, dim=1)
-        _, *slopes = self._interpolate(self._times, p_WQ, world)
+        _, uphill = self._times.interpolate(p_WQ, world)
         near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
-        downhill = torch.where(near, to_goal, -torch.stack(slopes, 1))
+        downhill = torch.where(near, to_goal, -uphill)
         return torch.nn.functional.normalize(downhill, dim=1)
 
     def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Signed distance (N,) [m] at p_WQ (N, 3) [m] in `world` (N,), from the grid: the bounds of
         the volume count as surfaces, and it costs the same however many shapes there are."""
-        return self._interpolate(self._distances, p_WQ, world)[0]
-
-    def _interpolate(self, grid: Tensor, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, ...]:
-        """Value and slopes (N,) each of a grid, by voxels, at p_WQ (N, 3)."""
-        assert self._voxel_size is not None
-        shape = self._shape[world]
-        x = (p_WQ - self.lower_W[world]) / self._voxel_size - 0.5
-        x = torch.minimum(x.clamp(min=0.0), shape - 1.001)
-        cell = x.long()
-        stride_y = shape[:, 2]
-        stride_x = shape[:, 1] * stride_y
-        base = self._first[world] + cell[:, 0] * stride_x + cell[:, 1] * stride_y + cell[:, 2]
-        step = torch.arange(2, device=p_WQ.device)
-        corners = (
-            base
-            + step[:, None, None, None] * stride_x
-            + step[:, None, None] * stride_y
-            + step[:, None]
-        )
-        return trilinear_with_gradient(grid[corners], *(x - cell).unbind(1))
+        return self._distances.interpolate(p_WQ, world)[0]
 
 
 class _Arrival(NamedTuple):

@@ -18,7 +18,7 @@ from splatpilot.training.policies.evaluation import (
     evaluate_agent,
     render_depth,
 )
-from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
 from splatpilot.training.policies.vehicles import BodyRate
 
@@ -67,7 +67,7 @@ class Watcher:
     """Accelerates ahead and notes what it observes."""
 
     rate = 1.0 / PERIOD
-    grid = PinholeGrid.of(16, 9, 90.0)
+    rays = PixelRays.of(16, 9, 90.0)
 
     def __init__(self) -> None:
         self.seen = []
@@ -77,10 +77,10 @@ class Watcher:
 
     def decide(self, seen, memory):
         self.seen.append(seen)
-        return 2.0 * seen.R_WB[:, :, 0], None, memory
+        return 2.0 * seen.vehicle.attitude()[:, :, 0], None, memory
 
-    def losses(self, transition):
-        return {"none": transition.a.sum()}
+    def losses(self, transitions):
+        return {"none": transitions.a.sum()}
 
 
 def test_rollouts_see_late_images_and_know_their_state():
@@ -93,17 +93,15 @@ def test_rollouts_see_late_images_and_know_their_state():
     rollout.losses()
     rollout.episodes = rollout.episodes._replace(age=torch.tensor([99.0, 0, 0, 0, 0, 0]))
     rollout.losses()
-    primitives = worlds.primitives.select(rollout.episodes.world)
+    geometry, world = worlds.geometry, rollout.episodes.world
     seen = [step.vehicle.detach() for step in watcher.seen]
     went_on = (seen[3].p - seen[2].p).norm(dim=1) < 1.0
     assert not went_on[0] and went_on.sum() >= 3
     for now, then in enumerate([0, 0, 0, 1, 2, 3]):
         rows = went_on if now > 2 else slice(None)
-        distances, _ = primitives.near(seen[now].p)
-        expected = render_depth(seen[then], primitives, watcher.grid, distances)
+        expected = render_depth(seen[then], geometry, watcher.rays, world)
         torch.testing.assert_close(watcher.seen[now].depth[rows], expected[rows], rtol=0, atol=0)
-        torch.testing.assert_close(watcher.seen[now].R_WB, seen[now].attitude())
-    fresh = render_depth(seen[3], primitives, watcher.grid, primitives.near(seen[3].p)[0])
+    fresh = render_depth(seen[3], geometry, watcher.rays, world)
     for now in (3, 4, 5):
         torch.testing.assert_close(watcher.seen[now].depth[0], fresh[0], rtol=0, atol=0)
 
@@ -113,10 +111,10 @@ def test_measured_flights_see_late_images():
     worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
     evaluate_agent(watcher, worlds, FlightConditions(patience=0.05), TWO_STEPS)
     assert len(watcher.seen) > 4
-    primitives = worlds.primitives
+    world = torch.arange(len(worlds))
     for now, then in enumerate([0, 0, 0, 1, 2]):
-        of, distances = watcher.seen[then].vehicle, primitives.near(watcher.seen[now].vehicle.p)[0]
-        expected = render_depth(of, primitives, watcher.grid, distances)
+        of = watcher.seen[then].vehicle
+        expected = render_depth(of, worlds.geometry, watcher.rays, world)
         torch.testing.assert_close(watcher.seen[now].depth, expected, rtol=0, atol=0)
 
 
@@ -129,11 +127,10 @@ def test_imitation_learns_from_late_images():
     trainer = AgileAutonomyTrainer(config)
     trainer.begin_update(0)
     data = trainer.state_dict()["data"]
-    primitives = training_worlds(config.worlds, 0).primitives.select(torch.zeros(6).long())
+    geometry = training_worlds(config.worlds, 0).geometry
     x, y, z = data["R_WB"].unbind(2)
     p_WC, R_WC = data["p_WB"] + CAMERA_AHEAD * x, torch.stack([-y, -z, x], 2)
-    distances, _ = primitives.near(data["p_WB"])
     spec = trainer.spec
-    grid = PinholeGrid.of(spec.image_width, spec.image_height, FOV_X)
-    depth = primitives.depth(p_WC, R_WC, grid, distances)[[0, 0, 0, 1, 2, 3]]
+    rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
+    depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(6).long())[[0, 0, 0, 1, 2, 3]]
     torch.testing.assert_close(data["depth"], depth.half(), rtol=2e-3, atol=0)

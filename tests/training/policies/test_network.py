@@ -39,7 +39,6 @@ def observed(depth: np.ndarray, body: BodyRate) -> Observation:
     return Observation(
         torch.tensor(depth).reshape(1, -1),
         body,
-        body.attitude(),
         torch.tensor(P_WG, dtype=torch.float32)[None],
         torch.tensor([2.0]),
     )

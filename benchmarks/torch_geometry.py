@@ -1,8 +1,7 @@
-"""Worlds of analytic shapes in batches: what cameras see of them and how near they are, in torch.
+"""The `Geometry` of analytic shapes in torch: what native casting is timed by.
 
-The shapes are those of `splatpilot.systems.collision.shapes`, so that training sees and hits
-exactly what the benchmark's worlds are made of. Nothing here is differentiable: images
-carry no gradient, and the gradient of a distance is the normal that is returned with it.
+All shapes of all worlds lie in arrays of equal lengths, of which those of the vehicles' worlds are
+gathered; of each kind the nearest before the camera are cast at.
 """
 
 from collections.abc import Sequence
@@ -10,16 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch_casts import MISS, cast_boxes, cast_cylinders, cast_planes, cast_spheres
 
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
-from splatpilot.training.policies.ray_casting import (
-    MISS,
-    PinholeGrid,
-    cast_boxes,
-    cast_cylinders,
-    cast_planes,
-    cast_spheres,
-)
+from splatpilot.training.policies.ray_casting import PixelRays
 
 _FAR = 1e4
 """[m], where the shapes lie that fill a batch up to equal numbers."""
@@ -27,117 +20,83 @@ _FAR = 1e4
 _HELD = 0.5
 """[m], ends of capsules further than this from the volume are left out: they end out of sight."""
 
+_LOOKED_AT = 24
+"""Shapes of each kind that a camera looks at, the nearest ones."""
 
-class Primitives:
-    """The shapes of W worlds.
+
+class TorchGeometry:
+    """See `splatpilot.training.policies.ray_casting.Geometry`.
 
     Args:
       worlds: the shapes of each, of any kinds.
       lower_W, upper_W: (W, 3) [m], the volumes flown in.
-      device: where the tensors live.
     """
 
     def __init__(
-        self,
-        worlds: Sequence[Sequence[Shape]],
-        lower_W: np.ndarray,
-        upper_W: np.ndarray,
-        device: torch.device | str = "cpu",
+        self, worlds: Sequence[Sequence[Shape]], lower_W: np.ndarray, upper_W: np.ndarray
     ) -> None:
-        spheres, cylinders, boxes, planes = [], [], [], []
+        kinds: list[list[np.ndarray]] = [[], [], [], []]
         for shapes, lower, upper in zip(worlds, lower_W, upper_W, strict=True):
             rows = _rows(shapes, lower - _HELD, upper + _HELD)
-            for stack, kind in zip((spheres, cylinders, boxes, planes), rows, strict=True):
+            for stack, kind in zip(kinds, rows, strict=True):
                 stack.append(kind)
         tiny, upright = 1e-3, (1, 0, 0, 0, 1, 0, 0, 0, 1)
-        # (W, 4, M): centre, radius
-        self.spheres = _pad(spheres, (_FAR, 0, 0, tiny), device)
-        # (W, 8, M): centre, axis, half length, radius
-        self.cylinders = _pad(cylinders, (_FAR, 0, 0, 0, 0, 1, tiny, tiny), device)
-        # (W, 15, M): centre, rotation row by row, half sizes
-        self.boxes = _pad(boxes, (_FAR, 0, 0, *upright, tiny, tiny, tiny), device)
-        # (W, 4, M): normal, offset; never empty, so that there always is a nearest shape
-        self.planes = _pad(planes, (0, 0, 1, -_FAR), device, least=1)
-        # (W, 4): whether a world has any of a kind
-        self._has = torch.tensor(
-            [
-                [len(rows) > 0 for rows in world]
-                for world in zip(spheres, cylinders, boxes, planes, strict=True)
-            ],
-            device=device,
-        )
-
-    def tensors(self) -> list[Tensor]:
-        """All there is, kind by kind."""
-        return [self.spheres, self.cylinders, self.boxes, self.planes]
-
-    def select(self, world: Tensor) -> "Primitives":
-        """The shapes of the worlds numbered `world` (N,)."""
-        chosen = object.__new__(Primitives)
-        chosen.spheres, chosen.cylinders, chosen.boxes, chosen.planes = (
-            kind.index_select(0, world) for kind in self.tensors()
-        )
-        chosen._has = self._has[world]
-        return chosen
-
-    def without_obstacles(self) -> "Primitives":
-        """As many worlds with nothing but their planes, the ground."""
-        empty = object.__new__(Primitives)
-        empty.spheres, empty.cylinders, empty.boxes = (
-            kind[:, :, :0] for kind in self.tensors()[:3]
-        )
-        empty.planes = self.planes
-        empty._has = self._has & torch.tensor([False, False, False, True], device=self._has.device)
-        return empty
-
-    @torch.no_grad()
-    def near(self, p_WQ: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N, M) [m] to every shape and its gradient (N, 3, M) at p_WQ (N, 3).
-
-        M counts the shapes of all kinds in the order spheres, cylinders, boxes, planes. Row n is
-        about world n.
-        """
-        parts = [
-            _sphere_distances(p_WQ, self.spheres),
-            _cylinder_distances(p_WQ, self.cylinders),
-            _box_distances(p_WQ, self.boxes),
-            _plane_distances(p_WQ, self.planes),
+        spheres, cylinders, boxes, planes = kinds
+        self._all = [
+            _pad(spheres, (_FAR, 0, 0, tiny)),  # centre, radius
+            _pad(cylinders, (_FAR, 0, 0, 0, 0, 1, tiny, tiny)),  # centre, axis, half length, radius
+            # centre, rotation row by row, half sizes
+            _pad(boxes, (_FAR, 0, 0, *upright, tiny, tiny, tiny)),
+            # normal, offset; never empty, so that there always is a nearest shape
+            _pad(planes, (0, 0, 1, -_FAR), least=1),
         ]
-        return torch.cat([d for d, _ in parts], 1), torch.cat([n for _, n in parts], 2)
+        self._has = torch.tensor([[len(rows) > 0 for rows in w] for w in zip(*kinds, strict=True)])
+        self._world: Tensor | None = None
 
     @torch.no_grad()
-    def depth(
-        self,
-        p_WC: Tensor,
-        R_WC: Tensor,
-        grid: PinholeGrid,
-        distances: Tensor,
-        nearest: int = 24,
-    ) -> Tensor:
-        """Planar depth (N, R) [m], infinite where nothing is: the nearest surface in each pixel.
+    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        self._select(world)
+        self._distances, normals = self._near(p_WQ)
+        nearest = self._distances.topk(min(count, normals.shape[2]), dim=1, largest=False)
+        chosen = nearest.indices[:, None].expand(-1, 3, -1)
+        return nearest.values, normals.gather(2, chosen).mT
 
-        A pixel sees what any part of it sees; see `ray_casting`.
-
-        Args:
-          p_WC, R_WC: (N, 3), (N, 3, 3), the cameras; row n is in world n.
-          grid: the rays.
-          distances: (N, M) [m] from about the cameras, as `near` returns them.
-          nearest: of each kind, that many shapes are looked at: the nearest before the camera.
-        """
-        rays = R_WC @ grid.directions_C.mT  # (N, 3, R)
-        depth = torch.full(rays[:, 0].shape, torch.inf, device=rays.device)
+    @torch.no_grad()
+    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
+        self._select(world)
+        if self._distances is None:
+            self._distances, _ = self._near(p_WC)
+        directions = R_WC @ torch.from_numpy(rays.directions_C).mT  # (N, 3, R)
+        depth = torch.full(directions[:, 0].shape, torch.inf)
         begin = 0
         casts = cast_spheres, cast_cylinders, cast_boxes, cast_planes
-        for cast, kind, has in zip(casts, self.tensors(), self._has.unbind(1), strict=True):
-            near = distances[:, begin : begin + kind.shape[2]]
+        for cast, kind, has in zip(casts, self._chosen, self._chosen_has.unbind(1), strict=True):
+            near = self._distances[:, begin : begin + kind.shape[2]]
             begin += kind.shape[2]
             rows = has.nonzero()[:, 0]  # few kinds of worlds have all kinds of shapes
             if len(rows):
                 p, R = p_WC[rows], R_WC[rows]
-                kind = _in_front(kind[rows], near[rows], p, R[:, :, 2], nearest)
-                seen = cast(p, R, rays[rows], kind, grid.half_pixel)
+                kind = _in_front(kind[rows], near[rows], p, R[:, :, 2], _LOOKED_AT)
+                seen = cast(p, R, directions[rows], kind, rays.half_pixel)
                 depth[rows] = torch.minimum(depth[rows], seen)
         return torch.where(depth < MISS, depth, torch.inf)
+
+    def _select(self, world: Tensor) -> None:
+        """The shapes of these worlds from now on; distances of the last ones count no more."""
+        if world is not self._world:
+            self._world, self._distances = world, None
+            self._chosen = [kind.index_select(0, world) for kind in self._all]
+            self._chosen_has = self._has[world]
+
+    def _near(self, p_WQ: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances (N, M) [m] to all shapes and their gradients (N, 3, M)."""
+        parts = [
+            _sphere_distances(p_WQ, self._chosen[0]),
+            _cylinder_distances(p_WQ, self._chosen[1]),
+            _box_distances(p_WQ, self._chosen[2]),
+            _plane_distances(p_WQ, self._chosen[3]),
+        ]
+        return torch.cat([d for d, _ in parts], 1), torch.cat([n for _, n in parts], 2)
 
 
 def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
@@ -169,15 +128,13 @@ def _rows(shapes: Sequence[Shape], lower: np.ndarray, upper: np.ndarray) -> list
     ]
 
 
-def _pad(
-    worlds: list[np.ndarray], filler: Sequence[float], device: torch.device | str, least: int = 0
-) -> Tensor:
+def _pad(worlds: list[np.ndarray], filler: Sequence[float], least: int = 0) -> Tensor:
     """(W, size, M), short worlds filled up; M is the size of the fullest, or `least`."""
     most = max(least, *(len(rows) for rows in worlds))
     stacked = np.tile(np.array(filler, np.float32), (len(worlds), most, 1))
     for target, rows in zip(stacked, worlds, strict=True):
         target[: len(rows)] = rows
-    return torch.tensor(stacked, device=device).mT.contiguous()
+    return torch.tensor(stacked).mT.contiguous()
 
 
 def _sphere_distances(p: Tensor, spheres: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,340 @@
+"""Native casting against the exact shapes: marched rays, and distances one shape at a time."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from splatpilot import _native
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+from splatpilot.systems.policies.observation import pool_depth
+from splatpilot.training.policies.ray_casting import EsdfGeometry, Grids, PixelRays, ShapeGeometry
+
+LOWER, UPPER = np.array([0.0, -8.0, 0.0]), np.array([20.0, 8.0, 6.0])
+R_BC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+RAYS = PixelRays.of(24, 14, 90.0)
+THIN = RAYS._replace(half_pixel=0.0)
+
+
+def some_world(seed: int, count: int = 8) -> list[Shape]:
+    rng = np.random.default_rng(seed)
+    shapes: list[Shape] = [HalfSpace([0, 0, 1], 0.0), HalfSpace([0, 0, -1], -6.0)]
+    for _ in range(count):
+        a, b, c, d = rng.uniform(LOWER, UPPER, (4, 3))
+        way = rng.normal(size=3)
+        shapes += [
+            Sphere(a, rng.uniform(0.1, 1.0)),
+            Box(RigidTransform(RollPitchYaw(rng.uniform(-3, 3, 3)), b), rng.uniform(0.2, 1.0, 3)),
+            Cylinder(c, c + way, rng.uniform(0.1, 0.4)),
+            Capsule(d, d + way, rng.uniform(0.1, 0.4)),
+        ]
+    return shapes
+
+
+def floats(values: np.ndarray | list) -> torch.Tensor:
+    return torch.tensor(np.array(values), dtype=torch.float32)
+
+
+def cameras(seed: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    p = rng.uniform([1, -5, 1], [6, 5, 5], (count, 3))
+    angles = rng.uniform(-0.3, 0.3, (count, 3))
+    R = [RollPitchYaw(rpy).ToRotationMatrix().matrix() @ R_BC for rpy in angles]
+    return floats(p), floats(R)
+
+
+def numbers(count: int) -> torch.Tensor:
+    return torch.arange(count)
+
+
+def one_image(
+    geometry: ShapeGeometry | EsdfGeometry, rays: PixelRays, p_WC: list[float]
+) -> np.ndarray:
+    """The depth (R,) that a level camera looking along x sees in the only world."""
+    return geometry.depth(floats([p_WC]), floats([R_BC]), rays, numbers(1))[0].numpy()
+
+
+@pytest.fixture(scope="module")
+def worlds() -> tuple[list[list[Shape]], ShapeGeometry]:
+    shapes = [some_world(seed) for seed in range(3)]
+    shapes.append([HalfSpace([0, 0, 1], 0.0), Sphere([10, 0, 3], 1.0)])  # few kinds
+    return shapes, ShapeGeometry(shapes)
+
+
+def marched(distance, p_WC: np.ndarray, rays_W: np.ndarray) -> np.ndarray:
+    """Depth (R,) along rays (R, 3) by marching on exact distances; 50 m where nothing is."""
+    depth = np.zeros(len(rays_W))
+    for _ in range(200):
+        step = distance(p_WC + depth[:, None] * rays_W) / np.linalg.norm(rays_W, axis=1)
+        depth = np.minimum(depth + step, 50.0)
+    return depth
+
+
+def wide_depth(shape: Shape, p_WC: np.ndarray, R_WC: np.ndarray, rays: PixelRays) -> np.ndarray:
+    """Depth (R,) of one shape as pixels of some width see it: marched, of the widened shape."""
+    rays_W = rays.directions_C.astype(float) @ R_WC.T
+    if isinstance(shape, HalfSpace):  # the lowest corner of each pixel
+        corners = [[x, y, 0.0] for x, y in product([-1, 1], repeat=2)]
+        normal, offset = shape.parameters()
+        fall = -(rays_W[:, None] + rays.half_pixel * np.array(corners) @ R_WC.T) @ normal
+        fall = fall.max(axis=1)
+        return np.where(fall > 1e-6, (normal @ p_WC - offset) / np.maximum(fall, 1e-6), np.inf)
+
+    def seen_from(p_WA: np.ndarray, wider) -> np.ndarray:
+        """Of a shape about p_WA (3,), `wider` by half a pixel there."""
+        away = p_WA - p_WC
+        half = rays.half_pixel * max(away @ R_WC[:, 2], 0.0) ** 2 / np.linalg.norm(away)
+        parameters = wider(half).parameters()
+        depth = marched(lambda p: type(wider(half)).distances(p, *parameters), p_WC, rays_W)
+        return np.where(depth < 50.0, depth + half, np.inf)
+
+    if isinstance(shape, Sphere):
+        center = np.asarray(shape.p_WO)
+        return seen_from(center, lambda e: replace(shape, radius=shape.radius + e))
+    if isinstance(shape, Box):
+        X_OW = shape.X_WO.inverse()
+        inner = np.clip(X_OW @ p_WC, -np.asarray(shape.size) / 2, np.asarray(shape.size) / 2)
+        return seen_from(shape.X_WO @ inner, lambda e: replace(shape, size=shape.size + 2 * e))
+    p_WA, p_WB = np.asarray(shape.p_WA), np.asarray(shape.p_WB)
+    if isinstance(shape, Capsule):
+        parts = [Cylinder(p_WA, p_WB, shape.radius), Sphere(p_WA, shape.radius),
+                 Sphere(p_WB, shape.radius)]  # fmt: skip
+        return np.min([wide_depth(part, p_WC, R_WC, rays) for part in parts], axis=0)
+    length = np.linalg.norm(p_WB - p_WA)
+    axis = (p_WB - p_WA) / length
+    on_axis = p_WA + np.clip((p_WC - p_WA) @ axis, 0.0, length) * axis
+    return seen_from(
+        on_axis, lambda e: Cylinder(p_WA - e * axis, p_WB + e * axis, shape.radius + e)
+    )
+
+
+def test_depth_is_where_marched_rays_end(worlds):
+    """With pixels of no width, depth is what marching along the rays finds."""
+    shapes, geometry = worlds
+    p, R = cameras(1, 4)
+    depth = geometry.depth(p, R, THIN, numbers(4)).numpy()
+    for w in range(4):
+        field = AnalyticDistanceField(shapes[w], LOWER - 60, UPPER + 60)
+        expected = marched(field.distance, p[w].numpy(), THIN.directions_C @ R[w].numpy().T)
+        seen = expected < 40.0
+        assert seen.mean() > 0.4
+        # Rays that graze an edge end on either side of it.
+        assert np.quantile(np.abs(depth[w] - expected)[seen], 0.97) < 1e-3
+        assert (depth[w][expected >= 50.0] > 49.0).all()
+
+
+@pytest.mark.parametrize("kind", [Sphere, Box, Cylinder, Capsule, HalfSpace])
+def test_wide_pixels_see_shapes_widened_by_half_of_them(kind):
+    """Depth is that of the shape grown by half a pixel at its place, plus that half."""
+    p, R = cameras(2, 6)
+    compared = 0
+    for shape in some_world(7):
+        if not isinstance(shape, kind):
+            continue
+        depth = ShapeGeometry([[shape]]).depth(p, R, RAYS, numbers(6) * 0).numpy()
+        for n in range(6):
+            expected = wide_depth(shape, p[n].double().numpy(), R[n].double().numpy(), RAYS)
+            both = np.isfinite(expected) & np.isfinite(depth[n])
+            assert (np.isfinite(expected) != np.isfinite(depth[n])).mean() < 0.01  # grazed
+            np.testing.assert_allclose(depth[n][both], expected[both], rtol=2e-3, atol=2e-3)
+            compared += both.sum()
+    assert compared > 30
+
+
+def test_wide_pixels_see_what_the_pooled_image_of_a_finer_camera_sees():
+    """A coarse image is the least of a finer one, to a few percent where a trunk is."""
+    trunk = [Capsule([6.0, 0.4, -1.0], [6.0, 0.4, 9.0], 0.15), HalfSpace([0, 0, 1], 0.0)]
+    geometry, p_WC = ShapeGeometry([trunk]), [0.0, 0.0, 2.0]
+    coarse = one_image(geometry, PixelRays.of(16, 9, 90.0), p_WC).reshape(9, 16)
+    fine = one_image(geometry, PixelRays.of(160, 90, 90.0)._replace(half_pixel=0.0), p_WC)
+    pooled = pool_depth(fine.reshape(90, 160), 9, 16)
+    near = pooled < 7.0
+    assert near[:, 6:9].sum() >= 9  # the trunk is thinner than a pixel and seen in every row
+    np.testing.assert_array_equal(np.isfinite(coarse), np.isfinite(pooled))
+    np.testing.assert_allclose(coarse[near], pooled[near], rtol=0.05)
+
+
+def test_nothing_is_left_out_among_many_shapes():
+    """The image of a crowded world is, bit for bit, the least of the images of its shapes."""
+    shapes = some_world(3, 60)
+    p, R = cameras(3, 8)
+    world = ShapeGeometry([shapes]).depth(p, R, RAYS, numbers(8) * 0)
+    alone = ShapeGeometry([[shape] for shape in shapes])
+    for n in range(8):
+        P, D = p[n].expand(len(shapes), 3), R[n].expand(len(shapes), 3, 3)
+        images = alone.depth(P, D, RAYS, numbers(len(shapes)))
+        assert torch.equal(world[n], images.amin(0))
+
+
+def test_level_camera_beside_an_upright_trunk_gives_numbers():
+    """Rays exactly across a cylinder's axis, along it, or along a box's face give no NaN."""
+    shapes = [
+        Cylinder([5, 0, 0], [5, 0, 6], 0.3),
+        Box(RigidTransform([8.0, 2.0, 3.0]), [1.0, 1.0, 2.0]),
+    ]
+    rays = PixelRays.of(17, 9, 90.0)
+    middle = one_image(ShapeGeometry([shapes]), rays, [0.0, 0.0, 3.0]).reshape(9, 17)[4]
+    assert middle[8] == pytest.approx(4.7, abs=1e-5)  # straight ahead, the trunk
+    assert middle[6] == pytest.approx(7.5, abs=1e-5)  # y = 4 / 17 z, the box's face
+    assert np.nanmin(middle) == middle.min() == pytest.approx(4.7, abs=1e-5)
+    log = ShapeGeometry([[Capsule([5, 0, 3], [7, 0, 3], 0.3)]])
+    assert one_image(log, rays, [0.0, 0.0, 3.0]).reshape(9, 17)[4, 8] == pytest.approx(4.7, abs=0.2)
+
+
+def test_distances_and_normals(worlds):
+    """The nearest shape's distance and normal are those of the exact field, inside shapes too."""
+    shapes, geometry = worlds
+    inside = 0
+    for w in range(4):
+        p_WQ = np.random.default_rng(100 + w).uniform(LOWER, UPPER, (900, 3))
+        distances, normals = geometry.nearest(floats(p_WQ), numbers(900) * 0 + w, 1)
+        exact = AnalyticDistanceField(shapes[w], LOWER, UPPER).query(p_WQ)
+        np.testing.assert_allclose(distances[:, 0], exact.distance, atol=1e-5)
+        np.testing.assert_allclose(normals[:, 0], exact.gradient, atol=1e-3)
+        inside += (exact.distance < 0.0).sum()
+    assert inside > 20
+
+
+def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
+    """Four shapes of a crowded world, nearest first, as exact distances one by one have it."""
+    shapes = some_world(4, 60)
+    p_WQ = np.random.default_rng(40).uniform(LOWER, UPPER, (50, 3))
+    distances, normals = ShapeGeometry([shapes]).nearest(floats(p_WQ), numbers(50) * 0, 4)
+    exact = np.array([type(s).distances(p_WQ, *s.parameters()) for s in shapes]).T  # (50, M)
+    order = np.argsort(exact, axis=1)[:, :4]
+    np.testing.assert_allclose(distances, np.take_along_axis(exact, order, 1), atol=1e-5)
+    for n, row in enumerate(order):
+        for k, shape in enumerate(shapes[i] for i in row):
+            gradient = type(shape).gradients(p_WQ[n], *shape.parameters())
+            np.testing.assert_allclose(normals[n, k], gradient, atol=1e-3)
+
+
+def test_fewer_shapes_than_asked_for_are_infinitely_far():
+    """Where there is nothing more, distances are infinite and normals zero."""
+    distances, normals = ShapeGeometry([[Sphere([3, 0, 0], 1.0)]]).nearest(
+        floats([[0, 0, 0]]), numbers(1), 3
+    )
+    assert distances.tolist() == [[2.0, torch.inf, torch.inf]]
+    assert normals.tolist() == [[[-1.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3]]
+
+
+def test_normals_are_unit_vectors_where_distances_have_a_ridge():
+    """At centres and on axes, where many ways out are equally long, one of them is the normal."""
+    ball, log, post = Sphere([1, 1, 1], 0.5), Capsule([0] * 3, [2, 0, 0], 0.5), [0.0, 0.0, 3.0]
+    geometry = ShapeGeometry([[ball], [log], [Cylinder([0, 0, 0], [0, 0, 6], 0.5)]])
+    _, normals = geometry.nearest(floats([[1, 1, 1], [1, 0, 0], post]), numbers(3), 1)
+    np.testing.assert_allclose(normals.norm(dim=2), 1.0, atol=1e-6)
+    assert normals[1, 0, 0] == 0.0
+    assert normals[2, 0, 2] == 0.0
+
+
+def field_of(shapes: list[Shape]) -> Esdf:
+    return esdf_from_distance_field(AnalyticDistanceField(shapes, LOWER, UPPER), 0.1)
+
+
+def test_distance_fields_show_what_their_shapes_do():
+    """A field's image is that of the shapes that it was made of, to a voxel and half a pixel."""
+    shapes = [
+        HalfSpace([0, 0, 1], 0.0),
+        Sphere([6, 1, 3], 0.8),
+        Capsule([9, -2, 0], [9, -2, 6], 0.3),
+        Box(RigidTransform([12.0, 3.0, 2.0]), [1.0, 2.0, 4.0]),
+    ]
+    exact, field = ShapeGeometry([shapes]), EsdfGeometry([field_of(shapes)])
+    for rays in (THIN, PixelRays.of(16, 9, 90.0)):
+        expected, seen = (one_image(g, rays, [1.0, 0.0, 2.0]) for g in (exact, field))
+        rays_W = rays.directions_C @ R_BC.T
+        p_WP = [1.0, 0.0, 2.0] + np.minimum(expected, 99.0)[:, None] * rays_W
+        known = ((p_WP > LOWER - 0.01) & (p_WP < UPPER)).all(axis=1)
+        assert known.sum() > 60
+        off = np.abs(seen - expected)[known] - rays.half_pixel * expected[known]
+        assert np.quantile(off, 0.85) < 0.1  # the others are at outlines
+        assert (seen[~known] == np.inf).mean() > 0.95
+
+
+def test_cameras_outside_a_field_see_into_it_and_nothing_beyond():
+    """A ball is seen from before the box, and nothing by a camera that looks away."""
+    geometry = EsdfGeometry([field_of([Sphere([4, 0, 3], 1.0)])])
+    rays = PixelRays.of(5, 3, 60.0)._replace(half_pixel=0.0)
+    assert one_image(geometry, rays, [-5.0, 0.0, 3.0])[7] == pytest.approx(8.0, abs=0.05)
+    assert (one_image(geometry, rays, [25.0, 0.0, 3.0]) == np.inf).all()
+
+
+def test_grids_are_interpolated_as_the_distance_field_is():
+    """Values and gradients are those of `Esdf.query`, and beyond the centres those at the edge."""
+    fields = [field_of(some_world(seed)) for seed in range(2)]
+    geometry = EsdfGeometry(fields)
+    p_WQ = np.random.default_rng(0).uniform(LOWER + 0.06, UPPER - 0.06, (300, 3))
+    for w, field in enumerate(fields):
+        expected = field.query(p_WQ)
+        world = numbers(300) * 0 + w
+        distances, gradients = geometry.interpolate(floats(p_WQ), world)
+        np.testing.assert_allclose(distances, expected.distance, atol=2e-5)
+        # Points within rounding of a cell's face may have the gradient of its other side.
+        off = np.abs(gradients.numpy() - expected.gradient).max(axis=1)
+        assert np.quantile(off, 0.98) < 1e-3
+    edge, beyond = floats([[0.05, 0.0, 3.0]]), floats([[-7.0, 0.0, 3.0]])
+    for a, b in zip(*(geometry.interpolate(p, numbers(1)) for p in (edge, beyond)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_threads_and_instructions_change_no_bit():
+    """Images are equal in every bit for one to three threads and every SIMD level."""
+    shapes, fields = some_world(5, 30), [field_of(some_world(5))]
+    p, R = cameras(5, 13)
+    world = numbers(13) * 0
+    settings = [{"threads": n} for n in (1, 2, 3)]
+    settings += [{"simd": level} for level in _native.simd_levels()]
+    results = []
+    for setting in settings:
+        exact, field = ShapeGeometry([shapes], **setting), EsdfGeometry(fields, **setting)
+        results.append(
+            [
+                exact.depth(p, R, RAYS, world),
+                *exact.nearest(p, world, 4),
+                field.depth(p, R, RAYS, world),
+                *field.nearest(p, world, 1),
+            ]
+        )
+    for result in results[1:]:
+        for ours, first in zip(result, results[0], strict=True):
+            assert torch.equal(ours, first)
+
+
+def test_bad_input_is_refused():
+    """What cannot be is a ValueError that says so, and no crash."""
+    geometry = ShapeGeometry([some_world(0)])
+    field = EsdfGeometry([field_of(some_world(0))])
+    p, R = cameras(0, 2)
+    for world in ([0, 1], [-1, 0]):
+        for g in (geometry, field):
+            with pytest.raises(ValueError, match=r"world -?1 of 1"):
+                g.nearest(p, torch.tensor(world), 1)
+            with pytest.raises(ValueError, match=r"world -?1 of 1"):
+                g.depth(p, R, RAYS, torch.tensor(world))
+    world = numbers(2) * 0
+    with pytest.raises(ValueError, match="differ in length"):
+        geometry.nearest(p, numbers(1), 1)
+    with pytest.raises(ValueError, match="differ in shape"):
+        geometry.depth(p, R[:1], RAYS, world)
+    with pytest.raises(ValueError, match="1 to 16"):
+        geometry.nearest(p, world, 17)
+    with pytest.raises(ValueError, match="depth 1"):
+        geometry.depth(p, R, RAYS._replace(directions_C=2.0 * RAYS.directions_C), world)
+    with pytest.raises(ValueError, match="threads"):
+        ShapeGeometry([[]], threads=0)
+    with pytest.raises(ValueError, match="2 to 32768 voxels"):
+        Grids([np.zeros((1, 2, 2))], [LOWER], [0.1])
+    with pytest.raises(ValueError, match="voxel's size"):
+        Grids([np.zeros((2, 2, 2))], [LOWER], [0.0])
+    with pytest.raises(ValueError, match=r"Sphere\.radius"):
+        ShapeGeometry([[Sphere([0, 0, 0], -1.0)]])
+    nowhere = floats([[torch.nan] * 3] * 2)
+    assert geometry.depth(nowhere, R, RAYS, world).shape == (2, 24 * 14)
+    assert field.depth(nowhere, R, RAYS, world).shape == (2, 24 * 14)
