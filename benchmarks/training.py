@@ -49,9 +49,8 @@ def main() -> None:
             step_optimizer(rollout.losses, learner.network, optimizer, 1.0)
 
         def render(rollout=rollout, learner=learner, worlds=worlds) -> None:
-            primitives = worlds.primitives.select(rollout.episodes.world)
-            distances, _ = primitives.near(rollout.episodes.vehicle.p)
-            render_depth(rollout.episodes.vehicle, primitives, learner.grid, distances)
+            episodes = rollout.episodes
+            render_depth(episodes.vehicle, worlds.geometry, learner.rays, episodes.world)
 
         learn()
         learning = seconds(learn, 4)

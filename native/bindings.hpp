@@ -143,11 +143,12 @@ inline int32_t radius_of(float extent) {
 }
 
 // Add to the module: the backward pass of Gaussians, the renderer of surfels, the rendering of
-// projected Gaussians, the losses, the casting of rays.
+// projected Gaussians, the losses, worlds of shapes, worlds of grids.
 void bind_gradients(nb::module_& m);
 void bind_surfels(nb::module_& m);
 void bind_projected(nb::module_& m);
 void bind_losses(nb::module_& m);
-void bind_ray_casting(nb::module_& m);
+void bind_shape_worlds(nb::module_& m);
+void bind_grid_worlds(nb::module_& m);
 
 }  // namespace splatpilot

@@ -1,7 +1,8 @@
 // Rays through a grid of signed distances, and its trilinear interpolant.
 #pragma once
 
-#include "shape_casting.hpp"
+#include "depth_image.hpp"
+#include "gather.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 

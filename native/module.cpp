@@ -189,7 +189,8 @@ NB_MODULE(_native, m) {
         "depth"_a, "alpha"_a, "Writes colour, median depth and alpha.");
 
   bind_losses(m);
-  bind_ray_casting(m);
+  bind_shape_worlds(m);
+  bind_grid_worlds(m);
   bind_gradients(m);
   bind_surfels(m);
   bind_projected(m);

@@ -21,7 +21,7 @@ if [ $# -eq 0 ]; then
   for name in rasterization_gradients surfels rasterization rasterization_unscented baked_scene; do
     set -- "$@" "tests/systems/splats/test_$name.py"
   done
-  set -- "$@" tests/training/reconstruction/test_losses.py
+  set -- "$@" tests/training/reconstruction/test_losses.py tests/training/policies/test_ray_casting.py
 fi
 # splatpilot._native comes from the build folder. pytest must not swallow the report (-s).
 program='

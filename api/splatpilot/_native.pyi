@@ -92,6 +92,43 @@ def log_depth_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(No
     Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.
     """
 
+class ShapeWorlds:
+    """The analytic shapes of several worlds."""
+
+    def __init__(self, *, shapes: Annotated[NDArray[numpy.float32], dict(shape=(None, 15), order='C', device='cpu', writable=False)], kinds: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], threads: int = 1, simd: str = '') -> None:
+        """
+        World w has the rows first[w] to first[w + 1]. A row holds, by its kind: 0 centre and
+        radius of a sphere; 1 end, axis, length and radius of a capsule; 2 centre, axis, half
+        length and radius of a cylinder; 3 centre, rotation and half sizes of a box; 4 normal
+        and offset of a half space.
+        """
+
+    def __len__(self) -> int: ...
+
+    def depth(self, *, p_WC: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], R_WC: Annotated[NDArray[numpy.float32], dict(shape=(None, 3, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], directions_C: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], half_pixel: float, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')]) -> None:
+        """Writes the depth images of N cameras."""
+
+    def nearest(self, *, p_WQ: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')]) -> None:
+        """
+        Writes the distances (N, K) of the K nearest shapes and their gradients (N, K, 3).
+        """
+
+class GridWorlds:
+    """Regular grids of several worlds, one of each."""
+
+    def __init__(self, *, values: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], shapes: Annotated[NDArray[numpy.int64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], voxel_sizes: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], threads: int = 1, simd: str = '') -> None:
+        """The values of all grids, one after another."""
+
+    def __len__(self) -> int: ...
+
+    def depth(self, *, p_WC: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], R_WC: Annotated[NDArray[numpy.float32], dict(shape=(None, 3, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], directions_C: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], half_pixel: float, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')]) -> None:
+        """
+        Writes the depth images of N cameras where the values are signed distances.
+        """
+
+    def interpolate(self, *, p_WQ: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], values: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')]) -> None:
+        """Writes the trilinear interpolants (N,) and their gradients (N, 3)."""
+
 def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], expected_depth: bool, absolute: bool, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu')], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu')]) -> int:
     """
     Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were
