@@ -20,7 +20,7 @@ _FAR = 1e4
 _HELD = 0.5
 """[m], ends of capsules further than this from the volume are left out: they end out of sight."""
 
-_LOOKED_AT = 500
+_LOOKED_AT = 24
 """Shapes of each kind that a camera looks at, the nearest ones."""
 
 
