@@ -23,8 +23,7 @@ from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.drake_images import ranged_depth, render_view
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.policies.primitives import Primitives
-from splatpilot.training.policies.ray_casting import PinholeGrid
+from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
 from splatpilot.training.reconstruction.measures import has_true_depth
 
 _BEYOND = 0.1
@@ -32,9 +31,6 @@ _BEYOND = 0.1
 
 _VEIL = 0.01
 """Alpha from which scenery that has no solid may be what a pixel shows."""
-
-_RAYS = 4096  # cast at once
-_NEAREST = 24  # shapes that they are cast at first
 
 
 class TrueDepth:
@@ -47,7 +43,7 @@ class TrueDepth:
     def __init__(self, blueprint: Blueprint) -> None:
         self._lower_W, self._upper_W = blueprint.lower_W - _BEYOND, blueprint.upper_W + _BEYOND
         shapes = [solid.shape for solid in (*blueprint.solids, *blueprint.scenery)]
-        self._shapes = Primitives([shapes], self._lower_W[None] - 40, self._upper_W[None] + 40)
+        self._geometry = ShapeGeometry([shapes])
         scenery = blueprint.surroundings()
         self._scenery = BakedScene(merge(scenery)) if scenery else None
 
@@ -55,9 +51,11 @@ class TrueDepth:
         """Planar depth (H, W) [m] along the middles of the pixels, exact to 3 mm within reach of
         the camera; infinite where nothing is, NaN where unknown."""
         slopes_C = camera.ray_slopes()
-        depth = self._cast(slopes_C.reshape(-1, 3), X_WC, camera.max_depth)
-        depth = depth.reshape(slopes_C.shape[:2])
         R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
+        middles = PixelRays(slopes_C.reshape(-1, 3).astype(np.float32), half_pixel=0.0)
+        p, R = (torch.tensor(x, dtype=torch.float32)[None] for x in (p_WC, R_WC))
+        depth = self._geometry.depth(p, R, middles, torch.zeros(1).long()).numpy()
+        depth = depth.reshape(slopes_C.shape[:2])
         with np.errstate(invalid="ignore"):
             p_WQ = p_WC + depth[..., None] * (slopes_C @ R_WC.T)
             outside = ~((p_WQ >= self._lower_W) & (p_WQ <= self._upper_W)).all(axis=-1)
@@ -67,27 +65,6 @@ class TrueDepth:
             view = render_view(self._scenery, info, X_WC, near=0.01, far=reach)
             unknown |= outside & (view.alpha > _VEIL)
         return np.where(unknown, np.nan, depth)
-
-    def _cast(self, slopes_C: NDArray, X_WC: RigidTransform, reach: float) -> NDArray:
-        """Depth (N,) [m] along rays (N, 3) of depth 1 to what begins within `reach` [m]."""
-        p_WC, R_WC = (
-            torch.tensor(x, dtype=torch.float32)[None]
-            for x in (X_WC.translation(), X_WC.rotation().matrix())
-        )
-        distances, _ = self._shapes.near(p_WC)
-        ordered = distances[0].sort().values
-        rays = torch.tensor(slopes_C, dtype=torch.float32)
-        lengths = rays.norm(dim=1)
-        depth = torch.full_like(lengths, torch.inf)
-        rest, nearest, horizon = torch.arange(len(rays)), _NEAREST, 0.0
-        while len(rest) and horizon < reach * lengths.max():
-            for some in rest.split(_RAYS):
-                grid = PinholeGrid(rays[some], half_pixel=0.0)
-                depth[some] = self._shapes.depth(p_WC, R_WC, grid, distances, nearest)[0]
-            # What has not been looked at is no nearer than this.
-            horizon = float(ordered[nearest]) if nearest < len(ordered) else np.inf
-            rest, nearest = rest[depth[rest] * lengths[rest] > horizon], 4 * nearest
-        return depth.numpy()
 
 
 def frames_along_flight(

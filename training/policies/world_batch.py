@@ -15,7 +15,7 @@ from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_dist
 from splatpilot.systems.collision.shapes import HalfSpace, Shape
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.ray_casting import Grids, ShapeGeometry
+from splatpilot.training.policies.ray_casting import Geometry, Grids, ShapeGeometry
 
 STARTS = 256
 """Places that flights of training start from, in each world."""
@@ -61,7 +61,7 @@ class WorldBatch:
             tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
         self._shapes = [world.shapes for world in worlds]
-        self.geometry = ShapeGeometry(self._shapes)
+        self.geometry: Geometry = ShapeGeometry(self._shapes)
         self._times = None
         if voxel_size is not None:
             grids = [_march(world, voxel_size, seed) for seed, world in enumerate(worlds)]
