@@ -86,7 +86,7 @@ class AgileAutonomyTraining:
     # [-] Steps between two questions to the expert.
     ask_every: int = 4
     # [m/s] Speeds that are asked for.
-    speeds: list[float] = field(default_factory=lambda: [1.5, 2.0, 2.5, 3.0])
+    speeds: list[float] = field(default_factory=lambda: [1.5, 2.0, 3.0, 4.0])
     # [-] Samples a step of the optimiser.
     batch: int = 128
     # [-] Weight of the cost head's error.
@@ -104,6 +104,7 @@ class AgileAutonomyTraining:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
         validate_training_noise(self.noise, "noise")
+        self.validation.validate()
         if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
             raise ValueError(f"speeds is {self.speeds}; give one or more of 0.1 to 10 m/s")
 

@@ -59,7 +59,7 @@ class RolloutConfig:
     # [-] Steps of the policy that the loss is differentiated through at once.
     steps: int = 32
     # [m/s] Range that each vehicle's wanted speed is drawn from.
-    speed: list[float] = field(default_factory=lambda: [1.5, 3.0])
+    speed: list[float] = field(default_factory=lambda: [1.5, 4.0])
     # [s] Range that each vehicle's lag of the acceleration is drawn from.
     lag: list[float] = field(default_factory=lambda: [0.07, 0.2])
     # [-] What is left of a gradient that went back through a second of flight.

@@ -1,6 +1,6 @@
 """Flights of a policy through worlds, many at once: how well it does."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import torch
@@ -50,22 +50,24 @@ class Outcomes(NamedTuple):
     left: Tensor  # (N,) bool, the volume
     least_clearance: Tensor  # (N,) [m]
     mean_speed: Tensor  # (N,) [m/s]
+    wanted_speed: Tensor  # (N,) [m/s]
 
     def measures(self, kinds: list[str] | None = None) -> dict[str, float]:
         """Parts of the flights that reached the goal, collided and left; what remains took too
-        long. Means of least clearance [m] and speed [m/s]. Flight n is of kind n modulo their
-        number, and success is also given for each of `kinds`."""
-        kinds = kinds or []
+        long. Means of least clearance [m] and speed [m/s]. Success is also given for each speed
+        that was wanted and, flight n being of kind n modulo their number, each of `kinds`."""
         flown: dict[str, list[bool]] = {}
-        for n, reached in enumerate(self.reached.tolist() if kinds else []):
-            flown.setdefault(kinds[n % len(kinds)], []).append(reached)
+        flights = zip(self.reached.tolist(), self.wanted_speed.tolist(), strict=True)
+        for n, (reached, speed) in enumerate(flights):
+            for name in [f"{speed:g} m/s", *([kinds[n % len(kinds)]] if kinds else [])]:
+                flown.setdefault(name, []).append(reached)
         return {
             "success": float(self.reached.float().mean()),
             "collisions": float(self.collided.float().mean()),
             "left": float(self.left.float().mean()),
             "least_clearance": float(self.least_clearance.mean()),
             "speed": float(self.mean_speed.mean()),
-            **{kind: sum(reached) / len(reached) for kind, reached in flown.items()},
+            **{name: sum(flown[name]) / len(flown[name]) for name in sorted(flown)},
         }
 
 
@@ -73,8 +75,8 @@ class Outcomes(NamedTuple):
 class FlightConditions:
     """Of the flights that measure a policy."""
 
-    # [m/s] Asked of the policy.
-    speed: float = 2.0
+    # [m/s] Asked of the policy, each in as many worlds, drawn at random.
+    speeds: list[float] = field(default_factory=lambda: [2.0, 3.0, 4.0])
     # [m] The goal is reached within this distance.
     goal_radius: float = 0.3
     # [-] Flights end after this multiple of the time that the straight way takes at that speed.
@@ -83,6 +85,13 @@ class FlightConditions:
     lag: float = 0.12
     # Whether the body-rate quadrotor flies, instead of a point mass.
     body_rate: bool = False
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
+            raise ValueError(
+                f"validation.speeds is {self.speeds}; give one or more of 0.1 to 10 m/s"
+            )
 
 
 @torch.no_grad()
@@ -107,7 +116,8 @@ def evaluate_agent(
         lag = torch.full((count, 1), conditions.lag, device=device)
         vehicle = PointMass(worlds.p_WS, zero, zero, yaw, lag)
     memory, control = agent.initial_memory(count), FlatnessControllerConfig()
-    speed = torch.full((count,), conditions.speed, device=device)
+    shuffled = torch.randperm(count, generator=generator, device=device)
+    speed = torch.tensor(conditions.speeds, device=device)[shuffled % len(conditions.speeds)]
     latency = noise.latency * agent.rate
     past = remembered(vehicle, latency)
 
@@ -115,7 +125,7 @@ def evaluate_agent(
     clearance = torch.full((count,), torch.inf, device=device)
     path, time = torch.zeros(count, device=device), torch.zeros(count, device=device)
     flying = torch.arange(count, device=device)
-    limit = conditions.patience * to_goal.norm(dim=1) / conditions.speed
+    limit = conditions.patience * to_goal.norm(dim=1) / speed
     dt = 1.0 / agent.rate
     while len(flying):
         distances, _ = worlds.geometry.nearest(vehicle.p, flying, 1)
@@ -141,4 +151,4 @@ def evaluate_agent(
         vehicle = vehicle.step(a_cmd, dt, control, heading)
         path[flying] += (vehicle.p - before).norm(dim=1)
         time[flying] += dt
-    return Outcomes(reached, collided, left, clearance, path / time.clamp(min=dt))
+    return Outcomes(reached, collided, left, clearance, path / time.clamp(min=dt), speed)

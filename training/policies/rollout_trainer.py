@@ -42,6 +42,7 @@ class RolloutTraining:
         self.schedule.validate()
         self.worlds.validate()
         self.rollout.validate()
+        self.validation.validate()
         if not 0.0 <= self.empty < 1.0:
             raise ValueError(f"empty is {self.empty}; it must be at least 0 and less than 1")
 

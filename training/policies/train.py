@@ -109,12 +109,12 @@ def run[Config: TrainingConfig](
             means = progress.means
             for name, value in terms.items():
                 means[name] = value if name not in means else 0.98 * means[name] + 0.02 * value
+            bar.set_postfix(_shown(progress), refresh=False)
             due = progress.update % schedule.validate_every == 0
             if due or progress.update == schedule.updates:
                 measured = trainer.evaluate()
                 row = {"update": float(progress.update), **means, **measured}
                 progress.curves.append(row)
-                bar.set_postfix(success=f"{measured['success']:.2f}")
                 log(progress.update, row)
                 if measured["success"] >= progress.best.get("success", -1.0):
                     progress.best = {"update": progress.update, **measured}
@@ -136,6 +136,17 @@ def run[Config: TrainingConfig](
         f"{progress.cpu_seconds / 60.0:.1f} CPU minutes; weights in {out / trainer.policy}.npz"
     )
     return summary
+
+
+def _shown(progress: _Progress) -> dict[str, str]:
+    """What the progress bar says: the loss, and the success measured last and best."""
+    shown = {"loss": f"{sum(progress.means.values()):.3f}"}
+    if progress.curves:
+        shown |= {
+            "success": f"{progress.curves[-1]['success']:.0%}",
+            "best": f"{progress.best['success']:.0%}",
+        }
+    return shown
 
 
 def step_optimizer(

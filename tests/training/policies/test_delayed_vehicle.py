@@ -109,7 +109,7 @@ def test_rollouts_see_late_images_and_know_their_state():
 def test_measured_flights_see_late_images():
     """So do the flights that measure a policy."""
     worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
-    evaluate_agent(watcher, worlds, FlightConditions(patience=0.05), TWO_STEPS)
+    evaluate_agent(watcher, worlds, FlightConditions(speeds=[2.0], patience=0.05), TWO_STEPS)
     assert len(watcher.seen) > 4
     world = torch.arange(len(worlds))
     for now, then in enumerate([0, 0, 0, 1, 2]):
