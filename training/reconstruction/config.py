@@ -43,7 +43,7 @@ class ReconstructConfig:
     """lambda_d, the weight of the depth term; 0 looks at colours alone."""
     depth_mode: str = "ED"
     """The depth it compares: "ED", expected, or "D", accumulated, the paper's equation 2."""
-    surface_weight: float = 1.0
+    surface_weight: float = 1.5
     """Of the distance of each Gaussian from the surface that it is part of, see `surface_loss`."""
     outline_weight: float = 1.0
     """Of the outlines of things before the infinitely far, see `outline_loss`: every other step of

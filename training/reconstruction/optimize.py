@@ -23,7 +23,7 @@ from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure
 from splatpilot.training.reconstruction.objective import Objective
 from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.photometry import fit_gain
-from splatpilot.training.reconstruction.smallest_scales import smallest_scales
+from splatpilot.training.reconstruction.scale_limits import scale_limits
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
@@ -34,8 +34,8 @@ _LAST_RATE = 0.01
 _ON_SURFACE = 0.25
 # Unknown gains are fitted after these parts of all steps.
 _GAIN_FITS = (0.1, 0.2, 0.4)
-# Steps from one time that the smallest scales are found to the next.
-_FIND_SMALLEST = 500
+# Steps from one time that the limits of the scales are found to the next.
+_LIMIT_EVERY = 500
 # One step in so many of a view with outlines before the infinitely far fits these.
 _SHARP_EVERY = 2
 
@@ -99,7 +99,7 @@ class Optimization:
             self.splats = SplatParameters.of_scene(
                 initial(), config.sh_degree, rates, config.device
             )
-            self._find_smallest()
+            self._limit_scales()
         else:
             self.step = kept["step"]
             self.splats = SplatParameters(**kept["splats"], rates=rates)
@@ -178,8 +178,8 @@ class Optimization:
             self._fit_gains()
         if self._strategy is not None:
             self._strategy.refine(self.step, splats)
-        if self.step % _FIND_SMALLEST == 0 or len(splats) != count:
-            self._find_smallest()
+        if self.step % _LIMIT_EVERY == 0 or len(splats) != count:
+            self._limit_scales()
 
     @torch.no_grad()
     def measure(self) -> HeldOutMeasures | None:
@@ -197,8 +197,8 @@ class Optimization:
             )
         return HeldOutMeasures(tuple(found))
 
-    def _find_smallest(self) -> None:
-        self.splats.smallest = smallest_scales(self.splats["means"], self._views)
+    def _limit_scales(self) -> None:
+        self.splats.limit_scales(scale_limits(self.splats["means"], self._views))
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         splats = self.splats

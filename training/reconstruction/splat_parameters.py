@@ -1,6 +1,6 @@
 """What is optimised: the parameters of Gaussians, and Adam's memory of each."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.reconstruction.scale_limits import ScaleLimits
 
 # Opacities at the ends of [0, 1] have infinite logits, which no gradient moves.
 _OPACITIES = (1e-4, 1 - 1e-4)
@@ -22,7 +23,7 @@ class SplatParameters:
 
     `means` (N, 3) [m]; `quats` (N, 4) wxyz of any length; `log_scales` (N, 3); `logit_opacities`
     (N,); `sh_0` (N, 1, 3) and, if the degree is not 0, `sh_rest` (N, K - 1, 3). Beside them
-    `smallest` (N,) [m], which is no parameter: see `scales`.
+    `limits` of the scales, which are no parameters.
     """
 
     def __init__(
@@ -30,7 +31,7 @@ class SplatParameters:
         tensors: Mapping[str, Tensor],
         rates: Mapping[str, float],
         state: Mapping[str, Mapping[str, Tensor]] | None = None,
-        smallest: Tensor | None = None,
+        limits: Sequence[Tensor] | None = None,
     ):
         groups = [
             {"params": [tensor.clone().requires_grad_()], "lr": rates[name], "name": name}
@@ -41,9 +42,8 @@ class SplatParameters:
         self._groups = {group["name"]: group for group in self.optimizer.param_groups}
         for name, parameter_state in (state or {}).items():
             self.optimizer.state[self[name]] = {k: v.clone() for k, v in parameter_state.items()}
-        self.smallest = torch.zeros_like(tensors["logit_opacities"])
-        if smallest is not None:
-            self.smallest = smallest
+        none = ScaleLimits.none(tensors["logit_opacities"])
+        self._limits = none if limits is None else ScaleLimits(*limits)
 
     @classmethod
     def of_scene(
@@ -84,8 +84,17 @@ class SplatParameters:
 
     @property
     def scales(self) -> Tensor:
-        """(N, 3) [m], never less than the `smallest`: their squares are added."""
-        return torch.sqrt(torch.exp(2 * self["log_scales"]) + self.smallest[:, None] ** 2)
+        """(N, 3) [m], within the limits."""
+        smallest, largest = (limit[:, None] for limit in self._limits)
+        scales = torch.sqrt(torch.exp(2 * self["log_scales"]) + smallest**2)
+        return torch.minimum(scales, largest)
+
+    @torch.no_grad()
+    def limit_scales(self, limits: ScaleLimits) -> None:
+        """Sets the limits; parameters that are beyond the largest come back to it, where their
+        gradient does not end."""
+        self._limits = limits
+        self["log_scales"].clamp_(max=torch.log(limits.largest)[:, None])
 
     @property
     def opacities(self) -> Tensor:
@@ -106,10 +115,8 @@ class SplatParameters:
     @torch.no_grad()
     def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
         """Keeps the Gaussians `rows` (indices), in that order, and appends those `added`, of which
-        Adam remembers nothing and whose `smallest` is 0."""
-        count = 0 if added is None else len(added["means"])
-        kept = self.smallest[rows]
-        self.smallest = torch.cat([kept, kept.new_zeros(count)])
+        Adam remembers nothing and whose scales have no limits."""
+        self._limits = self._limits.rebuild(rows, 0 if added is None else len(added["means"]))
         for name in self.names:
             old = self[name]
             extra = old[:0] if added is None else added[name]
@@ -137,7 +144,7 @@ class SplatParameters:
                 name: {k: v.clone() for k, v in self.optimizer.state[self[name]].items()}
                 for name in self.names
             },
-            "smallest": self.smallest,
+            "limits": list(self._limits),
         }
 
     @torch.no_grad()

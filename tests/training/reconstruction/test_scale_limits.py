@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.photometry import Photometry
-from splatpilot.training.reconstruction.smallest_scales import smallest_scales
+from splatpilot.training.reconstruction.scale_limits import ScaleLimits, scale_limits
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
@@ -33,10 +33,10 @@ def test_the_closest_camera_that_sees_a_gaussian_says_how_small_it_may_be():
     """It is 0.45 pixels of the closer camera; nothing for what is behind the wall that it shows, to
     the side of both or behind them."""
     np.testing.assert_allclose(
-        smallest_scales(MEANS, views(wall=4.0)), [3 * PIXEL, 0, 0, 0], rtol=1e-5
+        scale_limits(MEANS, views(wall=4.0)).smallest, [3 * PIXEL, 0, 0, 0], rtol=1e-5
     )
     np.testing.assert_allclose(
-        smallest_scales(MEANS, views(wall=np.inf)), [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
+        scale_limits(MEANS, views(wall=np.inf)).smallest, [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
     )
 
 
@@ -45,25 +45,36 @@ def test_unknown_depth_hides_nothing():
     unknown = views(wall=4.0)
     unknown.depths[:] = 0
     np.testing.assert_allclose(
-        smallest_scales(MEANS, unknown), [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
+        scale_limits(MEANS, unknown).smallest, [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
     )
 
 
-def test_scales_have_the_smallest_added_in_squares():
-    """Gaussians of 3 mm that may not be below 4 mm have 5 mm; rows that are kept keep theirs, added
-    ones have none; and it comes back from a state."""
+def test_no_gaussian_may_span_the_view_of_a_camera():
+    """None may be larger than a quarter of the depth from the closest camera that sees it; those
+    that none sees may be as they are."""
+    np.testing.assert_allclose(
+        scale_limits(MEANS, views(wall=np.inf)).largest, [0.75, 1.25, np.inf, np.inf]
+    )
+
+
+def test_scales_keep_their_limits():
+    """The smallest is added in squares: 3 mm and 4 mm are 5 mm; none is beyond the largest, from
+    which parameters come back. Rows that are kept keep their limits, added ones have none, and they
+    come back from a state."""
     tensors = {
-        "means": torch.zeros(2, 3),
-        "quats": torch.ones(2, 4),
-        "log_scales": torch.full((2, 3), 3e-3).log(),
-        "logit_opacities": torch.zeros(2),
-        "sh_0": torch.zeros(2, 1, 3),
+        "means": torch.zeros(3, 3),
+        "quats": torch.ones(3, 4),
+        "log_scales": torch.full((3, 3), 3e-3).log(),
+        "logit_opacities": torch.zeros(3),
+        "sh_0": torch.zeros(3, 1, 3),
     }
     rates = dict.fromkeys(tensors, 1e-3)
     splats = SplatParameters(tensors, rates)
-    assert splats.scales.flatten().tolist() == pytest.approx([3e-3] * 6)
-    splats.smallest = torch.tensor([0.0, 4e-3])
-    assert splats.scales[1].tolist() == pytest.approx([5e-3] * 3)
+    assert splats.scales.flatten().tolist() == pytest.approx([3e-3] * 9)
+    limits = ScaleLimits(torch.tensor([0.0, 4e-3, 0.0]), torch.tensor([torch.inf, 1.0, 2e-3]))
+    splats.limit_scales(limits)
+    assert splats.scales[:, 0].tolist() == pytest.approx([3e-3, 5e-3, 2e-3])
+    assert splats["log_scales"][2].exp().tolist() == pytest.approx([2e-3] * 3)
     again = SplatParameters(**splats.state(), rates=rates)
     assert torch.equal(again.scales, splats.scales)
     splats.rebuild(torch.tensor([1]), {name: tensor[:1] for name, tensor in tensors.items()})
