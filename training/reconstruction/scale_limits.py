@@ -10,7 +10,7 @@ from splatpilot.training.reconstruction.views import ReconstructionViews
 # Variance in pixels of the closest camera, as in Mip-Splatting.
 _VARIANCE = 0.2
 # Standard deviation as a fraction of the depth from the closest camera.
-_LARGEST = 0.25
+_LARGEST = 0.05
 # What is farther than this many times the depth that a view shows is hidden from it.
 _HIDDEN = 1.1
 
@@ -19,7 +19,7 @@ class ScaleLimits(NamedTuple):
     """Of N Gaussians, by the depth from the closest of the views that see their centres."""
 
     smallest: Tensor  # (N,) [m], added, squared, to their standard deviations; 0 where none sees it
-    largest: Tensor  # (N,) [m], of their standard deviations; infinite where none sees it
+    largest: Tensor  # (N,) [m], of their standard deviations; infinite where none sees its depth
 
     @classmethod
     def none(cls, like: Tensor) -> "ScaleLimits":
@@ -40,8 +40,8 @@ def scale_limits(means: Tensor, views: ReconstructionViews) -> ScaleLimits:
     The smallest is the 3D smoothing filter of Mip-Splatting (Yu et al. 2024), a variance of 0.2
     square pixels in the closest view: smaller Gaussians are seen by the blur of colours alone;
     depth, which has none, would look through between them, and so would a camera that comes closer.
-    The largest is a quarter of the depth: Gaussians are drawn as if each were flat in perspective,
-    and one that spans much of a camera's view is drawn all over it.
+    The largest, where depth is known, is a twentieth of it: Gaussians are drawn as if perspective
+    were the same all over each, so that large ones stand as haze before cameras that come close.
 
     Args:
         means: (N, 3) [m].
@@ -60,4 +60,6 @@ def scale_limits(means: Tensor, views: ReconstructionViews) -> ScaleLimits:
         number = number[(shown <= 0) | (z[number] < _HIDDEN * shown)]
         closest[number] = torch.minimum(closest[number], z[number])
     smallest = torch.where(closest.isfinite(), _VARIANCE**0.5 / K[0, 0] * closest, 0)
-    return ScaleLimits(smallest, _LARGEST * closest)
+    known = (views.depths > 0).any()
+    largest = _LARGEST * closest if known else torch.full_like(closest, torch.inf)
+    return ScaleLimits(smallest, largest)
