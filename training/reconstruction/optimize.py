@@ -198,7 +198,8 @@ class Optimization:
         return HeldOutMeasures(tuple(found))
 
     def _limit_scales(self) -> None:
-        self.splats.limit_scales(scale_limits(self.splats["means"], self._views))
+        bounded = self._config.initialization == "depth"
+        self.splats.limit_scales(scale_limits(self.splats["means"], self._views, bounded))
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         splats = self.splats

@@ -19,7 +19,7 @@ class ScaleLimits(NamedTuple):
     """Of N Gaussians, by the depth from the closest of the views that see their centres."""
 
     smallest: Tensor  # (N,) [m], added, squared, to their standard deviations; 0 where none sees it
-    largest: Tensor  # (N,) [m], of their standard deviations; infinite where none sees its depth
+    largest: Tensor  # (N,) [m], of their standard deviations; infinite where none sees it
 
     @classmethod
     def none(cls, like: Tensor) -> "ScaleLimits":
@@ -34,18 +34,19 @@ class ScaleLimits(NamedTuple):
 
 
 @torch.no_grad()
-def scale_limits(means: Tensor, views: ReconstructionViews) -> ScaleLimits:
+def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> ScaleLimits:
     """Returns how small and large Gaussians may be.
 
     The smallest is the 3D smoothing filter of Mip-Splatting (Yu et al. 2024), a variance of 0.2
     square pixels in the closest view: smaller Gaussians are seen by the blur of colours alone;
     depth, which has none, would look through between them, and so would a camera that comes closer.
-    The largest, where depth is known, is a twentieth of it: Gaussians are drawn as if perspective
+    The largest is a twentieth of the depth: Gaussians are drawn as if perspective
     were the same all over each, so that large ones stand as haze before cameras that come close.
 
     Args:
         means: (N, 3) [m].
         views: what is fitted.
+        bounded: whether there is a largest. Gaussians that do not start on surfaces need to reach.
     """
     K, viewmats = views.K[0].to(means.device), views.viewmats.to(means.device)
     closest = torch.full_like(means[:, 0], torch.inf)  # [m]
@@ -60,6 +61,5 @@ def scale_limits(means: Tensor, views: ReconstructionViews) -> ScaleLimits:
         number = number[(shown <= 0) | (z[number] < _HIDDEN * shown)]
         closest[number] = torch.minimum(closest[number], z[number])
     smallest = torch.where(closest.isfinite(), _VARIANCE**0.5 / K[0, 0] * closest, 0)
-    known = (views.depths > 0).any()
-    largest = _LARGEST * closest if known else torch.full_like(closest, torch.inf)
+    largest = _LARGEST * closest if bounded else torch.full_like(closest, torch.inf)
     return ScaleLimits(smallest, largest)

@@ -33,10 +33,12 @@ def test_the_closest_camera_that_sees_a_gaussian_says_how_small_it_may_be():
     """It is 0.45 pixels of the closer camera; nothing for what is behind the wall that it shows, to
     the side of both or behind them."""
     np.testing.assert_allclose(
-        scale_limits(MEANS, views(wall=4.0)).smallest, [3 * PIXEL, 0, 0, 0], rtol=1e-5
+        scale_limits(MEANS, views(wall=4.0), bounded=True).smallest, [3 * PIXEL, 0, 0, 0], rtol=1e-5
     )
     np.testing.assert_allclose(
-        scale_limits(MEANS, views(wall=np.inf)).smallest, [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
+        scale_limits(MEANS, views(wall=np.inf), bounded=True).smallest,
+        [3 * PIXEL, 5 * PIXEL, 0, 0],
+        rtol=1e-5,
     )
 
 
@@ -45,17 +47,17 @@ def test_unknown_depth_hides_nothing():
     unknown = views(wall=4.0)
     unknown.depths[:] = 0
     np.testing.assert_allclose(
-        scale_limits(MEANS, unknown).smallest, [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
+        scale_limits(MEANS, unknown, bounded=True).smallest, [3 * PIXEL, 5 * PIXEL, 0, 0], rtol=1e-5
     )
 
 
 def test_no_gaussian_may_span_the_view_of_a_camera():
     """None may be larger than a twentieth of the depth from the closest camera that sees it; those
-    that none sees may be as they are, and so may all where depth is unknown."""
+    that none sees may be as they are, and so may all that are not bounded."""
     seen = views(wall=np.inf)
-    np.testing.assert_allclose(scale_limits(MEANS, seen).largest, [0.15, 0.25, np.inf, np.inf])
-    seen.depths[:] = 0
-    assert scale_limits(MEANS, seen).largest.isinf().all()
+    bounded = scale_limits(MEANS, seen, bounded=True)
+    np.testing.assert_allclose(bounded.largest, [0.15, 0.25, np.inf, np.inf])
+    assert scale_limits(MEANS, seen, bounded=False).largest.isinf().all()
 
 
 def test_scales_keep_their_limits():
