@@ -18,7 +18,7 @@ class DepthPolicyConfig:
     rate: ClassVar[float]
     """[Hz], that the policy was trained at."""
 
-    # [m/s] Speed that it is asked to fly at; it was trained at 1.5 to 3 m/s.
+    # [m/s] Speed that it is asked to fly at; the model card of its weights says what they know.
     speed: float = 2.0
     # File of weights, as `splatpilot train` writes them; those that ship where left empty.
     weights: str = ""

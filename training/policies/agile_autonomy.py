@@ -40,7 +40,12 @@ from splatpilot.training.policies.agile_autonomy_agent import (
     reaching_acceleration,
 )
 from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
-from splatpilot.training.policies.evaluation import FlightConditions, evaluate_agent, render_depth
+from splatpilot.training.policies.evaluation import (
+    FlightConditions,
+    evaluate_agent,
+    render_depth,
+    validate_speeds,
+)
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import (
     Observation,
@@ -105,8 +110,7 @@ class AgileAutonomyTraining:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
         validate_training_noise(self.noise, "noise")
         self.validation.validate()
-        if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
-            raise ValueError(f"speeds is {self.speeds}; give one or more of 0.1 to 10 m/s")
+        validate_speeds(self.speeds, "speeds")
 
 
 class AgileAutonomyTrainer:

@@ -1,5 +1,6 @@
 """Flights of a policy through worlds, many at once: how well it does."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -88,10 +89,13 @@ class FlightConditions:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not self.speeds or not all(0.1 <= speed <= 10.0 for speed in self.speeds):
-            raise ValueError(
-                f"validation.speeds is {self.speeds}; give one or more of 0.1 to 10 m/s"
-            )
+        validate_speeds(self.speeds, "validation.speeds")
+
+
+def validate_speeds(speeds: Sequence[float], name: str) -> None:
+    """Raises ValueError unless all are speeds that can be asked for."""
+    if not speeds or not all(0.1 <= speed <= 10.0 for speed in speeds):
+        raise ValueError(f"{name} is {speeds}; give one or more of 0.1 to 10 m/s")
 
 
 @torch.no_grad()

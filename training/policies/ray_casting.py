@@ -5,7 +5,7 @@ normal that is returned with it. Tensors may be on any device; what is asked is 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, get_args
 
 import numpy as np
@@ -91,15 +91,7 @@ class ShapeGeometry:
         return _depth(self._native, p_WC, R_WC, rays, world)
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        distances = torch.empty(len(p_WQ), count)
-        gradients = torch.empty(len(p_WQ), count, 3)
-        self._native.nearest(
-            p_WQ=_array(p_WQ),
-            world=_array(world),
-            distances=distances.numpy(),
-            gradients=gradients.numpy(),
-        )
-        return distances.to(p_WQ.device), gradients.to(p_WQ.device)
+        return _query(self._native.nearest, p_WQ, world, count)
 
 
 class Grids:
@@ -135,14 +127,7 @@ class Grids:
     def interpolate(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
         """Values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; beyond the outermost centres
         of voxels those at the nearest point between them."""
-        values, gradients = torch.empty(len(p_WQ)), torch.empty(len(p_WQ), 3)
-        self._native.interpolate(
-            p_WQ=_array(p_WQ),
-            world=_array(world),
-            values=values.numpy(),
-            gradients=gradients.numpy(),
-        )
-        return values.to(p_WQ.device), gradients.to(p_WQ.device)
+        return _query(self._native.interpolate, p_WQ, world)
 
 
 class EsdfGeometry(Grids):
@@ -189,6 +174,15 @@ def _depth(
         depth=depth.numpy(),
     )
     return depth.to(p_WC.device)
+
+
+def _query(
+    answer: Callable[..., None], p_WQ: Tensor, world: Tensor, *shape: int
+) -> tuple[Tensor, Tensor]:
+    """Values (N, *shape) and their gradients (N, *shape, 3) at p_WQ, as `answer` writes them."""
+    values, gradients = torch.empty(len(p_WQ), *shape), torch.empty(len(p_WQ), *shape, 3)
+    answer(_array(p_WQ), _array(world), values.numpy(), gradients.numpy())
+    return values.to(p_WQ.device), gradients.to(p_WQ.device)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

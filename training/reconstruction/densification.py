@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.quaternions import rotate
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering
 
@@ -110,11 +111,3 @@ class DefaultStrategy:
         if huge:
             bad |= splats.scales.max(dim=1).values > _HUGE * self._reach(splats["means"])
         splats.rebuild(torch.nonzero(~bad)[:, 0])
-
-
-def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Returns the vectors (N, 3) turned by the quaternions (N, 4) wxyz of any length but zero."""
-    q = torch.nn.functional.normalize(quats, dim=1)
-    w, axis = q[:, :1], q[:, 1:]
-    across = 2 * torch.linalg.cross(axis, vectors)
-    return vectors + w * across + torch.linalg.cross(axis, across)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.densification import rotate
+from splatpilot.training.reconstruction.quaternions import rotate
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering
 
@@ -117,6 +117,8 @@ def _share(splats: SplatParameters, chosen: Tensor) -> None:
     """Gives each of the chosen Gaussians, which are to be copied as often as they occur, its part
     of what it was."""
     rows, copies = torch.unique(chosen, return_counts=True)
-    opacities, scales = share_out(splats.opacities[rows], splats.scales[rows], copies + 1)
+    # Of the parameters alone: the smallest scale is added to those of the copies again.
+    scales = torch.exp(splats["log_scales"][rows])
+    opacities, scales = share_out(splats.opacities[rows], scales, copies + 1)
     splats.overwrite("logit_opacities", torch.logit(opacities.clamp(1e-6, 1 - 1e-6)), rows)
     splats.overwrite("log_scales", torch.log(scales), rows)

@@ -35,8 +35,6 @@ class Objective:
         perceptual: Callable[[Tensor, Tensor], Tensor] | None,
     ):
         self._config, self._views, self._perceptual = config, views, perceptual
-        self._viewmats = views.viewmats.to(config.device)
-        self._K = views.K.to(config.device)
 
     def wants_distortion(self, step: int) -> bool:
         """Returns whether surfels are to render the spread along their rays in this step."""
@@ -52,7 +50,7 @@ class Objective:
         gain: Tensor,
         step: int,
         backdrop: Tensor,
-        sharp: bool,
+        outlines: bool,
     ) -> Tensor:
         """Returns a scalar.
 
@@ -63,12 +61,12 @@ class Objective:
             gain: brightness of its image.
             step: of all, from which what is random follows.
             backdrop: (1, 3), a colour.
-            sharp: fits outlines in place of colours.
+            outlines: fits these in place of colours.
         """
         config, device = self._config, self._config.device
         depth = self._views.depths[k].to(device)
         edges = self._views.edges[k].to(device).float()
-        if sharp:
+        if outlines:
             loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
         else:
             target = self._views.target(k, gain, backdrop.cpu()[0]).to(device)
@@ -80,9 +78,8 @@ class Objective:
             seen = rendering.meta["gaussian_ids"]
             seen = seen[torch.from_numpy(rng.random(len(seen)) < _HELD).to(device)]
             means, quats, scales = (values[seen] for values in gaussians[:3])
-            on_surface = surface_loss(
-                means, quats, scales, self._viewmats[k], self._K[0], depth, rng
-            )
+            viewmat, K = self._views.camera(k, device)
+            on_surface = surface_loss(means, quats, scales, viewmat[0], K[0], depth, rng)
             loss = loss + config.surface_weight * on_surface
         return loss + self._surfel_loss(rendering, step)
 

@@ -36,8 +36,6 @@ _ON_SURFACE = 0.25
 _GAIN_FITS = (0.1, 0.2, 0.4)
 # Steps from one time that the limits of the scales are found to the next.
 _LIMIT_EVERY = 500
-# One step in so many of a view with outlines before the infinitely far fits these.
-_SHARP_EVERY = 2
 
 
 class Optimization:
@@ -79,8 +77,6 @@ class Optimization:
         both = far.flatten(1).any(dim=1) & solid.flatten(1).any(dim=1)
         self._outlined = both.tolist() if config.outline_weight > 0 else [False] * len(views)
         self._objective = Objective(config, views, perceptual)
-        self._viewmats = views.viewmats.to(config.device)
-        self._K = views.K.to(config.device)
         self.center, self.extent = views.extent()
         near = _ON_SURFACE if config.initialization == "depth" else 1.0
         self._means_rate = near * config.means_rate * self.extent
@@ -145,25 +141,25 @@ class Optimization:
         decay = _LAST_RATE ** (self.step / config.iterations)
         splats.set_rate("means", self._means_rate * decay)
         k = self._image_of_step(self.step)
-        viewmat = self._viewmats[k : k + 1]
+        viewmat, K = self._views.camera(k, config.device)
         backdrop = self._backdrop_of_step(self.step)
-        sharp = self._outlined[k] and self.step % _SHARP_EVERY == _SHARP_EVERY - 1
+        outlines = self._outlined[k] and self.step % 2 == 1
         rendering = render(
             config.representation,
             self._gaussians(),
             viewmat,
-            self._K,
+            K,
             self._views.width,
             self._views.height,
             background=backdrop,
             depth_mode=config.depth_mode,
-            eps2d=0.0 if sharp else EPS2D,
+            eps2d=0.0 if outlines else EPS2D,
             absgrad=config.absgrad and config.strategy == "default",
             distortion=self._objective.wants_distortion(self.step),
             renderer=self._renderer,
         )
         loss = self._objective.loss(
-            rendering, self._gaussians(), k, self.gains[k], self.step, backdrop, sharp
+            rendering, self._gaussians(), k, self.gains[k], self.step, backdrop, outlines
         )
         if config.strategy == "mcmc":
             loss = loss + mcmc.penalty(splats)
@@ -171,7 +167,7 @@ class Optimization:
             self._strategy.watch(rendering)
         loss.backward()
         if self._strategy is not None:
-            self._strategy.observe(rendering, splats, viewmat, self._K)
+            self._strategy.observe(rendering, splats, viewmat, K)
         splats.step()
         self.step += 1
         if self.step in self._gain_steps:
@@ -222,8 +218,7 @@ class Optimization:
         return render(
             self._config.representation,
             self._gaussians(),
-            views.viewmats[k : k + 1].to(self._config.device),
-            views.K.to(self._config.device),
+            *views.camera(k, self._config.device),
             views.width,
             views.height,
             depth_mode="MD",

@@ -84,17 +84,14 @@ class SplatParameters:
 
     @property
     def scales(self) -> Tensor:
-        """(N, 3) [m], within the limits."""
-        smallest, largest = (limit[:, None] for limit in self._limits)
-        scales = torch.sqrt(torch.exp(2 * self["log_scales"]) + smallest**2)
-        return torch.minimum(scales, largest)
+        """(N, 3) [m], to which the smallest are added."""
+        smallest = self._limits.smallest[:, None]
+        return torch.sqrt(torch.exp(2 * self["log_scales"]) + smallest**2)
 
-    @torch.no_grad()
     def limit_scales(self, limits: ScaleLimits) -> None:
-        """Sets the limits; parameters that are beyond the largest come back to it, where their
-        gradient does not end."""
+        """Sets the limits; what is beyond the largest comes back to it, now and after each step."""
         self._limits = limits
-        self["log_scales"].clamp_(max=torch.log(limits.largest)[:, None])
+        self._clamp_scales()
 
     @property
     def opacities(self) -> Tensor:
@@ -111,6 +108,7 @@ class SplatParameters:
         """Moves all parameters along their gradients, and forgets these."""
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        self._clamp_scales()
 
     @torch.no_grad()
     def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
@@ -158,3 +156,8 @@ class SplatParameters:
             scales[:, 2] = _FLAT
         arrays = (self["means"], self["quats"], scales, opacities, self.sh)
         return GaussianScene(*(a[visible].cpu().numpy() for a in arrays))
+
+    @torch.no_grad()
+    def _clamp_scales(self) -> None:
+        # The parameters themselves: the gradient of a clamped function would end at the limit.
+        self["log_scales"].clamp_(max=torch.log(self._limits.largest)[:, None])

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.training.reconstruction.densification import rotate
 from splatpilot.training.reconstruction.losses import FAR
+from splatpilot.training.reconstruction.quaternions import rotate
 
 # Of its depth, how far from a surface a point may stand to belong to it.
 _REACH = 0.05
@@ -48,8 +48,8 @@ def surface_loss(
         u, v, _ = (p_CQ / z.clamp(min=_NEAREST)[:, None] @ K.T).floor().long().unbind(dim=1)
         inside = (z > _NEAREST) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         truth = depth[v.clamp(0, height - 1), u.clamp(0, width - 1)]
-        near = (truth > 0) & (truth < FAR) & ((z - truth).abs() < _REACH * truth)
-        near &= inside
+        known = inside & (truth > 0) & (truth < FAR)
+        near = known & ((z - truth).abs() < _REACH * truth)
     return (z[near] / truth[near]).log().abs().sum() / near.sum().clamp(min=1)
 
 

@@ -123,6 +123,10 @@ class ReconstructionViews:
     def __len__(self) -> int:
         return len(self.images)
 
+    def camera(self, k: int, device: str) -> tuple[Tensor, Tensor]:
+        """Returns X_CW (1, 4, 4) and K (1, 3, 3) [px] of view k on a device."""
+        return self.viewmats[k : k + 1].to(device), self.K.to(device)
+
     def extent(self) -> tuple[NDArray[np.float64], float]:
         """Returns the mean position (3,) [m] of the cameras and 1.1 times the largest distance from
         it [m], by which learning rates and sizes are scaled; 1 m if all stand in one place."""

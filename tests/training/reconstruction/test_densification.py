@@ -4,7 +4,7 @@ import torch
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.densification import DefaultStrategy, rotate
+from splatpilot.training.reconstruction.densification import DefaultStrategy
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import render
 
@@ -108,10 +108,3 @@ def test_gradients_are_those_of_places_on_the_image(representation):
                 change = loss(splats["means"] + step)[1] - loss(splats["means"] - step)[1]
                 slope.append(change.item() / 0.02 * half)
             assert strategy.gradients[i].item() == pytest.approx(np.hypot(*slope), rel=0.3)
-
-
-def test_rotation_by_quaternions():
-    """A quarter turn about z, by a quaternion of any length, takes x to y."""
-    q = torch.tensor([[2.0, 0, 0, 2.0]])
-    turned = rotate(q, torch.tensor([[1.0, 0, 0.5]]))
-    np.testing.assert_allclose(turned, [[0, 1, 0.5]], atol=1e-6)

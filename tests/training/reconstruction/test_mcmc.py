@@ -7,6 +7,7 @@ import torch
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.mcmc import McmcStrategy, share_out
+from splatpilot.training.reconstruction.scale_limits import ScaleLimits
 from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 
 RATES = {
@@ -62,6 +63,19 @@ def test_dead_gaussians_move_to_living_ones():
     assert same.any(dim=1).all()
     strategy.refine(2, splats)
     assert len(splats) == 215
+
+
+def test_what_is_added_to_scales_is_added_once():
+    """Gaussians whose smallest scale is far above their own share out their own alone."""
+    splats = SplatParameters.of_scene(scene(50, np.full(50, 0.9)), 0, RATES, "cpu")
+    largest = splats["log_scales"].max().item()
+    splats.limit_scales(ScaleLimits(torch.full((50,), 5.0), torch.full((50,), torch.inf)))
+    config = ReconstructConfig(
+        strategy="mcmc", refine_start=1, refine_every=1, iterations=10, noise=0.0
+    )
+    McmcStrategy(config).refine(1, splats)
+    assert len(splats) == 52
+    assert splats["log_scales"].max().item() <= largest
 
 
 def test_noise_moves_faint_gaussians_along_their_own_axes():

@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.splats.gaussian_ply import read_ply
-from splatpilot.training.captures.capture import SfmPoints, no_depth
+from splatpilot.training.captures.capture import CaptureFrame, SfmPoints, no_depth
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.initialization import (
+    Detail,
+    gaussians_from_depth,
     gaussians_from_points,
     random_points,
 )
@@ -149,6 +152,33 @@ def test_gains_that_are_fitted_leave_the_images_as_they_were(tmp_path, room):
     optimization.run()
     assert (views.gains == 1).all()
     assert np.ptp(optimization.gains.numpy()) > 1e-3
+
+
+def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
+    """Seen through a depth camera, which has no blur, a plate before the sky is opaque up to its
+    edge: with the outlines in the loss fewer of its pixels are holes than without."""
+    K = np.array([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]])
+    v, u = np.mgrid[:48, :64] + 0.5
+    frames = []
+    for x in np.linspace(-0.3, 0.3, 5):
+        on_plate = (np.abs((u - 32) / 40 * 2 + x) < 0.8) & (np.abs((v - 24) / 40 * 2) < 0.6)
+        image = np.where(on_plate[..., None], 150, 200).repeat(3, axis=2).astype(np.uint8)
+        depth = np.where(on_plate, 2.0, np.inf).astype(np.float32)
+        frames.append(CaptureFrame(image, depth, RigidTransform([x, 0, 0]), K))
+    views = ReconstructionViews(frames, Photometry(np.ones(5), 0.0))
+    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2, "opacity": 0.9}
+    detail = Detail(max_gaussians=300, optimized=True, **cells)
+    start = gaussians_from_depth(frames, Photometry(np.ones(5), 0.0), detail)
+    holes = []
+    for weight in (0.0, 1.0):
+        config = replace(CONFIG, iterations=200, strategy="none", outline_weight=weight)
+        checkpoint = Checkpoint(tmp_path / f"{weight}", config, views)
+        run = Optimization(config, views, views, (0.0, 0.0, 0.0), lambda: start, checkpoint)
+        run.run()
+        measured = run.measure()
+        assert measured is not None
+        holes.append(measured.means()["hole_fraction"])
+    assert holes[1] < holes[0]
 
 
 def test_unknown_scale_is_never_flown_in(tmp_path, room):

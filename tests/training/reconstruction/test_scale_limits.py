@@ -61,9 +61,9 @@ def test_no_gaussian_may_span_the_view_of_a_camera():
 
 
 def test_scales_keep_their_limits():
-    """The smallest is added in squares: 3 mm and 4 mm are 5 mm; none is beyond the largest, from
-    which parameters come back. Rows that are kept keep their limits, added ones have none, and they
-    come back from a state."""
+    """The smallest is added in squares: 3 mm and 4 mm are 5 mm; what is beyond the largest comes
+    back to it, also after a step. Rows that are kept keep their limits, added ones have none, and
+    they come back from a state."""
     tensors = {
         "means": torch.zeros(3, 3),
         "quats": torch.ones(3, 4),
@@ -82,3 +82,20 @@ def test_scales_keep_their_limits():
     assert torch.equal(again.scales, splats.scales)
     splats.rebuild(torch.tensor([1]), {name: tensor[:1] for name, tensor in tensors.items()})
     assert splats.scales[:, 0].tolist() == pytest.approx([5e-3, 3e-3])
+
+
+def test_gaussians_at_their_largest_can_shrink_again():
+    """Scales come back to the largest after each step that would take them beyond it, and leave it
+    where the gradient of what is rendered says so."""
+    tensors = {"means": torch.zeros(1, 3), "log_scales": torch.full((1, 3), 0.5).log()}
+    tensors["logit_opacities"] = torch.zeros(1)
+    splats = SplatParameters(tensors, dict.fromkeys(tensors, 0.1))
+    splats.limit_scales(ScaleLimits(torch.zeros(1), torch.tensor([0.2])))
+    for sign, expected in ((-1, 0.2), (-1, 0.2), (1, 0.19)):
+        (sign * splats.scales.sum()).backward()
+        splats.step()
+        assert splats.scales[0].tolist() == pytest.approx([expected] * 3, rel=0.1)
+    for _ in range(20):
+        splats.scales.sum().backward()
+        splats.step()
+    assert splats.scales.max() < 0.15
