@@ -39,7 +39,6 @@ from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import require_writable_folder, written_atomically
-from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
 from splatpilot.systems.visualization.video_recorder import colorize_depth
 
@@ -62,9 +61,7 @@ def BuildSplatBackgroundDiagram(world: World, width: int = 640, height: int = 48
     """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
-    scene_graph.AddRenderer(
-        RENDERER, SplatRenderEngine(world.baked, background=mean_color(world.background))
-    )
+    scene_graph.AddRenderer(RENDERER, SplatRenderEngine(world.baked, background=world.background))
     _add_bodies(plant)
     plant.Finalize()
     camera = _make_camera(world, width, height)

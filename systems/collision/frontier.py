@@ -10,9 +10,7 @@ from scipy.ndimage import binary_dilation, label, maximum_filter
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.distance_transform import distance_to_voxels, occupancy_distances
 from splatpilot.systems.collision.esdf import Esdf
-
-_SKY = 150.0
-"""[m], depth from which on a pixel shows the sky; some renderers give it a large number."""
+from splatpilot.systems.splats.background import FAR
 
 
 def reachable_space(esdf: Esdf, radius: float) -> NDArray[np.bool_]:
@@ -71,8 +69,8 @@ def hidden_frontier(
     p_WV = esdf.lower_W + esdf.voxel_size * (index + 0.5)
     sky = np.zeros(len(index), dtype=bool)
     for depth, X_WC in zip(depths, X_WCs, strict=True):
-        if (depth >= _SKY).any():
-            sky |= _values_at(p_WV, depth, K, X_WC) >= _SKY
+        if (depth >= FAR).any():
+            sky |= _values_at(p_WV, depth, K, X_WC) >= FAR
     of_sky = np.zeros_like(first)
     of_sky[tuple(index[sky].T)] = True
     return first & ~_grown(of_sky), before

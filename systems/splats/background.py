@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pydrake.math import RigidTransform
 
+FAR = 150.0
+"""[m], depth from which on a pixel shows the infinitely far; some renderers give it a number."""
+
 # Where less than this of the light comes from behind, it is not looked up.
 _FAINT = 1e-3
 

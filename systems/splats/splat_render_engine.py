@@ -28,6 +28,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
+from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, pixel_rays
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.drake_images import (
     color_pixels,
@@ -58,7 +59,7 @@ class SplatRenderEngine(RenderEngine):
     depth D:
 
     - colour is c where d <= D, else C + (1 - A) c: a shape behind thin leaves shines through them,
-      and where nothing is seen, it is the background of the shapes' engine;
+      and where nothing is seen, it is the background of the shapes' engine or the environment;
     - depth is the lesser of d and D, planar z in metres, 0 nearer than the camera's depth range and
       infinity beyond it; where the Gaussians have no surface, it is d;
     - labels are those of the shapes where d <= D or there is no D, else
@@ -76,7 +77,7 @@ class SplatRenderEngine(RenderEngine):
         self,
         scene: BakedScene,
         shapes: RenderEngine | None = None,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        background: Background = BLACK,
     ):
         """
         Args:
@@ -85,14 +86,15 @@ class SplatRenderEngine(RenderEngine):
                 RenderEngineVtk in front of `background` when None, which needs an OpenGL that works
                 without a display (Debian: libegl1 libegl-mesa0 libgl1-mesa-dri libglib2.0-0
                 libx11-6 libsm6).
-            background: colour behind everything, red, green, blue in [0, 1], for the default
-                `shapes`; any other engine has its own.
+            background: what is behind everything: a colour, red, green, blue in [0, 1], of the
+                default `shapes`, where any other engine has its own; or an environment, for all.
 
         Raises:
             ValueError: `background` is not three numbers in [0, 1].
         """
         super().__init__()
-        color = np.asarray(background, dtype=float)
+        environment = background if isinstance(background, EnvironmentMap) else None
+        color = np.asarray(BLACK if isinstance(background, EnvironmentMap) else background)
         if color.shape != (3,) or not np.all((color >= 0) & (color <= 1)):
             raise ValueError(f"background is {background}; it must be three numbers in [0, 1]")
         if shapes is None:
@@ -102,15 +104,17 @@ class SplatRenderEngine(RenderEngine):
         # A SceneGraph of our own: the poses of what an engine holds are moved by SceneGraph alone.
         scene_graph = SceneGraph()
         scene_graph.AddRenderer(_SHAPES, shapes)
-        self._share(scene, scene_graph)
+        self._share(scene, environment, scene_graph)
         self._source = scene_graph.RegisterSource(_SHAPES)
         self._frames: dict[GeometryId, FrameId] = {}  # of every geometry ever registered
         self._X_WG: dict[FrameId, RigidTransform] = {}
         self._geometries: dict[GeometryId, GeometryId] = {}  # theirs to that in _scene_graph
         self._X_WC = RigidTransform()
 
-    def _share(self, scene: BakedScene, scene_graph: SceneGraph) -> None:
-        self._scene = scene
+    def _share(
+        self, scene: BakedScene, environment: EnvironmentMap | None, scene_graph: SceneGraph
+    ) -> None:
+        self._scene, self._environment = scene, environment
         self._scene_graph = scene_graph
         self._context: Context | None = None  # stale after registration and removal
         self._last_view: tuple[bytes, RenderedView] | None = None
@@ -118,7 +122,8 @@ class SplatRenderEngine(RenderEngine):
     def __deepcopy__(self, memo: dict) -> "SplatRenderEngine":
         copy = type(self).__new__(type(self))
         RenderEngine.__init__(copy)
-        copy._share(self._scene, cast(SceneGraph, self._scene_graph.Clone()))
+        scene_graph = cast(SceneGraph, self._scene_graph.Clone())
+        copy._share(self._scene, self._environment, scene_graph)
         copy._source = self._source
         copy._frames = dict(self._frames)
         copy._X_WG = dict(self._X_WG)
@@ -184,8 +189,14 @@ class SplatRenderEngine(RenderEngine):
     def DoRenderColorImage(self, camera: ColorRenderCamera, color_image_out: ImageRgba8U) -> None:
         view = self._view(camera.core())
         behind = np.asarray(self._shapes().RenderColorImage(*self._same(camera)).data)
-        shape_in_front = self._shape_depth(camera.core()) <= view.depth  # (H, W)
+        shape_depth = self._shape_depth(camera.core())
+        shape_in_front = shape_depth <= view.depth  # (H, W)
         behind = behind[..., :3].astype(np.float32) / 255
+        if self._environment is not None:
+            rows, columns = np.nonzero(np.isinf(shape_depth))
+            K = camera.core().intrinsics().intrinsic_matrix()
+            v_W = pixel_rays(K, rows, columns, self._X_WC)
+            behind[rows, columns] = self._environment.color(v_W)
         blended = view.color + (1 - view.alpha[..., None]) * behind
         color = np.where(shape_in_front[..., None], behind, blended)
         out = np.asarray(color_image_out.mutable_data)  # (H, W, 4)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from splatpilot.systems.splats.background import FAR
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.losses import FAR
 
 # A cell is flat if its inverse depth differs from a plane by less than this fraction (rms).
 _FLATNESS = 2e-3

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.splats.background import (
     BLACK,
+    FAR,
     Background,
     EnvironmentMap,
     pixel_rays,
     texel_of,
 )
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.photometry import Photometry
 
 _HEIGHT, _WIDTH = 128, 256  # texels, powers of two

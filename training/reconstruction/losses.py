@@ -14,13 +14,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
 from splatpilot import _native
+from splatpilot.systems.splats.background import FAR
 
 WINDOW = 11  # [px] of SSIM
 SIGMA = 1.5  # [px]
 C1, C2 = 0.01**2, 0.03**2
-
-FAR = 150.0
-"""[m], true depth from which on a pixel shows the infinitely far, as the sky."""
 
 
 def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:

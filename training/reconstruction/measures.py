@@ -8,11 +8,11 @@ import torch
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.splats.background import Background, put_behind
+from splatpilot.systems.splats.background import FAR, Background, put_behind
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.losses import FAR, photometric_loss
+from splatpilot.training.reconstruction.losses import photometric_loss
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.vignette import vignette

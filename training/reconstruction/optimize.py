@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from splatpilot.systems.splats.background import Background
+from splatpilot.systems.splats.background import FAR, Background
 from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.splats.rasterization import EPS2D
@@ -17,7 +17,6 @@ from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.densification import DefaultStrategy
-from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
 from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
 from splatpilot.training.reconstruction.objective import Objective

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
+from splatpilot.systems.splats.background import FAR
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.lens import back_project
-from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.vignette import radius_squared
 
 STRIDE = 2

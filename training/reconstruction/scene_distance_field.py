@@ -11,11 +11,11 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
+from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.losses import FAR
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.views import ShrunkFrames
 

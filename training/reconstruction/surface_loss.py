@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.training.reconstruction.losses import FAR
+from splatpilot.systems.splats.background import FAR
 from splatpilot.training.reconstruction.quaternions import rotate
 
 # Of its depth, how far from a surface a point may stand to belong to it.

@@ -12,8 +12,9 @@ from pydrake.math import RigidTransform
 from torch import Tensor
 from tqdm import tqdm
 
+from splatpilot.systems.splats.background import FAR
 from splatpilot.training.captures.capture import Capture, CaptureFrame
-from splatpilot.training.reconstruction.losses import FAR, depth_edge_weights
+from splatpilot.training.reconstruction.losses import depth_edge_weights
 from splatpilot.training.reconstruction.photometry import Photometry
 
 # Depths within a pixel that differ by more than this fraction belong to different surfaces.

@@ -35,6 +35,7 @@ from pydrake.systems.sensors import (
     RgbdSensor,
 )
 
+from splatpilot.systems.splats.background import EnvironmentMap, pixel_rays
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -244,6 +245,21 @@ def test_a_given_engine_renders_the_shapes():
     params = RenderEngineVtkParams(default_clear_color=[1, 0, 1])
     engine = SplatRenderEngine(wall(-4.0), MakeRenderEngineVtk(params))
     assert np.all(color(engine) == [255, 0, 255, 255])
+
+
+def test_an_environment_is_behind_everything():
+    """Each pixel that shows neither Gaussians nor shapes has the colour of its direction."""
+    texels = np.zeros((4, 8, 3), np.float32)
+    texels[:2], texels[2:] = (0.2, 0.4, 0.6), (0.8, 0.1, 0.2)
+    environment = EnvironmentMap(texels)
+    engine = SplatRenderEngine(wall(-4.0), background=environment)
+    add_box(engine, 3.0)
+    rows, columns = np.array([CORNER[0], HEIGHT - 2]), np.array([CORNER[1], WIDTH - 2])
+    v_W = pixel_rays(INFO.intrinsic_matrix(), rows, columns, RigidTransform())
+    seen = color(engine)
+    np.testing.assert_allclose(seen[rows, columns, :3] / 255, environment.color(v_W), atol=0.01)
+    assert is_green(seen[CENTRE])
+    assert is_orange(color(SplatRenderEngine(wall(4.0), background=environment))[CENTRE])
 
 
 @pytest.mark.parametrize("background", [(0, 0), (0, 0, 1.5), (0, 0, np.nan)])
