@@ -7,18 +7,24 @@ from splatpilot.analysis.commands.overrides import add_overrides
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    train = verbs.add_parser("train", help="train a policy")
+    train = verbs.add_parser("train", help="train policies")
     train.set_defaults(verb=_train)
     train.add_argument(
-        "policy",
+        "policies",
         metavar="POLICY",
+        nargs="+",
         help="name of a trainer, such as diffaero, or module:attribute of one of your own",
     )
     train.add_argument(
         "--out",
         type=Path,
         required=True,
-        help="folder to write; an interrupted run of the same configuration goes on there",
+        help="folder to write; an interrupted run of the same configuration goes on there; several "
+        "runs have folders in it, POLICY or seed_N or both",
+    )
+    train.add_argument("--seeds", type=int, nargs="+", metavar="N", help="train with each of these")
+    train.add_argument(
+        "--jobs", type=int, metavar="N", help="runs at a time, one core each; default: cores"
     )
     train.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
     train.add_argument(
@@ -34,22 +40,31 @@ def _train(options: argparse.Namespace) -> None:
     from splatpilot.analysis.benchmark.study import StudyConfig
     from splatpilot.diagrams.scenario_files import scenario_file
     from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies.registry import TRAINERS
-    from splatpilot.training.policies.train import run
+    from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
 
+    if options.jobs is not None and options.jobs < 1:
+        raise ValueError(f"--jobs is {options.jobs}; it must be at least 1")
     scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
     for name in scenarios:
         scenario_file(name)  # before the training, not after it
-    trainer = TRAINERS.find(options.policy)
-    summary = run(
-        config=load_config(trainer.config(), options.config, options.overrides),
-        out=options.out,
-        make=trainer.make,
-    )
+    runs = []
+    for policy in options.policies:
+        for seed in options.seeds or [None]:
+            overrides = [*options.overrides, *([] if seed is None else [f"seed={seed}"])]
+            config = load_config(TRAINERS.find(policy).config(), options.config, overrides)
+            out = options.out
+            if len(options.policies) > 1:
+                out = out / policy.rpartition(":")[2]
+            if seed is not None:
+                out = out / f"seed_{seed}"
+            runs.append(TrainingRun(policy, config, out))
+    summaries = run_side_by_side(runs, options.jobs or available_cores())
     if scenarios:
-        study = StudyConfig(
-            scenarios=scenarios,
-            policies=[str(options.out / f"{summary['policy']}.npz")],
-            seeds=5,
-        )
+        weights = [
+            str(run.out / f"{summary['policy']}.npz")
+            for run, summary in zip(runs, summaries, strict=True)
+        ]
+        study = StudyConfig(scenarios=scenarios, policies=weights, seeds=5)
         benchmark.run(config=study, out=options.out / "benchmark")

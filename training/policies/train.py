@@ -33,7 +33,7 @@ class NotFiniteError(ValueError):
 
 @one_torch_thread()
 def run[Config: TrainingConfig](
-    *, config: Config, out: Path, make: Callable[[Config], Trainer]
+    *, config: Config, out: Path, make: Callable[[Config], Trainer], bar_line: int = 0
 ) -> dict[str, Any]:
     """
     Trains a policy on one thread, from where an interrupted run of the same configuration in `out`
@@ -48,6 +48,7 @@ def run[Config: TrainingConfig](
             however often the run was interrupted.
         out: folder.
         make: the trainer of that configuration.
+        bar_line: line of the terminal, from the cursor down, for the progress bar.
 
     Returns:
         What `summary.json` says.
@@ -89,8 +90,8 @@ def run[Config: TrainingConfig](
         folder.write_curves(progress.curves)
 
     bar = tqdm(
-        total=schedule.updates, initial=progress.update, desc=trainer.policy, unit="update",
-        disable=None,
+        total=schedule.updates, initial=progress.update, unit="update", disable=None,
+        desc=f"{trainer.policy}, seed {config.seed}", position=bar_line,
     )  # fmt: skip
     with event_log(str(out) if schedule.tensorboard else "") as log, bar:
         while progress.update < schedule.updates:
@@ -110,18 +111,16 @@ def run[Config: TrainingConfig](
             for name, value in terms.items():
                 means[name] = value if name not in means else 0.98 * means[name] + 0.02 * value
             bar.set_postfix(_shown(progress), refresh=False)
-            due = progress.update % schedule.validate_every == 0
-            if due or progress.update == schedule.updates:
-                measured = trainer.evaluate()
+            keep, measure = schedule.due(progress.update)
+            if keep or measure:
+                measured = trainer.evaluate() if measure else {}
                 row = {"update": float(progress.update), **means, **measured}
                 progress.curves.append(row)
                 log(progress.update, row)
-                if measured["success"] >= progress.best.get("success", -1.0):
+                if measure and measured["success"] >= progress.best.get("success", -1.0):
                     progress.best = {"update": progress.update, **measured}
                     folder.write_weights(trainer.policy, trainer.spec, network, progress.best)
-            if due or progress.update % schedule.checkpoint_every == 0:
                 save()
-    save()
     summary = {
         "policy": trainer.policy,
         "seed": config.seed,
@@ -141,11 +140,9 @@ def run[Config: TrainingConfig](
 def _shown(progress: _Progress) -> dict[str, str]:
     """What the progress bar says: the loss, and the success measured last and best."""
     shown = {"loss": f"{sum(progress.means.values()):.3f}"}
-    if progress.curves:
-        shown |= {
-            "success": f"{progress.curves[-1]['success']:.0%}",
-            "best": f"{progress.best['success']:.0%}",
-        }
+    measured = [row["success"] for row in progress.curves if "success" in row]
+    if measured:
+        shown |= {"success": f"{measured[-1]:.0%}", "best": f"{progress.best['success']:.0%}"}
     return shown
 
 

@@ -15,7 +15,8 @@ class Schedule:
     # [-] Updates between two measurements of the success on held-out worlds; the weights of the
     # best are kept.
     validate_every: int = 200
-    # [-] Updates between two checkpoints that training goes on from when it was interrupted.
+    # [-] Updates between two checkpoints that training goes on from when it was interrupted, and
+    # between two rows of the curves.
     checkpoint_every: int = 100
     # [-] Step size of AdamW, which falls to nothing over the last part `decay` of the updates.
     learning_rate: float = 1e-3
@@ -36,6 +37,13 @@ class Schedule:
                 raise ValueError(f"schedule.{name} is {getattr(self, name)}; it must be positive")
         if not 0.0 <= self.decay <= 1.0:
             raise ValueError(f"schedule.decay is {self.decay}; it must be between 0 and 1")
+
+    def due(self, update: int) -> tuple[bool, bool]:
+        """Whether to keep a checkpoint after an update, and whether to measure the success: also
+        with the first checkpoint, so that curves and weights are there early, and at the end."""
+        keep, last = update % self.checkpoint_every == 0, update == self.updates
+        measure = update % self.validate_every == 0 or update == self.checkpoint_every
+        return keep or last, measure or last
 
     def factor(self, update: int) -> float:
         """What the step size is multiplied by at an update."""

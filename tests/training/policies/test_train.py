@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatpilot.analysis.cli import main
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies import policy_checkpoint
@@ -27,6 +28,7 @@ from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTrain
 from splatpilot.training.policies.evaluation import evaluate_agent
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
 from splatpilot.training.policies.train import run
 from splatpilot.training.policies.trainer import Schedule
 
@@ -76,7 +78,8 @@ def test_run_leaves_what_it_says(finished):
     assert checkpoint.provenance["revision"]
     assert load_config(DiffAeroTraining(), finished / "config.yaml") == tiny()
     rows = list(csv.DictReader((finished / "curves.csv").open()))
-    assert [float(row["update"]) for row in rows] == [3.0, 6.0]
+    measured = {float(row["update"]): row["success"] != "" for row in rows}
+    assert measured == {2.0: True, 3.0: True, 4.0: False, 6.0: True}
     assert {"velocity", "contact", "success", "collisions"} <= set(rows[0])
     summary = json.loads((finished / "summary.json").read_text())
     assert summary["updates"] == 6 and summary["seed"] == 0
@@ -97,6 +100,23 @@ def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
     assert_same(tmp_path, finished)
     rows = (tmp_path / "curves.csv").read_text()
     assert rows == (finished / "curves.csv").read_text()
+
+
+def test_runs_side_by_side_learn_as_if_alone(finished, tmp_path):
+    """Two seeds at once, in processes of their own, each end as if alone, in a folder each; where
+    one stops the other is finished, and the error names the folder and the reason."""
+    overrides = [argument for override in TINY for argument in ("--set", override)]
+    command = ["train", "diffaero", "--seeds", "0", "1", "--jobs", "2", "--out", str(tmp_path)]
+    assert main([*command, *overrides]) == 0
+    assert_same(tmp_path / "seed_0", finished)
+    assert json.loads((tmp_path / "seed_1" / "summary.json").read_text())["seed"] == 1
+    runs = [
+        TrainingRun("diffaero", tiny("schedule.learning_rate=1e30"), tmp_path / "diverges"),
+        TrainingRun("diffaero", tiny(), tmp_path / "beside"),
+    ]
+    with pytest.raises(ValueError, match="diverges: training stopped at update"):
+        run_side_by_side(runs, jobs=2)
+    assert_same(tmp_path / "beside", finished)
 
 
 @pytest.mark.parametrize("policy", ["depthnav", "agile_autonomy"])
