@@ -82,6 +82,21 @@ def test_a_slanted_plane_has_the_depth_of_the_plane(simd):
     np.testing.assert_allclose(view.depth[inside], truth[inside], rtol=2e-4)
 
 
+@pytest.mark.parametrize("simd", LEVELS)
+def test_large_gaussians_close_to_the_camera_are_no_haze(simd):
+    """Flat Gaussians of 0.3 m on a floor 0.5 m below a level camera, some of them beside it, have
+    the floor's depth up to the horizon and nothing above, however large they are on the image."""
+    X_CP = RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2), [0.0, 0.5, 0.0])
+    floor = wall(X_CP, 12.0, 12.0, step=0.3 / 0.7)
+    view = BakedScene(scene_of(floor), simd=simd).render(K, **SIZE, X_WC=RigidTransform())
+    truth = plane_depth(X_CP, **SIZE)
+    above = np.arange(SIZE["height"]) + 0.5 < K[1, 2]
+    assert (view.depth[above] == 0).all()
+    near = ~above[:, None] & (truth < 8.0)
+    assert near.mean() > 0.4
+    np.testing.assert_allclose(view.depth[near], truth[near], rtol=1e-3)
+
+
 def test_a_pixel_beside_an_edge_shows_what_is_behind():
     """Where a near wall ends before a far one every pixel reads one of the two, and the change is
     within a Gaussian's width of the edge; expected depth has values between them."""
