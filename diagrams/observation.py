@@ -53,7 +53,7 @@ def AddObservation(
         return {}
     config = getattr(policy, "camera", None) or getattr(scenario.policy, "camera", None)
     config, noise = config or OnboardCamera(), scenario.observation
-    camera = builder.AddNamedSystem("policy_camera", make_camera(config, world))
+    camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, noise.latency))
     if noise.latency > 0.0:
         delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(noise.latency))
         builder.Connect(state, delayed.GetInputPort("state"))
