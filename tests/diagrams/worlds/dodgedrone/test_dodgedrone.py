@@ -83,11 +83,13 @@ def test_a_course_repeats(course):
     """The same level and seed give the same bits of what stands and of what moves; the seed is
     added to the generator's own."""
     again = dodgedrone_world(DodgeDroneConfig("easy", first_seed=SEED + 1, voxel_size=0.5), 0)
+    assert again.moving and course.moving
     for time in (0.0, 11.0):
         np.testing.assert_array_equal(
             again.moving.balls.centers(time), course.moving.balls.centers(time)
         )
     same = dodgedrone_world(EASY, 1)
+    assert same.moving
     np.testing.assert_array_equal(same.gaussians.means, course.gaussians.means)
     np.testing.assert_array_equal(same.gaussians.sh, course.gaussians.sh)
     for one, two in zip(
