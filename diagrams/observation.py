@@ -13,7 +13,8 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 _TAKEN = {
     *("plant", "pose", "collision", "goal", "policy", "controller", "selector", "camera", "video"),
     *("policy_camera", "delayed_pose", "depth_noise", "color_noise"),
-    *("flight_visualizer", "camera_visualizer", "state_log", "command_log", "hypotheses_log"),
+    *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
+    *("state_log", "command_log", "hypotheses_log"),
 }
 """Names of the other systems of a flight."""
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 
 from splatpilot.diagrams.flight import Outcome, fly, sample_initial_state
@@ -115,3 +116,13 @@ def test_a_start_in_a_ball_is_refused(post_world):
     world = with_ball(post_world, falling(1.0, 0.0, 3.0) - [0.0, 0.0, 7.0])
     with pytest.raises(InfeasibleFlightError, match=r"start .* from the nearest surface"):
         sample_initial_state(hovering(), world)
+
+
+def test_meshcat_shows_the_ball_if_there_is_one(post_world):
+    """A flight drawn in Meshcat has the ball where it is; a world without balls has none."""
+    scenario, meshcat = hovering(), Meshcat()
+    world = with_ball(post_world, falling(1.0, 0.0, 3.0))
+    for flown, shown in ((post_world, False), (world, True)):
+        diagram = BuildFlightDiagram(scenario, flown, meshcat=meshcat)
+        assert diagram.HasSubsystemNamed("balls_visualizer") == shown
+        assert meshcat.HasPath("/splatpilot/balls/0") == shown
