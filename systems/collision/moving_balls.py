@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
-from splatpilot.systems.collision.distance_field import DistanceField, FieldSample, FieldState
+from splatpilot.systems.collision.distance_field import (
+    DistanceField,
+    Distances,
+    FieldSample,
+    FieldState,
+)
 
 
 class MovingBalls:
@@ -54,6 +59,12 @@ class MovingBalls:
         """A distance field with the balls in it, where they are at a time [s]."""
         return FieldWithBalls(field, self.centers(time), self.radii)
 
+    def along(self, field: DistanceField, times: ArrayLike) -> "DistancesAlongTrajectories":
+        """Distances, in a field with the balls in it, of trajectories sampled at `times` (S,)."""
+        return DistancesAlongTrajectories(
+            [self.among(field, float(time)) for time in np.asarray(times)]
+        )
+
 
 class FieldWithBalls:
     """The union of a distance field and balls: the nearer of both, where the field is known.
@@ -99,3 +110,20 @@ class FieldWithBalls:
     def _to_balls(self, p_WQ: np.ndarray) -> np.ndarray:
         """Signed distances (N, M) [m] of all points to all balls."""
         return cdist(p_WQ.reshape(-1, 3), self._centers) - self._radii
+
+
+class DistancesAlongTrajectories:
+    """Distances of trajectories, each sample's in a field of its own.
+
+    Args:
+        fields: S of them.
+    """
+
+    def __init__(self, fields: Sequence[Distances]) -> None:
+        self._fields = fields
+
+    def distance(self, p_WQ: ArrayLike) -> np.ndarray:
+        """Signed distances (N, S) [m] of the samples p_WQ (N, S, 3) [m] of N trajectories."""
+        p_WQ = np.asarray(p_WQ, dtype=float)
+        samples = zip(self._fields, p_WQ.swapaxes(0, 1), strict=True)
+        return np.column_stack([field.distance(p) for field, p in samples])

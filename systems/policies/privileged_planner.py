@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
 
-from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.infeasible import InfeasibleFlightError
@@ -60,7 +60,7 @@ def plan(
     toa: TimeOfArrival,
     lattice: TrajectoryLattice,
     params: QuadrotorParams | None = None,
-    obstacles: DistanceField | None = None,
+    obstacles: Distances | None = None,
 ) -> Hypotheses:
     """The best K distinct trajectories from a state, cheapest first.
 
@@ -74,8 +74,8 @@ def plan(
         toa: the time of arrival at the goal, over the same grid.
         lattice: the trajectories to choose from.
         params: the vehicle's; drag and gravity tell its acceleration from its attitude.
-        obstacles: what trajectories keep away from, `field` by default: another one if something
-            moves, of which the way to the goal takes no account.
+        obstacles: what trajectories keep away from, `field` by default; what moves is in it, and
+            not in the way to the goal.
 
     Raises:
         ValueError: if the state is not finite or its quaternion zero.
@@ -133,8 +133,8 @@ class PrivilegedPlanner(LeafSystem):
     Updates at ``rate`` (15 Hz) from time 0. Each plan holds the K best distinct ones of a
     lattice of quintic point-mass trajectories, by the cost of `LatticeConfig`. The time of arrival
     is computed once per goal (0.1 s for 400,000 voxels, 1 s for 3 million) and kept in the
-    Context's cache. What moves is known where it is at the time of planning, not where it will be,
-    and not to the time of arrival.
+    Context's cache. What moves is known ahead: each waypoint keeps clear of where it will be by
+    then. The time of arrival knows nothing of it.
 
     Raises:
         ValueError: from the constructor on a config out of range; from an update if the state is
@@ -203,7 +203,7 @@ class PrivilegedPlanner(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         time, obstacles = context.get_time(), None
         if self._moving is not None:
-            obstacles = self._moving.among(self._field, time)
+            obstacles = self._moving.along(self._field, time + self._lattice.sample_times)
         hypotheses = plan(
             time,
             np.asarray(self._state_port.Eval(context)),

@@ -111,6 +111,21 @@ def test_the_planner_leaves_room_to_a_ball(post_world):
     assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
 
 
+def test_the_planner_looks_ahead(post_world):
+    """A ball that crosses the way at 4 m/s, just when the planner would be there, is let pass or
+    passed: what counts is where it will be, not where it is."""
+    scenario = Scenario(timeout=15.0)
+    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    meeting = np.argmax(blind.states[:, 0] > 3.0)
+    way = 4.0 * (0.02 * np.arange(600) - blind.times[meeting])
+    path = blind.states[meeting, :3] + np.column_stack([0 * way, way, 0 * way])
+    world = with_ball(post_world, path)
+    hit = world.distances(blind.times, blind.states[:, :3]) - VEHICLE_RADIUS
+    assert hit.min() < -0.4
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
+
+
 def test_a_start_in_a_ball_is_refused(post_world):
     """A ball on the start at time 0 leaves the vehicle no room, wherever it is later."""
     world = with_ball(post_world, falling(1.0, 0.0, 3.0) - [0.0, 0.0, 7.0])

@@ -57,6 +57,18 @@ def test_the_field_is_that_of_everything_where_it_is(time):
     assert field.query(p_WQ[0, 0]).distance.shape == ()
 
 
+def test_samples_of_trajectories_meet_the_balls_of_their_times():
+    """Along trajectories the distance at each sample is that of the field at the sample's time."""
+    field = AnalyticDistanceField([Sphere([0.0, -2.0, 1.0], 0.7)], LOWER, UPPER)
+    times = np.array([0.2, 0.6, 1.1, 1.4])
+    p_WQ = np.random.default_rng(1).uniform(-4.0, 4.0, (30, 4, 3))
+    along = BALLS.along(field, times).distance(p_WQ)
+    assert along.shape == (30, 4)
+    for s, time in enumerate(times):
+        expected = BALLS.among(field, time).distance(p_WQ[:, s])
+        np.testing.assert_array_equal(along[:, s], expected)
+
+
 def test_the_middle_of_a_ball_has_no_gradient():
     """At its centre, where no direction leads out fastest, the gradient is zero and not NaN."""
     sample = BALLS.among(AnalyticDistanceField([], LOWER, UPPER), 0.0).query(PATHS[1][0])
