@@ -124,7 +124,7 @@ def conclude(
     print(format_table(table))
     if external := external_table(rows, config):
         folder.write_table("external.csv", external)
-        print(format_external(external))
+        print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
     for row in rows:
         if "reason" in row:
             print(f"{row['id']} could not be flown: {row['reason']}")
