@@ -43,7 +43,9 @@ class BallsVisualizer(LeafSystem):
         builder: DiagramBuilder, balls: MovingBalls, meshcat: Meshcat
     ) -> "BallsVisualizer":
         """Adds a visualizer of balls, named `balls_visualizer`."""
-        return builder.AddNamedSystem("balls_visualizer", BallsVisualizer(meshcat, balls))
+        visualizer = BallsVisualizer(meshcat, balls)
+        builder.AddNamedSystem("balls_visualizer", visualizer)
+        return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
