@@ -209,7 +209,7 @@ def _record(
         times=times,
         states=states,
         commands=commands,
-        clearances=world.distance_field.distance(QuadrotorState.of(states).p_WB) - VEHICLE_RADIUS,
+        clearances=world.distances(times, QuadrotorState.of(states).p_WB) - VEHICLE_RADIUS,
         hypotheses=_recorded_plans(diagram, root),
         wall_time=wall_time,
     )
@@ -233,13 +233,13 @@ def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:
 
 
 def _is_free(world: World, p_WQ: np.ndarray) -> bool:
-    sample = world.distance_field.query(p_WQ)
+    sample = world.field_at(0.0).query(p_WQ)
     return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
 
 
 def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
     """Raises InfeasibleFlightError unless the vehicle fits at p_WQ (3,) [m]."""
-    field = world.distance_field
+    field = world.field_at(0.0)
     sample = field.query(p_WQ)
     where = f"{what} {np.round(p_WQ, 3).tolist()}"
     if sample.state >= FieldState.UNKNOWN:

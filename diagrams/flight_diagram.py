@@ -100,7 +100,8 @@ def BuildFlightDiagram(
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
 
     builder.AddNamedSystem("plant", plant)
-    pose, collision = StateToPose(), EsdfCollision(world.distance_field)
+    balls = world.moving.balls if world.moving else None
+    pose, collision = StateToPose(), EsdfCollision(world.distance_field, balls)
     builder.AddNamedSystem("pose", pose)
     builder.AddNamedSystem("collision", collision)
     goal = builder.AddNamedSystem("goal", ConstantVectorSource(goal_of(scenario, world)))
@@ -177,6 +178,7 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
         near=config.clipping_near,
         far=config.clipping_far,
         background=world.background,
+        moving=world.moving.gaussians if world.moving else None,
     )
 
 

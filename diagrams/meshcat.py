@@ -12,6 +12,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.visualization.balls_visualizer import BallsVisualizer
 from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer
 from splatpilot.systems.visualization.drawing import (
     draw_distance_slice,
@@ -62,5 +63,7 @@ def AddMeshcat(
         meshcat,
         policy.GetOutputPort("hypotheses") if plans else None,
     )
+    if world.moving:
+        BallsVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
     camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
     CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)

@@ -13,7 +13,8 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 _TAKEN = {
     *("plant", "pose", "collision", "goal", "policy", "controller", "selector", "camera", "video"),
     *("policy_camera", "delayed_pose", "depth_noise", "color_noise"),
-    *("flight_visualizer", "camera_visualizer", "state_log", "command_log", "hypotheses_log"),
+    *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
+    *("state_log", "command_log", "hypotheses_log"),
 }
 """Names of the other systems of a flight."""
 
@@ -53,7 +54,7 @@ def AddObservation(
         return {}
     config = getattr(policy, "camera", None) or getattr(scenario.policy, "camera", None)
     config, noise = config or OnboardCamera(), scenario.observation
-    camera = builder.AddNamedSystem("policy_camera", make_camera(config, world))
+    camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, noise.latency))
     if noise.latency > 0.0:
         delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(noise.latency))
         builder.Connect(state, delayed.GetInputPort("state"))

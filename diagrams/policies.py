@@ -86,7 +86,9 @@ def register_policy(
 
 register_policy(
     PrivilegedPlannerConfig,
-    lambda config, world, vehicle: PrivilegedPlanner(world.esdf, config, vehicle),
+    lambda config, world, vehicle: PrivilegedPlanner(
+        world.esdf, config, vehicle, world.moving.balls if world.moving else None
+    ),
     name="planner",
     at_speed=lambda speed: PrivilegedPlannerConfig(lattice=LatticeConfig(speed=speed)),
 )

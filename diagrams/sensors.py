@@ -53,8 +53,8 @@ def register_sensor(config: type, build: Callable[[Any, World], System]) -> None
     SENSORS.add(config.__name__, SensorKind(config, build))
 
 
-def make_camera(config: OnboardCamera, world: World) -> SplatCamera:
-    """A camera that looks at the Gaussians of the world."""
+def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> SplatCamera:
+    """A camera that looks at the Gaussians of the world, as they were `latency` [s] ago."""
     return SplatCamera(
         world.baked,
         config.camera_info(),
@@ -62,6 +62,8 @@ def make_camera(config: OnboardCamera, world: World) -> SplatCamera:
         min_depth=config.min_depth,
         max_depth=config.max_depth,
         background=world.background,
+        moving=world.moving.gaussians if world.moving else None,
+        latency=latency,
     )
 
 

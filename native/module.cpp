@@ -84,10 +84,14 @@ RenderedFrame render(Renderer& renderer, const Means& means, const Quats& quats,
   return RenderedFrame(renderer.render(gaussians, camera, out, keep));
 }
 
-void render_baked(const BakedScene& scene, Renderer& renderer, const Intrinsics& K,
-                  const Pose& X_CW, int width, int height, double near_plane, double far_plane,
-                  double eps2d, const Floats<nb::shape<3>>& background, const Output& color,
-                  const Output& depth, const Output& alpha) {
+void render_baked(const BakedScene& scene, Renderer& renderer, const Means& means,
+                  const Quats& quats, const Means& scales, const Opacities& opacities,
+                  const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW, int width,
+                  int height, double near_plane, double far_plane, double eps2d,
+                  const Floats<nb::shape<3>>& background, const Output& color, const Output& depth,
+                  const Output& alpha) {
+  require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
+  const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
   const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d);
   check_size(color, camera, 3);
   check_size(depth, camera, 1);
@@ -95,7 +99,7 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Intrinsics&
   Image out{color.data(), 3, depth.data(), 1, DepthMode::kMedian, alpha.data(), {}};
   std::copy_n(background.data(), 3, out.background);
   const Exclusive use(renderer);
-  renderer.render(scene.arrays(), camera, out);
+  renderer.render(scene.arrays(), moving, camera, out);
 }
 
 }  // namespace
@@ -184,9 +188,10 @@ NB_MODULE(_native, m) {
             new (self) BakedScene(gaussian_arrays(means, quats, scales, opacities, sh, sh_degree));
           },
           nb::kw_only(), "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a);
-  m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, nb::kw_only(), "K"_a, "X_CW"_a,
-        "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a,
-        "depth"_a, "alpha"_a, "Writes colour, median depth and alpha.");
+  m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a,
+        "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
+        "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a, "depth"_a, "alpha"_a,
+        "Writes colour, median depth and alpha of the scene and of Gaussians among it.");
 
   bind_losses(m);
   bind_shape_worlds(m);

@@ -1,5 +1,6 @@
 #include "renderer.hpp"
 
+#include <algorithm>
 #include <atomic>
 #include <limits>
 #include <numeric>
@@ -30,13 +31,23 @@ std::shared_ptr<const Frame> Renderer::render(const GaussianArrays& gaussians, c
   return draw(camera, image, keep, gaussians.count, project);
 }
 
-std::shared_ptr<const Frame> Renderer::render(const BakedArrays& scene, const Camera& camera,
+std::shared_ptr<const Frame> Renderer::render(const BakedArrays& scene,
+                                              const GaussianArrays& moving, const Camera& camera,
                                               const Image& image) {
+  const size_t baked = scene.groups * 16;
+  // A chunk holds Gaussians of one kind.
+  const size_t first_moving = (baked + kChunkSize - 1) / kChunkSize * kChunkSize;
   const auto project = [&](size_t begin, size_t end, Splat* splats, DepthPlane* planes,
                            uint32_t* depth_bits) {
-    return kernels_.project_baked(scene, camera, begin, end, splats, planes, depth_bits);
+    if (begin < baked) {
+      return kernels_.project_baked(scene, camera, begin, std::min(end, baked), splats, planes,
+                                    depth_bits);
+    }
+    return kernels_.project(moving, camera, begin - first_moving, end - first_moving, splats,
+                            planes, depth_bits);
   };
-  return draw(camera, image, false, scene.groups * 16, project);
+  const size_t count = moving.count ? first_moving + moving.count : baked;
+  return draw(camera, image, false, count, project);
 }
 
 std::shared_ptr<const Frame> Renderer::render(const ProjectedArrays& projected,

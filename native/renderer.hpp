@@ -32,8 +32,9 @@ class Renderer {
 
   std::shared_ptr<const Frame> render(const GaussianArrays& gaussians, const Camera& camera,
                                       const Image& image, bool keep);
-  std::shared_ptr<const Frame> render(const BakedArrays& scene, const Camera& camera,
-                                      const Image& image);
+  // A baked scene, and among it Gaussians that are not: those that move.
+  std::shared_ptr<const Frame> render(const BakedArrays& scene, const GaussianArrays& moving,
+                                      const Camera& camera, const Image& image);
   std::shared_ptr<const Frame> render(const ProjectedArrays& projected, const Camera& camera,
                                       const Image& image, bool keep);
   // From the image to the frame's splats, in the order of the input; `gradients` and

@@ -6,6 +6,7 @@ from itertools import combinations
 from typing import Any
 
 from splatpilot.analysis.benchmark import html_page
+from splatpilot.analysis.benchmark.external import external_section, external_table
 from splatpilot.analysis.benchmark.figures import (
     draw_success_against_speed,
     draw_trajectories,
@@ -59,6 +60,7 @@ def write_report(
         _warnings(config, rows, absent, damaged),
         "<h2>Policies</h2>" + _policies(table) + _timing(config, rows, timings),
         "<h2>Beside the paper's Table I</h2>" + _paper(table, paper) if paper else "",
+        external_section(external_table(rows, config)),
         "<h2>Success against speed</h2>"
         + html_page.image(success_png, "Success rate against velocity"),
         "<h2>Trajectories through one field</h2>" + _trajectories(folder, config, rows),

@@ -7,6 +7,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.report import write_report
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout
 from splatpilot.analysis.benchmark.shard import Shard
@@ -121,6 +122,9 @@ def conclude(
     folder.write_table("table.csv", table)
     write_report(folder, config, rows, timings, table, absent, damaged)
     print(format_table(table))
+    if external := external_table(rows, config):
+        folder.write_table("external.csv", external)
+        print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
     for row in rows:
         if "reason" in row:
             print(f"{row['id']} could not be flown: {row['reason']}")

@@ -8,6 +8,7 @@
     timings/         how long each took, and where: all that differs between two runs of a study
     errors/          the traceback of a flight that stopped the study
     rollouts.csv, timings.csv, table.csv, report.html
+    external.csv     where others published figures about the scenarios
 
 A flight is there when its file in `rollouts/` is; files appear whole.
 """

@@ -27,6 +27,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         f"{QUICK_SEEDS} seeds, unless other ones are named",
     )
     benchmark.add_argument(
+        "--dodgedrone",
+        action="store_true",
+        help="the DodgeDrone challenge, easy, medium and hard, at 2, 3, 5 and 7 m/s, beside "
+        "published figures, unless other scenarios and speeds are named",
+    )
+    benchmark.add_argument(
         "--policies",
         metavar="A,B.npz,C:FIELD=VALUE,...",
         help="names, files of weights or module:Class, with LABEL= before and fields behind; "
@@ -63,6 +69,7 @@ def _names(text: str) -> list[str]:
 
 def _benchmark(options: argparse.Namespace) -> None:
     from splatpilot.analysis.benchmark import run as benchmark
+    from splatpilot.analysis.benchmark.external import DODGEDRONE, DODGEDRONE_SPEEDS
     from splatpilot.analysis.benchmark.shard import Shard
     from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
     from splatpilot.analysis.benchmark.variants import split_policies, sweep
@@ -72,6 +79,8 @@ def _benchmark(options: argparse.Namespace) -> None:
     if options.quick:
         config.scenarios, config.policies = list(QUICK_SCENARIOS), list(QUICK_POLICIES)
         config.seeds = QUICK_SEEDS
+    if options.dodgedrone:
+        config.scenarios, config.speeds = list(DODGEDRONE), list(DODGEDRONE_SPEEDS)
     for name in ("scenarios", "seeds"):
         value = getattr(options, name)
         if value is not None:

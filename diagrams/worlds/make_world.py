@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.worlds.branches import BranchesConfig, branches_blueprint
 from splatpilot.diagrams.worlds.clutter import ClutterConfig, clutter_blueprint
+from splatpilot.diagrams.worlds.dodgedrone.dodgedrone import DodgeDroneConfig, dodgedrone_world
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.forest.forest import forest_blueprint
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
@@ -14,11 +15,9 @@ from splatpilot.diagrams.worlds.over_under import OverUnderConfig, over_under_bl
 from splatpilot.diagrams.worlds.room import RoomConfig, room_blueprint
 from splatpilot.diagrams.worlds.scene import SceneConfig, read_scene_world
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.surfaces import merge
-from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.diagrams.worlds.solids.build import build
 from splatpilot.diagrams.worlds.walls import WallsConfig, walls_blueprint
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.registry import Registry
 
 
@@ -107,27 +106,6 @@ def make_blueprint(config: WorldConfig, seed: int) -> Blueprint:
     return plan(config, seed)
 
 
-def build(blueprint: Blueprint) -> World:
-    """Draws a blueprint's Gaussians and samples its distance grid."""
-    field = blueprint.distance_field
-    esdf = esdf_from_distance_field(field, blueprint.voxel_size)
-    light = blueprint.light(esdf)
-    if blueprint.gaussians is not None:
-        gaussians = blueprint.gaussians(light)
-    else:
-        solids = draw(blueprint, blueprint.solids, light)
-        gaussians = merge([solids, *blueprint.surroundings()])
-    return World(
-        name=blueprint.name,
-        gaussians=gaussians,
-        distance_field=field,
-        esdf=esdf,
-        background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),
-        p_WS=blueprint.p_WS,
-        p_WG=blueprint.p_WG,
-    )
-
-
 register_world(ForestConfig, make_blueprint=forest_blueprint)
 register_world(BranchesConfig, make_blueprint=branches_blueprint)
 register_world(ClutterConfig, make_blueprint=clutter_blueprint)
@@ -137,3 +115,4 @@ register_world(OverUnderConfig, make_blueprint=over_under_blueprint)
 register_world(SceneConfig, read_scene_world)
 register_world(InsertedConfig, inserted_world)
 register_world(OctomapConfig, octomap_world)
+register_world(DodgeDroneConfig, dodgedrone_world)

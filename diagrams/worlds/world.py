@@ -8,14 +8,27 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.moving_gaussians import MovingGaussians
+
+
+@dataclass(frozen=True, eq=False)
+class MovingBodies:
+    """What moves in a world, as functions of time alone."""
+
+    balls: MovingBalls  # what is hit
+    gaussians: MovingGaussians  # what cameras see of it
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What is flown in, everything in world frame W (z up, metres)."""
+    """What is flown in, everything in world frame W (z up, metres).
+
+    All fields but `moving` are about what stands.
+    """
 
     name: str
     gaussians: GaussianScene  # what cameras see
@@ -25,6 +38,20 @@ class World:
     background: Background  # what is seen where no Gaussian is
     p_WS: NDArray[np.float64]  # (3,) [m], default start
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
+    moving: MovingBodies | None = None
+
+    def field_at(self, time: float) -> DistanceField:
+        """What decides collisions at a time [s] of a flight."""
+        if self.moving is None:
+            return self.distance_field
+        return self.moving.balls.among(self.distance_field, time)
+
+    def distances(self, times: NDArray, p_WQ: NDArray) -> NDArray[np.float64]:
+        """The distances (N,) [m] of points p_WQ (N, 3) [m], each at its time, (N,) [s]."""
+        if self.moving is None:
+            return self.distance_field.distance(p_WQ)
+        rows = zip(times, p_WQ, strict=True)
+        return np.array([self.field_at(time).distance(p) for time, p in rows])
 
     @cached_property
     def baked(self) -> BakedScene:

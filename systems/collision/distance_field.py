@@ -30,6 +30,14 @@ class FieldSample(NamedTuple):
     state: np.ndarray  # (...,) uint8, a `FieldState`
 
 
+class Distances(Protocol):
+    """Signed distances of points, and nothing else about them."""
+
+    def distance(self, p_WQ: ArrayLike) -> np.ndarray:
+        """The distance (...,) [m] at the points p_WQ (..., 3) [m]."""
+        ...
+
+
 class DistanceField(Protocol):
     """A signed distance field over the box [lower_W, upper_W] of the world."""
 

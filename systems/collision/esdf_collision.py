@@ -8,6 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.collision.soft_barrier import in_collision, soft_barrier
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -39,7 +40,8 @@ class EsdfCollision(LeafSystem):
     outputs share one query of the field, which is held by reference.
 
     Args:
-        field: the truth about obstacles.
+        field: the truth about obstacles that stand.
+        moving: those that move, where they are at the Context's time.
         radius: of the vehicle [m].
         beta: sharpness of the barrier [1/m].
         margin: of the barrier [m].
@@ -59,6 +61,7 @@ class EsdfCollision(LeafSystem):
     def __init__(
         self,
         field: DistanceField,
+        moving: MovingBalls | None = None,
         radius: float = VEHICLE_RADIUS,
         beta: float = 4.0,
         margin: float = 1.0,
@@ -68,7 +71,7 @@ class EsdfCollision(LeafSystem):
             raise ValueError(f"EsdfCollision: the radius is {radius} m; it must not be negative.")
         if not beta > 0.0:
             raise ValueError(f"EsdfCollision: beta is {beta} 1/m; it must be positive.")
-        self._field = field
+        self._field, self._moving = field, moving
         state = self.DeclareVectorInputPort("state", 13)
         # Drake would never free a system that its own callbacks or a kept cache entry refer to:
         # hence a weak reference, and the entry's index.
@@ -79,7 +82,8 @@ class EsdfCollision(LeafSystem):
                 allocate=lambda: AbstractValue.Make(object()),
                 calc=lambda context, sample: collision._sample(context, sample),
             ),
-            prerequisites_of_calc={self.input_port_ticket(state.get_index())},
+            prerequisites_of_calc={self.input_port_ticket(state.get_index())}
+            | ({self.time_ticket()} if moving is not None else set()),
         )
         index, ticket = cache.cache_index(), cache.ticket()
 
@@ -99,4 +103,7 @@ class EsdfCollision(LeafSystem):
 
     def _sample(self, context: Any, sample: Any) -> None:
         state = np.asarray(self.get_input_port().Eval(context))
-        sample.set_value(self._field.query(QuadrotorState.of(state).p_WB))
+        field = self._field
+        if self._moving is not None:
+            field = self._moving.among(field, context.get_time())
+        sample.set_value(field.query(QuadrotorState.of(state).p_WB))

@@ -8,7 +8,9 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, ValueProducer
 
+from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
@@ -58,6 +60,7 @@ def plan(
     toa: TimeOfArrival,
     lattice: TrajectoryLattice,
     params: QuadrotorParams | None = None,
+    obstacles: Distances | None = None,
 ) -> Hypotheses:
     """The best K distinct trajectories from a state, cheapest first.
 
@@ -71,6 +74,8 @@ def plan(
         toa: the time of arrival at the goal, over the same grid.
         lattice: the trajectories to choose from.
         params: the vehicle's; drag and gravity tell its acceleration from its attitude.
+        obstacles: what trajectories keep away from, `field` by default; what moves is in it, and
+            not in the way to the goal.
 
     Raises:
         ValueError: if the state is not finite or its quaternion zero.
@@ -87,7 +92,7 @@ def plan(
     p_WB, v_WB, _, _ = QuadrotorState.of(state)
     _check_way_exists(p_WB, field, toa)
     a_WB = level_acceleration(R_WB, v_WB, params or QuadrotorParams())
-    positions_W, costs = lattice.best(p_WB, v_WB, a_WB, field, toa)
+    positions_W, costs = lattice.best(p_WB, v_WB, a_WB, obstacles or field, toa)
     waypoints_B = (positions_W[:, :NUM_WAYPOINTS] - p_WB) @ R_WB
     return Hypotheses(time, X_WB, waypoints_B, costs)
 
@@ -128,7 +133,8 @@ class PrivilegedPlanner(LeafSystem):
     Updates at ``rate`` (15 Hz) from time 0. Each plan holds the K best distinct ones of a
     lattice of quintic point-mass trajectories, by the cost of `LatticeConfig`. The time of arrival
     is computed once per goal (0.1 s for 400,000 voxels, 1 s for 3 million) and kept in the
-    Context's cache.
+    Context's cache. What moves is known ahead: each waypoint keeps clear of where it will be by
+    then. The time of arrival knows nothing of it.
 
     Raises:
         ValueError: from the constructor on a config out of range; from an update if the state is
@@ -146,6 +152,7 @@ class PrivilegedPlanner(LeafSystem):
         esdf: Esdf,
         config: PrivilegedPlannerConfig | None = None,
         params: QuadrotorParams | None = None,
+        moving: MovingBalls | None = None,
     ) -> None:
         """Constructs the planner.
 
@@ -153,6 +160,7 @@ class PrivilegedPlanner(LeafSystem):
             esdf: the scene; unknown space and all outside its box count as occupied.
             config: see `PrivilegedPlannerConfig`.
             params: the vehicle's, see `plan`.
+            moving: what moves in the scene.
         """
         super().__init__()
         self._config = config or PrivilegedPlannerConfig()
@@ -160,6 +168,7 @@ class PrivilegedPlanner(LeafSystem):
         self._params = params or QuadrotorParams()
         self._params.validate()
         self._field = esdf if esdf.occupied_outside else esdf.conservative()
+        self._moving = moving
         self._lattice = TrajectoryLattice(self._config.lattice)
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
@@ -192,12 +201,16 @@ class PrivilegedPlanner(LeafSystem):
         self.get_cache_entry(self._time_of_arrival).Eval(context)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        time, obstacles = context.get_time(), None
+        if self._moving is not None:
+            obstacles = self._moving.along(self._field, time + self._lattice.sample_times)
         hypotheses = plan(
-            context.get_time(),
+            time,
             np.asarray(self._state_port.Eval(context)),
             self._field,
             cast(TimeOfArrival, self.get_cache_entry(self._time_of_arrival).Eval(context)),
             self._lattice,
             self._params,
+            obstacles,
         )
         discrete_state.set_value(hypotheses.to_vector())

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, slowness
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -111,8 +111,9 @@ class TrajectoryLattice:
         self.config = config = config or LatticeConfig()
         config.validate()
         samples = np.arange(1, round(config.horizon / WAYPOINT_PERIOD) + 1)
+        self.sample_times = WAYPOINT_PERIOD * samples  # (S,) [s]
         self._basis = np.concatenate(
-            [quintic_basis(WAYPOINT_PERIOD * samples, config.horizon, order) for order in (0, 3)]
+            [quintic_basis(self.sample_times, config.horizon, order) for order in (0, 3)]
         )  # (2 S, 6)
         self._final_velocities_L = final_velocities(config)
 
@@ -144,14 +145,14 @@ class TrajectoryLattice:
         return Trajectories(positions=samples[0], jerks=samples[1])
 
     def costs(
-        self, trajectories: Trajectories, p_WB: np.ndarray, field: DistanceField, toa: TimeOfArrival
+        self, trajectories: Trajectories, p_WB: np.ndarray, field: Distances, toa: TimeOfArrival
     ) -> np.ndarray:
         """The costs (N,) of trajectories that start at p_WB (3,) [m], see `LatticeConfig`.
 
         Args:
             trajectories: N of them.
             p_WB: where they start [m].
-            field: a distance field that answers everywhere, as `Esdf.conservative()` does.
+            field: distances that are known everywhere, as those of `Esdf.conservative()` are.
             toa: the time of arrival at the goal.
         """
         config = self.config
@@ -175,7 +176,7 @@ class TrajectoryLattice:
         p_WB: np.ndarray,
         v_WB: np.ndarray,
         a_WB: np.ndarray,
-        field: DistanceField,
+        field: Distances,
         toa: TimeOfArrival,
     ) -> tuple[np.ndarray, np.ndarray]:
         """The positions (K, S, 3) [m] and costs (K,) of the K best distinct trajectories.

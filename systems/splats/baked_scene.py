@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from splatpilot import _native
+from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, PlacedGaussians
 from splatpilot.systems.splats.spherical_harmonics import degree_of
 
 if TYPE_CHECKING:
@@ -97,6 +98,7 @@ class BakedScene:
         near: float = 0.01,
         far: float = 1e10,
         background: "ArrayLike" = (0.0, 0.0, 0.0),
+        moving: PlacedGaussians = NO_GAUSSIANS,
     ) -> RenderedView:
         """Renders colour, median depth and alpha.
 
@@ -109,6 +111,7 @@ class BakedScene:
             near: Gaussians whose centre is nearer than this along z are left out [m].
             far: The same for those farther away [m].
             background: (3,) colour behind everything.
+            moving: Gaussians among those of the scene, in this image alone; trusted to be valid.
 
         Raises:
             ValueError: intrinsics, image size, depth range or background make no sense.
@@ -124,6 +127,8 @@ class BakedScene:
         _native.render_baked(
             self._scene,
             self._renderer,
+            **moving._asdict(),
+            sh_degree=degree_of(moving.sh.shape[1]),
             K=K,
             X_CW=X_CW,
             width=width,

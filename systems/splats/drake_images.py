@@ -13,6 +13,7 @@ from splatpilot.systems.splats.background import (
     put_behind,
 )
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, PlacedGaussians
 
 
 def render_view(
@@ -22,6 +23,7 @@ def render_view(
     near: float,
     far: float,
     background: Background = BLACK,
+    moving: PlacedGaussians = NO_GAUSSIANS,
 ) -> RenderedView:
     """What the pinhole camera of `camera_info` at X_WC sees; see `BakedScene.render`.
 
@@ -31,8 +33,8 @@ def render_view(
     width, height = camera_info.width(), camera_info.height()
     K = camera_info.intrinsic_matrix()
     if not isinstance(background, EnvironmentMap):
-        return scene.render(K, width, height, X_WC, near=near, far=far, background=background)
-    view = scene.render(K, width, height, X_WC, near=near, far=far)
+        return scene.render(K, width, height, X_WC, near, far, background, moving)
+    view = scene.render(K, width, height, X_WC, near, far, moving=moving)
     return put_behind(view, background, K, X_WC)
 
 

@@ -24,6 +24,7 @@ from splatpilot.systems.splats.drake_images import (
     surface_labels,
 )
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, MovingGaussians
 from splatpilot.systems.weakly import weakly
 
 
@@ -48,7 +49,7 @@ class SplatCamera(LeafSystem):
     `body_pose` is the pose X_WB of the body that carries the camera; the camera sits at X_WC = X_WB
     X_BC with x right, y down and z forward, and images all of colour, depth and labels from there.
     The images are rendered when a port is evaluated, once for all of them, and again only when the
-    pose has changed.
+    pose has changed, or the time where something moves.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in metres
     (`depth_image_32f`) or millimetres (`depth_image_16u`). As in Drake, nearer than `min_depth`
@@ -79,6 +80,8 @@ class SplatCamera(LeafSystem):
         near: float = 0.01,
         far: float = 1e10,
         background: Background = BLACK,
+        moving: MovingGaussians | None = None,
+        latency: float = 0.0,
     ):
         """
         Args:
@@ -90,6 +93,9 @@ class SplatCamera(LeafSystem):
             near, far: Gaussians whose centre is not between these planes are not drawn [m].
             background: colour behind everything, red, green, blue in [0, 1], or one for each
                 direction.
+            moving: what moves among the scene's Gaussians.
+            latency: age of the images [s]: what moves is where it was so long ago. The pose that
+                the camera is given must be as old.
 
         Raises:
             ValueError: if the depth range is empty or a focal length is not positive.
@@ -111,6 +117,7 @@ class SplatCamera(LeafSystem):
         self._depth_range = (min_depth, max_depth)
         self._clipping = (near, far)
         self._background = background
+        self._moving, self._latency = moving, latency
 
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
@@ -120,7 +127,7 @@ class SplatCamera(LeafSystem):
                 Value[object],  # pyright: ignore[reportArgumentType]
                 weakly(self._calc_view),
             ),
-            {pose_ticket},
+            {pose_ticket} if moving is None else {pose_ticket, self.time_ticket()},
         )
         # The index: Drake would never free a system that keeps the entry itself.
         self._view_index = view_entry.cache_index()
@@ -155,21 +162,25 @@ class SplatCamera(LeafSystem):
         """The pose of the camera in the body that carries it."""
         return self._X_BC
 
-    def render(self, X_WB: RigidTransform) -> RenderedView:
-        """The view from body pose X_WB: float colour, depth and alpha, before they become Drake
-        images.
+    def render(self, X_WB: RigidTransform, time: float = 0.0) -> RenderedView:
+        """The view from body pose X_WB at a time [s]: float colour, depth and alpha, before they
+        become Drake images.
         """
+        moving = NO_GAUSSIANS
+        if self._moving is not None:
+            moving = self._moving.at(max(0.0, time - self._latency))
         return render_view(
             self._scene,
             self._camera_info,
             X_WB @ self._X_BC,
             *self._clipping,
             background=self._background,
+            moving=moving,
         )
 
     def _calc_view(self, context, value) -> None:
         X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
-        value.set_value(self.render(X_WB))
+        value.set_value(self.render(X_WB, context.get_time()))
 
     def _view(self, context) -> RenderedView:
         return cast(RenderedView, self.get_cache_entry(self._view_index).Eval(context))

@@ -21,8 +21,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.worlds.gltf import write_gltf
-from splatpilot.diagrams.worlds.make_world import build
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.build import build
 from splatpilot.diagrams.worlds.solids.illumination import Sunlight
 from splatpilot.diagrams.worlds.solids.light import Daylight
 from splatpilot.diagrams.worlds.solids.solid import Solid

@@ -17,10 +17,12 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.collision.shapes import Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.visualization.balls_visualizer import BallsVisualizer
 from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer, picture_gltf
 from splatpilot.systems.visualization.drawing import (
     draw_distance_slice,
@@ -61,6 +63,22 @@ def test_flight_is_drawn_page_by_page(meshcat):
             assert meshcat.HasPath(f"/splatpilot/hypotheses/{page:05d}/{k}")
     assert not meshcat.HasPath("/splatpilot/trail/00004")
     assert not meshcat.HasPath("/splatpilot/hypotheses/00000/3")
+
+
+def test_balls_are_drawn_where_they_are(meshcat):
+    """Each ball has its radius, stands where it is at the time of the last picture, and far below
+    while it is nowhere."""
+    paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
+    balls = MovingBalls([0.5, 0.25], paths, period=0.1)
+    builder = DiagramBuilder()
+    builder.AddSystem(BallsVisualizer(meshcat, balls, period=0.1))
+    simulator = Simulator(builder.Build())
+    for time, places in ((0.15, [[2, 2, 3], [0, 0, -1000]]), (0.25, [[4, 2, 3], [0, 0, 1]])):
+        simulator.AdvanceTo(time)
+        for k, place in enumerate(places):
+            packed = msgpack.unpackb(meshcat._GetPackedTransform(f"/splatpilot/balls/{k}"))
+            assert packed["matrix"][12:15] == place
+    assert drawn(meshcat, "/splatpilot/balls/1")["geometries"][0]["radius"] == 0.25
 
 
 def drawn(meshcat, path: str) -> dict:
