@@ -129,6 +129,9 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
       const auto white = [&](const Vector16& a) { return whitened(columns, in.scale, a); };
       plane = depth_plane(camera, p_C.z, inverse_z, white(camera_axis(camera, 0)),
                           white(camera_axis(camera, 1)), white(d_W));
+      plane.seen = reaches_image(camera, p_C, [&](const Vector16& n) -> Vector16 {
+        return {dot(n, columns[0]), dot(n, columns[1]), dot(n, columns[2])};
+      });
     }
     uint32_t bits = lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, log2_opacity,
                                                 planes ? &plane : nullptr, pack));

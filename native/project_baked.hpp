@@ -63,8 +63,9 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
   if (planes) {
     plane = depth_plane(camera, p_C.z, inverse_z, whitened(L, camera_axis(camera, 0)),
                         whitened(L, camera_axis(camera, 1)), whitened(L, d_W));
+    plane.seen = reaches_image(camera, p_C, times_L);
   }
-  const uint32_t bits = lane_bits(
+  uint32_t bits = lane_bits(
       finish_projection(camera, p_C, inverse_z, p0, p1, field(9), planes ? &plane : nullptr, pack));
   if (!bits) return 0;
   if (planes) append_planes(plane, bits, planes);

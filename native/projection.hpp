@@ -95,9 +95,10 @@ struct SplatPack {
   F16 mean_x, mean_y, extent_x, extent_y, ux, uy, vy, log2_opacity, depth, slope_x, slope_y, reach;
 };
 
-// One pack per field of DepthPlane.
+// One pack per field of DepthPlane, and the lanes that the image shows a part of.
 struct PlanePack {
   F16 ux, uy, vy, l_x, l_y, b_xx, b_xy, b_yy, inverse_z;
+  Mask16 seen;
 };
 
 // From x, y and c, the camera's axes and the centre where the Gaussian is a unit sphere about c.
@@ -143,7 +144,25 @@ SP_INLINE F16 reach_of(const PlanePack& p, const SplatPack& splat, const Mask16&
   const F16 reach = (f + sqrt(f * f + rest)) / rest;
   const F16 s1 = splat.ux * a, s2 = splat.ux * b + splat.uy * d, s3 = splat.vy * d;
   const F16 stretch = select(held, max(s1 * s1 + s2 * s2 + s3 * s3, one), one);
-  return min(reach * sqrt(stretch), F16(kMostReach));
+  return select(p.seen, min(reach * sqrt(stretch), F16(kMostReach)), one);
+}
+
+// Lanes of which a part within kMaxExtent standard deviations is between the sides of the image.
+// `times_factor(n)` is n times a factor of the covariance.
+template <typename Times>
+SP_INLINE Mask16 reaches_image(const Camera& camera, const Vector16& p_C,
+                               const Times& times_factor) {
+  Mask16 seen = in_depth_range(camera, p_C.z);
+  for (int side = 0; side < 4; ++side) {
+    const float* n_C = camera.side_normal[side];
+    const float* R = camera.R_CW;
+    const auto in_world = [&](int axis) {
+      return F16(n_C[0] * R[axis] + n_C[1] * R[3 + axis] + n_C[2] * R[6 + axis]);
+    };
+    const Vector16 s = times_factor(Vector16{in_world(0), in_world(1), in_world(2)});
+    seen = seen & (dot(n_C, p_C) + F16(kMaxExtent) * sqrt(dot(s, s)) > F16(0.0f));
+  }
+  return seen;
 }
 
 SP_INLINE F16 largest_component(const Vector16& a) {
