@@ -15,8 +15,8 @@ struct StagedSplat {
 
 // A DepthPlane in the tile's own coordinates.
 struct StagedPlane {
-  float mean_x, mean_y;
-  DepthPlane of;
+  float ux, uy, u0, vy, v0;
+  float w_x, w_y, w, mean_w;
 };
 
 SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
@@ -28,7 +28,9 @@ SP_INLINE StagedSplat in_tile(const Splat& s, float left, float top) {
 }
 
 SP_INLINE StagedPlane in_tile(const DepthPlane& p, const Splat& s, float left, float top) {
-  return {s.mean_x - left, s.mean_y - top, p};
+  const float x = s.mean_x - left, y = s.mean_y - top;
+  return {p.ux,  p.uy,  -(p.ux * x + p.uy * y),        p.vy, -(p.vy * y),
+          p.w_x, p.w_y, p.w - (p.w_x * x + p.w_y * y), p.w};
 }
 
 SP_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
@@ -39,23 +41,17 @@ SP_INLINE F16 alpha_at(const StagedSplat& splat, const F16& x, const F16& y) {
 }
 
 // Lets the light through one splat without blur; returns whether any pixel has half of it left.
-// Those that do take the splat's depth, in case it takes the half: as l and as q / z.
+// Those that do take the splat's depth, in case it takes the half.
 SP_INLINE bool seek_median(const StagedPlane& plane, float log2_opacity, const F16& x, const F16& y,
-                           F16& transmittance, F16& median_l, F16& median_q) {
-  const DepthPlane& p = plane.of;
-  const F16 half = F16(0.5f), one = F16(1.0f);
-  const F16 dx = x - F16(plane.mean_x), dy = y - F16(plane.mean_y);
-  const F16 u = F16(p.ux) * dx + F16(p.uy) * dy;
-  const F16 v = F16(p.vy) * dy;
-  const F16 l = one + (F16(p.l_x) * dx + F16(p.l_y) * dy);
-  const F16 b = dx * (F16(p.b_xx) * dx + F16(p.b_xy) * dy) + F16(p.b_yy) * (dy * dy);
-  const F16 q = max((l + l - one) + b, l * l);  // but for rounding it is never less
-  const F16 exponent = F16(log2_opacity) - (u * u + v * v) / q;
-  const Mask16 hit = (l > F16(0.0f)) & (exponent >= F16(kLog2AlphaCut));
-  const F16 alpha = zero_unless(hit, exp2(exponent));
-  const Mask16 open = transmittance > half;
-  median_l = select(open, l, median_l);
-  median_q = select(open, F16(p.inverse_z) * q, median_q);
+                           F16& transmittance, F16& median_w) {
+  const F16 half = F16(0.5f);
+  const F16 w = F16(plane.w_x) * x + (F16(plane.w_y) * y + F16(plane.w));
+  const F16 u = F16(plane.ux) * x + (F16(plane.uy) * y + F16(plane.u0));
+  const F16 v = F16(plane.vy) * y + F16(plane.v0);
+  const F16 divisor = min(w, F16(plane.mean_w));
+  const F16 exponent = F16(log2_opacity) - (u * u + v * v) / (divisor * divisor);
+  const F16 alpha = zero_unless(exponent >= F16(kLog2AlphaCut), exp2(exponent));
+  median_w = select(transmittance > half, w, median_w);
   transmittance = transmittance - transmittance * alpha;
   return any(transmittance > half);
 }

@@ -64,6 +64,10 @@ SP_INLINE void covariance_factor(const F16 q[4], const F16 scale[3], Vector16 co
                 scale[2] * (one - two * (x * x + y * y))};
 }
 
+SP_INLINE F16 dot(const Vector16& a, const Vector16& b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
 // Asks for the first `used` floats of rows that are read soon, all at once.
 SP_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint32_t* indices,
                              uint32_t bits) {
@@ -95,10 +99,18 @@ SP_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, u
   }
 }
 
-// a along the axes of a Gaussian, in its standard deviations.
-SP_INLINE Vector16 whitened(const Vector16 columns[3], const F16 scale[3], const Vector16& a) {
-  const auto along = [&](int k) { return dot(columns[k], a) / (scale[k] * scale[k]); };
-  return {along(0), along(1), along(2)};
+// In the camera frame: the inverse covariance times p_C, up to scale, from the columns of its
+// factor.
+SP_INLINE Vector16 plane_normal(const Camera& camera, const Vector16 columns[3], const F16 scale[3],
+                                const Vector16& d_W) {
+  const F16 least = min(min(scale[0], scale[1]), scale[2]);
+  Vector16 n_W = {F16(0.0f), F16(0.0f), F16(0.0f)};
+  for (int k = 0; k < 3; ++k) {
+    const F16 ratio = least / scale[k];
+    const Vector16 axis = (F16(1.0f) / scale[k]) * columns[k];
+    n_W = n_W + (ratio * ratio * dot(axis, d_W)) * axis;
+  }
+  return to_camera(camera, n_W);
 }
 
 inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size_t begin,
@@ -124,20 +136,14 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
 
     SplatPack pack;
-    PlanePack plane;
-    if (planes) {
-      const auto white = [&](const Vector16& a) { return whitened(columns, in.scale, a); };
-      plane = depth_plane(camera, p_C.z, inverse_z, white(camera_axis(camera, 0)),
-                          white(camera_axis(camera, 1)), white(d_W));
-      plane.seen = reaches_image(camera, p_C, [&](const Vector16& n) -> Vector16 {
-        return {dot(n, columns[0]), dot(n, columns[1]), dot(n, columns[2])};
-      });
-    }
-    uint32_t bits = lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, log2_opacity,
-                                                planes ? &plane : nullptr, pack));
+    uint32_t bits =
+        lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, log2_opacity, pack));
     if (candidate_count - first < kLanes) bits &= (1u << (candidate_count - first)) - 1;
     if (!bits) continue;
-    if (planes) append_planes(plane, bits, planes + count);
+    if (planes) {
+      const Vector16 n_C = plane_normal(camera, columns, in.scale, d_W);
+      append_planes(depth_plane(camera, p_C, inverse_z, p0, p1, n_C), bits, planes + count);
+    }
     F16 color[3];
     gather_colors(g, indices, bits, d_W, color);
     count += append_splats(pack, color, bits, indices, splats + count, depth_bits + count);

@@ -36,10 +36,18 @@ SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
   return lane_bits(visible);
 }
 
-// The inverse of the lower-triangular L times a.
-SP_INLINE Vector16 whitened(const F16 L[6], const Vector16& a) {
-  const F16 x = a.x / L[0], y = (a.y - L[1] * x) / L[2];
-  return {x, y, (a.z - L[3] * x - L[4] * y) / L[5]};
+// In the camera frame: the inverse of L L^T times d_W, up to scale: multiplied by (L00 L11 L22)^2,
+// which takes no division.
+SP_INLINE Vector16 plane_normal(const Camera& camera, const F16 L[6], const Vector16& d_W) {
+  const F16 L11_L22 = L[2] * L[5];
+  const F16 y0 = d_W.x * L11_L22;
+  const F16 rest = d_W.y * L[0] - L[1] * d_W.x;
+  const F16 y1 = rest * L[5];
+  const F16 y2 = (d_W.z * L[0] - L[3] * d_W.x) * L[2] - L[4] * rest;
+  const F16 n2 = L[0] * L[2] * y2;
+  const F16 n1 = L[0] * (L[5] * y1 - L[4] * y2);
+  const F16 n0 = L11_L22 * y0 - L[1] * (L[5] * y1 - L[4] * y2) - L[2] * L[3] * y2;
+  return to_camera(camera, {n0, n1, n2});
 }
 
 SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
@@ -59,16 +67,13 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
   };
   const Vector16 p0 = times_L(m[0]), p1 = times_L(m[1]);
   SplatPack pack;
-  PlanePack plane;
-  if (planes) {
-    plane = depth_plane(camera, p_C.z, inverse_z, whitened(L, camera_axis(camera, 0)),
-                        whitened(L, camera_axis(camera, 1)), whitened(L, d_W));
-    plane.seen = reaches_image(camera, p_C, times_L);
-  }
-  uint32_t bits = lane_bits(
-      finish_projection(camera, p_C, inverse_z, p0, p1, field(9), planes ? &plane : nullptr, pack));
+  const uint32_t bits =
+      lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, field(9), pack));
   if (!bits) return 0;
-  if (planes) append_planes(plane, bits, planes);
+  if (planes) {
+    const Vector16 n_C = plane_normal(camera, L, d_W);
+    append_planes(depth_plane(camera, p_C, inverse_z, p0, p1, n_C), bits, planes);
+  }
 
   F16 color[3];
   const int coefficients = (scene.sh_degree + 1) * (scene.sh_degree + 1);

@@ -26,7 +26,7 @@ bool place(const ProjectedArrays& in, const Camera& camera, size_t i, Splat& s) 
   s.slope_y = static_cast<float>(xy / xx);
   s.depth = in.depths[i];
   s.index = static_cast<uint32_t>(i);
-  s.reach = 1.0f;
+  s.unused = 0;
   std::copy_n(in.colors + 3 * i, 3, s.color);
   s.log2_opacity = std::log2(std::max(in.opacities[i], 1e-30f));
 

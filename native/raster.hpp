@@ -14,9 +14,9 @@ constexpr int kStageWords = kStageSize / 64;
 // carried from splat to splat. Pixels outside the image start at 0, finished.
 struct BlockState {
   F16 transmittance, red, green, blue, depth, alpha;
-  // Of the median depth: what footprints without blur let through, and where that fell to one half,
-  // if it did.
-  F16 sharp_transmittance, median_l, median_q;
+  // Of the median depth: what footprints without blur let through, and the inverse depth at which
+  // that fell to one half, if it did.
+  F16 sharp_transmittance, median_w;
 };
 
 struct alignas(64) StagedTile {
@@ -97,7 +97,7 @@ SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneC
       if constexpr (kMedian) {
         if (seeking)
           seeking = seek_median(staged.planes[i], splat.log2_opacity, pixel.x, pixel.y,
-                                s.sharp_transmittance, s.median_l, s.median_q);
+                                s.sharp_transmittance, s.median_w);
       }
       const F16 alpha = alpha_at(splat, pixel.x, pixel.y);
       const F16 rest = s.transmittance * (F16(1.0f) - alpha);
@@ -143,7 +143,7 @@ SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPi
     store(pixels.depth, expected ? state.depth / max(state.alpha, F16(1e-10f)) : state.depth);
   }
   if constexpr (kMedian) {
-    const F16 z = state.median_l / max(state.median_q, F16(1e-10f));
+    const F16 z = F16(1.0f) / max(state.median_w, F16(1e-10f));
     store(pixels.depth, zero_unless(state.sharp_transmittance <= F16(0.5f), z));
   }
 }
@@ -201,7 +201,7 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const F16 zero = F16(0.0f);
     const F16 open = ones_inside(in.width, in.height, centres, left, top, b);
-    state[b] = {open, zero, zero, zero, zero, zero, open, zero, zero};
+    state[b] = {open, zero, zero, zero, zero, zero, open, zero};
     if (any(state[b].transmittance > zero)) inside |= 1u << b;
   }
 

@@ -133,7 +133,6 @@ SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const
   out.extent_y = min(select(regular, sqrt(yy), cut_y), most);
   out.slope_x = zero_unless(regular, xy * inverse_yy);
   out.slope_y = zero_unless(regular, xy / xx);
-  out.reach = one;
   out.ux = zero_unless(regular, ellipse_ux);
   out.uy = -(out.ux * out.slope_x);
   out.vy = zero_unless(regular, root * sqrt(inverse_yy));

@@ -56,15 +56,15 @@ SP_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float t
 // Which tiles to look at, and which blocks of one of them a splat touches.
 struct SplatFootprint {
   static SP_INLINE TileRange columns(const Splat& s, int tiles) {
-    return tile_range(s.mean_x, s.reach * s.extent_x, tiles);
+    return tile_range(s.mean_x, s.extent_x, tiles);
   }
   static SP_INLINE TileRange rows(const Splat& s, int tiles) {
-    return tile_range(s.mean_y, s.reach * s.extent_y, tiles);
+    return tile_range(s.mean_y, s.extent_y, tiles);
   }
   static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
     // A little more than log2(255 o), so that rounding here never hides a pixel.
     const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
-    return touched_blocks(s, grid, left, top, s.reach * s.reach * budget);
+    return touched_blocks(s, grid, left, top, budget);
   }
 };
 

@@ -20,8 +20,8 @@ constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
-// How many times as far as the affine one a footprint with perspective may be looked for.
-constexpr float kMostReach = 1e4f;
+// How far the inverse depth of a Gaussian may fall towards its rim, of that of its centre.
+constexpr float kMostFall = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.
 constexpr float kMaxExtent = 3.33f;
 // The exponent is kept in base 2 and in Cholesky form: alpha = exp2(log2 o - u^2 - v^2) with
@@ -55,23 +55,21 @@ struct alignas(64) Splat {
   float depth;             // z in the camera frame [m]
   float slope_x, slope_y;  // s01 / s11 and s01 / s00 of the 2D covariance
   uint32_t index;          // of the Gaussian in the input
-  float reach;             // how many times as far it may touch pixels, for its DepthPlane
+  uint32_t unused;
 };
 static_assert(sizeof(Splat) == 64);
 
-// How a Gaussian enters the median depth: the point of greatest density along a pixel's ray, and
-// how many standard deviations that is from the centre, both exact. With d = pixel - mean, l = 1 +
-// l_x dx + l_y dy and q = 2 l - 1 + b_xx dx^2 + b_xy dx dy + b_yy dy^2, the depth is l / q times
-// that of the centre, and u^2 / q, v^2 / q are as in Splat, without blur: for a ray r and the
-// inverse covariance A, q is r.A r and l is r.A c, both 1 for the ray to the centre c.
-struct alignas(16) DepthPlane {
+// How a Gaussian enters the median depth: the inverse depth of the point of greatest density along
+// a pixel's ray, W = w + w_x dx + w_y dy, which is the plane n . p = n . mean with
+// n = covariance^-1 mean, in the camera frame; and its footprint without blur, as in Splat but for
+// a division: u = (ux dx + uy dy) / min(W, w), v = vy dy / min(W, w). So the half that lies farther
+// from the camera has the perspective of what is flat; where large, it would be haze without.
+struct alignas(32) DepthPlane {
   float ux, uy, vy;
-  float l_x, l_y;          // [1/px]
-  float b_xx, b_xy, b_yy;  // [1/px^2]
-  float inverse_z;         // [1/m]
-  float unused[3];
+  float w_x, w_y, w;  // [1/(m px)], [1/m]
+  float unused[2];
 };
-static_assert(sizeof(DepthPlane) == 48);
+static_assert(sizeof(DepthPlane) == 32);
 
 // A splat in a tile and the blocks of the tile that it touches.
 struct Pair {

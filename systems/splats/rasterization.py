@@ -71,12 +71,13 @@ def rasterize(
     centre, plus eps2d on the diagonal. Contributions with a < 1/255 are skipped, and a pixel is
     finished before T would fall to 1e-4. Gaussians of equal depth blend in the order of the input.
 
-    z is the depth of the centre for "D" and "ED". The median depth is that of a surface, and of the
-    Gaussians as they are in space, without Jacobian and eps2d: z of the point of greatest density
-    along the pixel's ray, at the Gaussian where what passes, each time 1 - o exp(-d^T C^-1 d / 2)
-    for that point's offset d from the centre and the covariance C, falls to one half; 0 where it
-    never does. A pixel beside an edge shows what is behind, whatever tails reach it; a flat
-    Gaussian has the depth of its plane, and a large one close to the camera is no haze before it.
+    z is the depth of the centre for "D" and "ED". The median depth is that of a surface: z of the
+    point of greatest density along the pixel's ray, at the Gaussian where what passes through S
+    without eps2d falls to one half, and 0 where it never does. A pixel beside an edge shows what is
+    behind, whatever tails reach it, and a flat Gaussian has the depth of its plane, n . p = n . c
+    with n = covariance^-1 c for a centre c in the camera frame (Zhang et al. 2024, RaDe-GS). Where
+    z is more than that of the centre, d counts z / c_z times: a footprint without perspective would
+    be haze beyond the far end of what is large and close.
 
     Colour, depth and alpha are differentiable with respect to means, quats, scales, opacities,
     colors, viewmats (all twelve numbers, taken as free) and backgrounds; a Gaussian that is skipped
