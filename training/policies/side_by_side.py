@@ -41,7 +41,7 @@ def run_side_by_side(runs: Sequence[TrainingRun], jobs: int) -> list[dict[str, A
     jobs = min(jobs, len(runs))
     work = [delayed(_run)(run, line % jobs) for line, run in enumerate(runs)]
     try:
-        results: Any = Parallel(jobs, batch_size=1)(work)
+        results: Any = Parallel(jobs)(work)
     except TerminatedWorkerError as error:
         raise OSError(
             f"a training process was killed, perhaps for want of memory ({error}); run the same "
