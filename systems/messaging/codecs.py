@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from drake import lcmt_header
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.messaging.generated import (
     lcmt_body_rate_command,
@@ -40,8 +41,16 @@ class Codec:
     """The type of the messages."""
     frame: str = WORLD
     """`header.frame_name` of the messages."""
-    size: int
-    """The length of the array; images have `image` instead."""
+    size: int = 0
+    """The length of the array; 0 of images."""
+    image: ImageDepth32F | ImageRgba8U | None = None
+    """An image like those that travel, of signals that are images."""
+
+    def stamped(self, header: lcmt_header) -> Any:
+        """An empty message with a header."""
+        message = self.message()
+        message.header = header
+        return message
 
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:
         """The message, or None where there is nothing to say yet; `epoch` is the Unix time [s] of
@@ -59,8 +68,7 @@ class StateCodec(Codec):
     channel, port, message, size = "QUADROTOR_STATE", "state", lcmt_quadrotor_state, 13
 
     def pack(self, value, header, epoch):
-        message = lcmt_quadrotor_state()
-        message.header = header
+        message = self.stamped(header)
         message.p_WB, message.v_WB, message.q_WB, message.w_WB_B = QuadrotorState.of(value)
         return message
 
@@ -76,8 +84,7 @@ class CommandCodec(Codec):
     frame = BODY
 
     def pack(self, value, header, epoch):
-        message = lcmt_body_rate_command()
-        message.header = header
+        message = self.stamped(header)
         message.thrust, message.w_cmd_B = value[0], value[1:]
         return message
 
@@ -96,8 +103,7 @@ class VelocitySetpointCodec(Codec):
     )
 
     def pack(self, value, header, epoch):
-        message = lcmt_velocity_setpoint()
-        message.header = header
+        message = self.stamped(header)
         message.v_WB, message.heading = value[:3], value[3]
         return message
 
@@ -124,8 +130,7 @@ class HypothesesCodec(Codec):
         plan = Hypotheses.from_vector(value, self.num_hypotheses)
         if plan is None:
             return None
-        message = lcmt_trajectory_hypotheses()
-        message.header = header
+        message = self.stamped(header)
         message.plan_utime = round((epoch + plan.plan_time) * 1e6)
         message.waypoint_period = WAYPOINT_PERIOD
         message.p_WP = plan.X_WB.translation()
@@ -164,8 +169,8 @@ class MotionCaptureCodec(Codec):
         self.body = body
 
     def pack(self, value, header, epoch):
-        message = lcmt_motion_capture_pose()
-        message.header, message.body = header, self.body
+        message = self.stamped(header)
+        message.body = self.body
         message.tracked = bool(np.isfinite(value).all())
         message.p_WB, message.q_WB = value[:3], value[3:]
         return message
@@ -195,8 +200,7 @@ class DepthGridCodec(Codec):
         self.size = width * height
 
     def pack(self, value, header, epoch):
-        message = lcmt_depth_grid()
-        message.header = header
+        message = self.stamped(header)
         message.width, message.height = self.width, self.height
         message.max_range, message.encoding = self.max_range, lcmt_depth_grid.PROXIMITY
         message.num_values, message.values = self.size, value
@@ -223,8 +227,7 @@ class StatusCodec(Codec):
     frame = ""
 
     def pack(self, value, header, epoch):
-        message = lcmt_bridge_status()
-        message.header = header
+        message = self.stamped(header)
         message.mode = int(value[0])
         message.state_age, message.observation_age = value[1:3]
         message.num_gaps, message.num_rejected, message.num_overruns = map(int, value[3:])

@@ -33,15 +33,16 @@ class ImageCodec(Codec):
         image.size, image.row_stride = len(image.data), value.nbytes // image.height
         image.pixel_format, image.channel_type = self._format, self._type
         image.compression_method = lcmt_image.COMPRESSION_METHOD_ZLIB
-        message = lcmt_image_array()
-        message.header, message.num_images, message.images = header, 1, [image]
+        message = self.stamped(header)
+        message.num_images, message.images = 1, [image]
         return message
 
     def unpack(self, message, epoch):
         if message.num_images != 1:
             raise ValueError(f"there are {message.num_images} images; there must be one")
         [image] = message.images
-        pixels = np.asarray(self.image.data)  # type: ignore
+        assert self.image is not None
+        pixels = np.asarray(self.image.data)
         is_so = image.width, image.height, image.pixel_format, image.channel_type
         should_be = self.image.width(), self.image.height(), self._format, self._type
         if is_so != should_be:

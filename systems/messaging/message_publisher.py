@@ -1,6 +1,7 @@
 """MessagePublisher: sends what comes in on its port."""
 
 import math
+from typing import Any
 
 import numpy as np
 from drake import lcmt_header
@@ -9,7 +10,6 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, LeafSystem
 
 from splatpilot.systems.messaging.codecs import Codec
-from splatpilot.systems.messaging.image_codec import ImageCodec
 from splatpilot.systems.ports import input_port
 
 PUBLISH_OFFSET = 1e-6
@@ -58,10 +58,10 @@ class MessagePublisher(LeafSystem):
                 "and finite"
             )
         self._lcm, self._codec, self._period = lcm, codec, period
-        if isinstance(codec, ImageCodec):
-            self.DeclareAbstractInputPort(codec.port, Value(codec.image))
-        else:
+        if codec.image is None:
             self.DeclareVectorInputPort(codec.port, codec.size)
+        else:
+            self.DeclareAbstractInputPort(codec.port, Value(codec.image))
         self.DeclareVectorInputPort("unix_time", 1)
         self.DeclareVectorInputPort("enabled", 1)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
@@ -75,8 +75,8 @@ class MessagePublisher(LeafSystem):
         header.seq = round((context.get_time() - PUBLISH_OFFSET) / self._period)
         header.utime = round(unix_time * 1e6)
         header.frame_name = self._codec.frame
-        value = self.get_input_port(0).Eval(context)
-        array = np.asarray(value.data if isinstance(self._codec, ImageCodec) else value)
+        value: Any = self.get_input_port(0).Eval(context)
+        array = np.asarray(value if self._codec.image is None else value.data)
         message = self._codec.pack(array, header, unix_time - context.get_time())
         if message is not None:
             self._lcm.publish(self._codec.channel, message.encode())

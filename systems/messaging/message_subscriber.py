@@ -7,7 +7,7 @@ import weakref
 from collections import deque
 from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from lcm import LCM
@@ -15,7 +15,6 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from splatpilot.systems.messaging.codecs import Codec
-from splatpilot.systems.messaging.image_codec import ImageCodec
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.weakly import weakly
 
@@ -94,16 +93,17 @@ class MessageSubscriber(LeafSystem):
         subscription = lcm.subscribe(codec.channel, lambda _, data: inbox.append(data))
         weakref.finalize(self, lcm.unsubscribe, subscription)
         self.DeclareVectorInputPort("unix_time", 1)
-        is_image = isinstance(codec, ImageCodec)
+        image = codec.image
         if initial is None:
-            initial = np.asarray(codec.image.data) if is_image else np.full(codec.size, np.nan)
+            initial = np.full(codec.size, np.nan) if image is None else np.asarray(image.data)
         received = self.DeclareAbstractState(Value(Received(initial.copy())))
         ticket = {self.abstract_state_ticket(received)}
-        if is_image:
-            alloc = lambda: Value(codec.image)  # noqa: E731
-            self.DeclareAbstractOutputPort(codec.port, alloc, weakly(self._calc_image), ticket)
-        else:
+        if image is None:
             self.DeclareVectorOutputPort(codec.port, codec.size, self._calc_vector, ticket)
+        else:
+            self.DeclareAbstractOutputPort(
+                codec.port, lambda: Value(image), weakly(self._calc_image), ticket
+            )
         self.DeclareVectorOutputPort("age", 1, self._calc_age)
         for name in ("gaps", "rejected"):
             self.DeclareVectorOutputPort(name, 1, self._counter(name), ticket)
@@ -183,4 +183,4 @@ class MessageSubscriber(LeafSystem):
 
 
 def _received(context: Context) -> Received:
-    return context.get_abstract_state(0).get_value()
+    return cast(Received, context.get_abstract_state(0).get_value())

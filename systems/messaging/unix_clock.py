@@ -1,5 +1,6 @@
 """UnixClock: what time it is in the world outside."""
 
+import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from splatpilot.systems.ports import output_port
@@ -23,12 +24,12 @@ class UnixClock(LeafSystem):
 
     def __init__(self):
         super().__init__()
-        self.DeclareNumericParameter(BasicVector([0.0]))
+        self.DeclareNumericParameter(BasicVector(np.zeros(1)))
         self.DeclareVectorOutputPort("unix_time", 1, self._calc)
 
     def set_epoch(self, context: Context, epoch: float) -> None:
         """Sets the Unix time [s] of the Context's time 0."""
-        context.get_mutable_numeric_parameter(0).SetFromVector([epoch])
+        context.get_mutable_numeric_parameter(0).SetFromVector(np.array([epoch]))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         output[0] = context.get_numeric_parameter(0)[0] + context.get_time()

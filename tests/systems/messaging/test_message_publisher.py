@@ -32,7 +32,8 @@ def published(source: LeafSystem, until: float, enabled: float | None = None) ->
     heard = []
     transport.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
     builder = DiagramBuilder()
-    clock, source = builder.AddSystem(UnixClock()), builder.AddSystem(source)
+    clock = builder.AddSystem(UnixClock())
+    builder.AddSystem(source)
     publisher = builder.AddSystem(MessagePublisher(transport, CommandCodec(), 0.02))
     builder.Connect(source.get_output_port(), publisher.GetInputPort("command"))
     builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
