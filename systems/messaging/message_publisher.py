@@ -32,9 +32,9 @@ class MessagePublisher(LeafSystem):
     - ``unix_time`` (1): [s], see :class:`UnixClock`.
     - ``enabled`` (1), optional: nothing is sent while it is 0.
 
-    Publishes every ``period`` seconds from time 0, a microsecond later. Stateless: the sequence
-    number is the Context's time in periods, so that a message that was not sent is missing. What it
-    sends on, an ``lcm.LCM``, is outside the Context.
+    Publishes every ``period`` seconds from time 0, a microsecond later, and when forced. Stateless:
+    the sequence number is the Context's time in periods, so that a message that was not sent is
+    missing. What it sends on, an ``lcm.LCM``, is outside the Context.
     """
 
     unix_time_input_port = input_port("unix_time")
@@ -65,6 +65,7 @@ class MessagePublisher(LeafSystem):
         self.DeclareVectorInputPort("unix_time", 1)
         self.DeclareVectorInputPort("enabled", 1)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
+        self.DeclareForcedPublishEvent(self._publish)
 
     def _publish(self, context: Context) -> None:
         enabled = self.GetInputPort("enabled")

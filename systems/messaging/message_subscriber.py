@@ -21,6 +21,9 @@ from splatpilot.systems.weakly import weakly
 MAX_AHEAD = 0.1
 """[s] by which the clock of who sends may be ahead of ours."""
 
+_QUEUE = 1000
+"""Messages that wait at most; further ones are lost. LCM's 30 are but half a second of states."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -33,6 +36,9 @@ class Received:
     seq: int = 0
     gaps: int = 0
     rejected: int = 0
+
+    def __deepcopy__(self, memo: dict) -> "Received":
+        return self  # Nothing in it changes: Contexts, which copy it at every update, may share it.
 
 
 class MessageSubscriber(LeafSystem):
@@ -62,7 +68,7 @@ class MessageSubscriber(LeafSystem):
 
     Takes what has come every ``period`` seconds from time 0, in an unrestricted update: discrete
     updates of the same instant see it. All of that is in the Context; outside of it are the
-    ``lcm.LCM``, which keeps 30 messages, and what other subscribers made it deliver meanwhile.
+    ``lcm.LCM``, which keeps 1000 messages, and what other subscribers made it deliver meanwhile.
     """
 
     unix_time_input_port = input_port("unix_time")
@@ -91,6 +97,7 @@ class MessageSubscriber(LeafSystem):
         self._lcm, self._codec = lcm, codec
         self._inbox = inbox = deque[bytes]()
         subscription = lcm.subscribe(codec.channel, lambda _, data: inbox.append(data))
+        subscription.set_queue_capacity(_QUEUE)
         weakref.finalize(self, lcm.unsubscribe, subscription)
         self.DeclareVectorInputPort("unix_time", 1)
         image = codec.image
@@ -134,7 +141,10 @@ class MessageSubscriber(LeafSystem):
                 received = replace(received, rejected=received.rejected + 1)
                 if received.rejected & (received.rejected - 1) == 0:
                     _log.warning(
-                        "%s: message refused, the %dth: %s", self.channel, received.rejected, error
+                        "%s: a message is refused, %d so far: %s",
+                        self.channel,
+                        received.rejected,
+                        error,
                     )
         state.get_mutable_abstract_state(0).set_value(received)
 
