@@ -46,8 +46,9 @@ def run_in_real_time(
     clock = diagram.GetSubsystemByName("clock")
     assert isinstance(clock, UnixClock)
     clock_context = clock.GetMyMutableContextFromRoot(root)
+    simulator.Initialize()  # Here and in the first tick is made what is kept for the whole flight.
     clock.set_epoch(clock_context, time.time())
-    simulator.AdvanceTo(2 * PUBLISH_OFFSET)  # Here is made what is kept for the whole flight.
+    simulator.AdvanceTo(2 * PUBLISH_OFFSET)
     ready()
     # The wall clock is not read again: when it is set, messages do not seem to be older.
     epoch, started, number, overruns = time.time(), time.monotonic(), 0, 0

@@ -18,8 +18,8 @@ from splatpilot.systems.messaging.codecs import Codec
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.weakly import weakly
 
-MAX_AHEAD = 0.1
-"""[s] by which the clock of who sends may be ahead of ours."""
+MAX_AHEAD = 0.2
+"""[s] by which the clock of who sends may be ahead of ours, which is behind while we are busy."""
 
 _QUEUE = 1000
 """Messages that wait at most; further ones are lost. LCM's 30 are but half a second of states."""
@@ -63,7 +63,7 @@ class MessageSubscriber(LeafSystem):
     - ``gaps`` (1): how many messages were sent between those that came. A sender that starts again
       leaves no gap.
     - ``rejected`` (1): how many came but were of another type, malformed, not finite, in another
-      frame, no newer than the one before, or sent more than 0.1 s ahead of our clock. The reason is
+      frame, no newer than the one before, or sent more than 0.2 s ahead of our clock. The reason is
       logged at the first, second, fourth, eighth... rejection.
 
     Takes what has come every ``period`` seconds from time 0, in an unrestricted update: discrete

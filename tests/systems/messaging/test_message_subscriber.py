@@ -78,7 +78,7 @@ def test_a_burst_loses_nothing(listener):
         (command(1, 0.01, frame="ned"), "the frame is 'ned'; it must be 'body'"),
         (command(1, 0.0), "no newer than the one before"),
         (command(1, -0.1), "no newer than the one before"),
-        (command(1, 0.3), "ahead of our clock"),
+        (command(1, 0.4), "ahead of our clock"),
     ],
 )
 def test_messages_of_no_use_are_counted_and_logged(listener, data, reason, caplog):
