@@ -185,7 +185,7 @@ class MotionCaptureCodec(Codec):
 
 
 class DepthGridCodec(Codec):
-    """The proximity 1 - range / max_range (height * width), row by row from the top left."""
+    """The proximity 1 - range / max_range (height * width), row by row from the lowest."""
 
     channel, port, message = "DEPTH_GRID", "depth_grid", lcmt_depth_grid
 

@@ -58,7 +58,7 @@ class lcmt_depth_grid(object):
 
         self.values = []
         """
-        Row by row from the top of the image, each from its left.
+        Row by row, each from the left of the image: the lowest row first, as policies for time of flight see it.
         LCM Type: float[num_values]
         """
 
