@@ -26,6 +26,7 @@ def recorded(lcm: LCM, path: Path) -> Iterator[None]:
     subscription = lcm.subscribe(
         ".*", lambda channel, data: log.write_event(time.time_ns() // 1000, channel, data)
     )
+    subscription.set_queue_capacity(10_000)  # Nobody looks while a world is made.
     try:
         yield
     finally:

@@ -1,6 +1,8 @@
 """The flight diagram, cut in two between which messages travel."""
 
 import dataclasses
+import gc
+import weakref
 
 import lcm
 import numpy as np
@@ -159,3 +161,14 @@ def test_images_of_another_size_are_refused_by_the_other_half(post_world):
     assert (mode, image_age, rejected) == (lcmt_bridge_status.WAITING, np.inf, 5)
     assert state_age < 0.03
     assert not heard
+
+
+def test_both_halves_are_freed(post_world):
+    """Whoever drops the diagrams gets their memory back, though they share an LCM that stays."""
+    halves = Halves(Scenario(policy=policy_named("diffaero")), post_world)
+    transport, freed = halves.lcm, [weakref.ref(d) for d in (halves.vehicle, halves.hardware)]
+    halves.advance_to(0.1)
+    del halves
+    gc.collect()
+    assert [reference() for reference in freed] == [None, None]
+    assert transport is not None
