@@ -7,7 +7,7 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(wildcard native/*.hpp native/*.cpp)
 
-.PHONY: fly test lint stub sanitize nightly clean
+.PHONY: fly test lint stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly
@@ -24,6 +24,12 @@ lint: .venv/installed
 # Writes the types of the native module, after a change of its bindings.
 stub: .venv/installed
 	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file api/splatpilot/_native.pyi
+
+# Writes the Python of the messages, after a change in lcmtypes/.
+messages: .venv/installed
+	rm -rf build/messages systems/messaging/generated
+	.venv/bin/lcm-gen --python --ppath build/messages lcmtypes/*.lcm
+	mv build/messages/splatpilot systems/messaging/generated
 
 # The tests of the native kernels on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
 sanitize: .venv/installed

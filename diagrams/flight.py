@@ -12,7 +12,8 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
-from splatpilot.diagrams.flight_diagram import goal_of
+from splatpilot.diagrams.observation import images_of
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -142,7 +143,7 @@ def fly(
     wall_time = time.perf_counter() - started
 
     ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
-    return _record(diagram, root, world, ended, wall_time)
+    return record_flight(diagram, root, world, ended, wall_time)
 
 
 def decision_times(
@@ -156,7 +157,7 @@ def decision_times(
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     policy = diagram.GetSubsystemByName("policy")
     context = policy.GetMyContextFromRoot(root)
-    images = [n for n in ("depth_image_32f", "color_image") if policy.HasInputPort(n)]
+    images = images_of(policy)
     rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
     spent = np.zeros((count + 1, 2))  # [s]
     # The first time through, what is kept for the whole flight is made: it does not count.
@@ -190,9 +191,10 @@ def flight_outcome(
     return None
 
 
-def _record(
+def record_flight(
     diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
 ) -> Flight:
+    """What a flight left in the loggers of its diagram, which took `wall_time` [s]."""
     logs = {
         name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
         for name in ("state", "command")

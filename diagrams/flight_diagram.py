@@ -2,10 +2,9 @@
 
 from typing import cast
 
-import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import LogVectorOutput
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.diagrams.meshcat import AddMeshcat
@@ -15,16 +14,11 @@ from splatpilot.diagrams.observation import (
     decision_period,
     sensors_of,
 )
-from splatpilot.diagrams.policies import POLICIES
+from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, goal_of, require_ports
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.policies.hypotheses import num_hypotheses_in
-from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
 from splatpilot.systems.splats.splat_camera import SplatCamera
-from splatpilot.systems.vehicle.flatness_controller import FlatnessController
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
-from splatpilot.systems.vehicle.state_to_pose import StateToPose
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 LOG_PERIOD = 0.02  # [s]
@@ -93,49 +87,24 @@ def BuildFlightDiagram(
         )
     builder = DiagramBuilder()
     sensors = sensors_of(scenario, policy)
-    if policy is None:
-        policy = POLICIES.kind_of(scenario.policy).build(scenario.policy, world, scenario.vehicle)
-
     plant = cast(System, plant or QuadrotorPlant(scenario.vehicle))
-    controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
-
     builder.AddNamedSystem("plant", plant)
-    balls = world.moving.balls if world.moving else None
-    pose, collision = StateToPose(), EsdfCollision(world.distance_field, balls)
-    builder.AddNamedSystem("pose", pose)
-    builder.AddNamedSystem("collision", collision)
-    goal = builder.AddNamedSystem("goal", ConstantVectorSource(goal_of(scenario, world)))
-    builder.AddNamedSystem("policy", policy)
-    builder.AddNamedSystem("controller", controller)
-    _require_ports("plant", plant, inputs=["command"], outputs=["state"])
-    _require_ports("controller", controller, inputs=["state"], outputs=["command"])
-
+    require_ports("plant", plant, inputs=["command"], outputs=["state"])
     state = plant.GetOutputPort("state")
-    builder.Connect(state, pose.state_input_port())
-    builder.Connect(state, collision.state_input_port())
-    _ConnectDecision(builder, scenario, state, policy, controller)
-    builder.Connect(state, controller.GetInputPort("state"))
+    pilot = AddPilot(builder, scenario, world, state, policy, controller)
+    policy, controller = pilot.policy, pilot.controller
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
 
-    observed = {"state": state, "goal": goal.get_output_port()}
-    observed |= AddObservation(builder, scenario, world, state, pose.pose_output_port(), policy)
-    measured = AddSensors(builder, sensors, world, state, pose.pose_output_port())
-    _ConnectObservation(builder, observed | measured, policy)
+    images = AddObservation(builder, scenario, world, state, pilot.pose, policy)
+    measured = AddSensors(builder, sensors, world, state, pilot.pose)
+    ConnectObservation(builder, {"state": state} | images | measured, policy)
 
-    exported = {
-        plant: ["state"],
-        controller: ["command"],
-        collision: ["clearance", "in_collision", "field_state"],
-    }
-    if policy.HasOutputPort("hypotheses"):
-        exported[policy] = ["hypotheses"]
+    builder.ExportOutput(state, "state")
     if camera:
         onboard = builder.AddNamedSystem("camera", MakeCamera(scenario, world))
-        builder.Connect(pose.pose_output_port(), onboard.GetInputPort("body_pose"))
-        exported[onboard] = ["color_image", "depth_image_32f", "depth_image_16u"]
-    for system, names in exported.items():
-        for name in names:
-            builder.ExportOutput(system.GetOutputPort(name), name)
+        builder.Connect(pilot.pose, onboard.GetInputPort("body_pose"))
+        for name in ("color_image", "depth_image_32f", "depth_image_16u"):
+            builder.ExportOutput(onboard.GetOutputPort(name), name)
     for name, port in measured.items():
         builder.ExportOutput(port, name)
 
@@ -180,62 +149,3 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
         background=world.background,
         moving=world.moving.gaussians if world.moving else None,
     )
-
-
-def _require_ports(what: str, system: System, inputs: list[str], outputs: list[str]) -> None:
-    lacking = [name for name in inputs if not system.HasInputPort(name)]
-    lacking += [name for name in outputs if not system.HasOutputPort(name)]
-    if lacking:
-        raise ValueError(
-            f"the {what} {type(system).__name__} has no port {lacking[0]!r}; it needs the inputs "
-            f"{inputs} and the outputs {outputs}"
-        )
-
-
-def _ConnectObservation(
-    builder: DiagramBuilder, observed: dict[str, OutputPort], policy: System
-) -> None:
-    """Leads to each input of the policy what bears its name."""
-    for index in range(policy.num_input_ports()):
-        port = policy.get_input_port(index)
-        if port.get_name() not in observed:
-            raise ValueError(
-                f"nothing gives the input {port.get_name()!r} of the policy "
-                f"{type(policy).__name__}; there are {', '.join(observed)}, and the outputs of "
-                "sensors that the scenario names"
-            )
-        builder.Connect(observed[port.get_name()], port)
-
-
-def _ConnectDecision(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    state: OutputPort,
-    policy: System,
-    controller: System,
-) -> None:
-    """Leads what the policy decides to the controller's port of that kind."""
-    if policy.HasOutputPort("hypotheses"):
-        hypotheses = policy.GetOutputPort("hypotheses")
-        count = num_hypotheses_in(hypotheses.size())
-        selector = HypothesisSelector(count, scenario.controller.lookahead)
-        builder.AddNamedSystem("selector", selector)
-        builder.Connect(hypotheses, selector.hypotheses_input_port())
-        builder.Connect(state, selector.state_input_port())
-        builder.Connect(selector.waypoint_output_port(), controller.GetInputPort("waypoint"))
-    else:
-        kind = "acceleration" if policy.HasOutputPort("acceleration") else "waypoint"
-        if not policy.HasOutputPort(kind):
-            raise ValueError(
-                f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
-                "acceleration and waypoint; give it one"
-            )
-        _require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
-        builder.Connect(policy.GetOutputPort(kind), controller.GetInputPort(kind))
-    if policy.HasOutputPort("heading"):
-        builder.Connect(policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
-
-
-def goal_of(scenario: Scenario, world: World) -> np.ndarray:
-    """The goal p_WG (3,) [m]: the scenario's, or the world's where the scenario leaves it open."""
-    return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)

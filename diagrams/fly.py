@@ -11,7 +11,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from tqdm import tqdm
 
 from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram, goal_of
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World

@@ -32,6 +32,17 @@ def sensors_of(scenario: Scenario, policy: System | None = None) -> dict[str, Se
     return getattr(policy or scenario.policy, "sensors", {}) | scenario.sensors
 
 
+def images_of(policy: System) -> list[str]:
+    """The names of the images that a policy has inputs for."""
+    return [name for name in ("depth_image_32f", "color_image") if policy.HasInputPort(name)]
+
+
+def camera_of(scenario: Scenario, policy: System) -> OnboardCamera:
+    """Through which a policy sees: its own camera, the scenario's policy's, or the default one."""
+    config = getattr(policy, "camera", None) or getattr(scenario.policy, "camera", None)
+    return config or OnboardCamera()
+
+
 def AddObservation(
     builder: DiagramBuilder,
     scenario: Scenario,
@@ -49,11 +60,10 @@ def AddObservation(
     Returns:
         The images that the policy has inputs for, by their names.
     """
-    names = [n for n in ("depth_image_32f", "color_image") if policy.HasInputPort(n)]
+    names = images_of(policy)
     if not names:
         return {}
-    config = getattr(policy, "camera", None) or getattr(scenario.policy, "camera", None)
-    config, noise = config or OnboardCamera(), scenario.observation
+    config, noise = camera_of(scenario, policy), scenario.observation
     camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, noise.latency))
     if noise.latency > 0.0:
         delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(noise.latency))

@@ -1,6 +1,9 @@
+import os
+
 import pytest
 from hypothesis import settings
 
+from splatpilot.systems.messaging.open_lcm import open_lcm
 from splatpilot.systems.opengl import require_opengl
 
 # The same examples in every run, and no failure because the machine was busy.
@@ -15,3 +18,14 @@ def opengl() -> None:
         require_opengl()
     except OSError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def udp_url() -> str:
+    """An LCM URL on a port of this process's own; skips where multicast does not come back."""
+    url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0&recv_buf_size=4000000"
+    try:
+        open_lcm(url)
+    except OSError as error:
+        pytest.skip(str(error))
+    return url

@@ -24,7 +24,7 @@ from splatpilot.analysis.benchmark.tables import (
     select,
     success_summary,
 )
-from splatpilot.diagrams.flight_diagram import goal_of
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState

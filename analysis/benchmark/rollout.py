@@ -18,7 +18,8 @@ from splatpilot import _native
 from splatpilot.analysis.benchmark.flight_measures import flight_measures, shortest_length
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.diagrams.flight import Flight, decision_times, fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram, goal_of
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World

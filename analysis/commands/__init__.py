@@ -1,4 +1,4 @@
-"""The verbs of the command line, one module each.
+"""The verbs of the command line, one module each, or one of two that belong together.
 
 A module has `add_to(verbs)`, which adds the verb's parser and sets its default `verb` to the
 function that runs it. That function imports what it needs when it runs: torch and pydrake take
@@ -12,6 +12,7 @@ from splatpilot.analysis.commands import (
     difficulty,
     fidelity,
     fly,
+    hardware,
     measure,
     merge,
     places,
@@ -23,6 +24,7 @@ from splatpilot.analysis.commands import (
 
 COMMANDS = (
     fly,
+    hardware,
     benchmark,
     merge,
     replay,

@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatpilot.diagrams.flight import Flight, Outcome, fly, goal_of
+from splatpilot.diagrams.flight import Flight, Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World

@@ -1,0 +1,44 @@
+"""`splatpilot vehicle` and `splatpilot bridge`."""
+
+import argparse
+import logging
+from pathlib import Path
+
+from splatpilot.analysis.commands.scenario_options import add_scenario, read_scenario
+
+
+def add_to(verbs: argparse._SubParsersAction) -> None:
+    vehicle = verbs.add_parser("vehicle", help="simulate a vehicle that is flown by LCM messages")
+    vehicle.set_defaults(verb=_vehicle)
+    vehicle.add_argument(
+        "--out", type=Path, default=Path("out/vehicle"), help="output folder (%(default)s)"
+    )
+    bridge = verbs.add_parser("bridge", help="fly a vehicle, real or simulated, by LCM messages")
+    bridge.set_defaults(verb=_bridge)
+    bridge.add_argument("--log", type=Path, help="write all messages to this file, as lcm-logger")
+    for parser in (vehicle, bridge):
+        parser.add_argument("--lcm-url", metavar="URL", help="where messages travel")
+        parser.add_argument(
+            "--patience", type=float, metavar="S", help="how long to wait for messages [s]"
+        )
+        add_scenario(parser)
+
+
+def _vehicle(options: argparse.Namespace) -> None:
+    from splatpilot.diagrams import vehicle
+
+    vehicle.run(scenario=read_scenario(options), config=_config(options), out=options.out)
+
+
+def _bridge(options: argparse.Namespace) -> None:
+    from splatpilot.diagrams import bridge
+
+    bridge.run(scenario=read_scenario(options), config=_config(options), log=options.log)
+
+
+def _config(options: argparse.Namespace):
+    from splatpilot.diagrams.hardware_config import HardwareConfig
+
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    given = {"url": options.lcm_url, "patience": options.patience}
+    return HardwareConfig(**{name: value for name, value in given.items() if value is not None})

@@ -1,0 +1,178 @@
+"""The pilot of the flight diagram behind messages: the vehicle is somewhere else."""
+
+from lcm import LCM
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+
+from splatpilot.diagrams.hardware_config import HardwareConfig
+from splatpilot.diagrams.observation import camera_of, decision_period, images_of
+from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, Pilot
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.messaging.bridge_status import BridgeStatus
+from splatpilot.systems.messaging.codecs import (
+    Codec,
+    CommandCodec,
+    HypothesesCodec,
+    StateCodec,
+    StatusCodec,
+    VelocitySetpointCodec,
+)
+from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec, ImageCodec
+from splatpilot.systems.messaging.message_publisher import MessagePublisher
+from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
+from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.policies.hypotheses import num_hypotheses_in
+from splatpilot.systems.policies.velocity_setpoint import VelocitySetpoint
+from splatpilot.systems.vehicle.state_prediction import StatePredictor
+
+
+def BuildHardwareDiagram(
+    scenario: Scenario,
+    world: World,
+    lcm: LCM,
+    config: HardwareConfig | None = None,
+    *,
+    policy: System | None = None,
+    controller: System | None = None,
+) -> Diagram:
+    """
+    Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
+    subscribers in the place of plant and camera. It runs with the wall clock, see
+    `run_in_real_time`.
+
+    Systems, by name: those of `AddPilot`; `clock`; the subscribers `state_subscriber` and one
+    `{image}_subscriber` for each image that the policy sees; `state_predictor`, which brings the
+    state up to date; `velocity_setpoint`, `status`; and one `{port}_publisher` for each of
+    `command`, `velocity_setpoint`, `status`, and `hypotheses` where the policy has them.
+
+    .. pydrake_system::
+
+        name: hardware
+        input_ports:
+        - overruns
+        output_ports:
+        - state
+        - command
+        - hypotheses
+        - color_image
+        - depth_image_32f
+        - clearance
+        - in_collision
+        - field_state
+        - velocity_setpoint
+        - status
+
+    The ports are those of `BuildFlightDiagram`, the images those that the policy sees; `status` and
+    `overruns` are those of `BridgeStatus`, `velocity_setpoint` that of `VelocitySetpoint`.
+
+    Args:
+        scenario: who flies, and where to. Its vehicle is what is known of the one that flies.
+        world: what is flown in, as far as that is known.
+        lcm: where messages travel.
+        config: how often, and how old they may be.
+        policy, controller: see `BuildFlightDiagram`.
+
+    Raises:
+        ValueError: for a configuration out of range or that no policy has, a system without the
+            ports it needs, sensors, and worlds in which something moves.
+    """
+    config = config or HardwareConfig()
+    config.validate()
+    require_messages_for(scenario, world)
+    builder = DiagramBuilder()
+    clock = UnixClock()
+    builder.AddNamedSystem("clock", clock)
+
+    def add_subscriber(codec: Codec) -> MessageSubscriber:
+        subscriber = MessageSubscriber(lcm, codec, config.tick)
+        builder.AddNamedSystem(f"{codec.port}_subscriber", subscriber)
+        builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
+        return subscriber
+
+    def add_publisher(
+        codec: Codec, source: OutputPort, period: float, enabled: OutputPort | None = None
+    ) -> None:
+        publisher = MessagePublisher(lcm, codec, period)
+        builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
+        builder.Connect(source, publisher.GetInputPort(codec.port))
+        builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+        if enabled is not None:
+            builder.Connect(enabled, publisher.enabled_input_port())
+
+    received = {"state": add_subscriber(StateCodec())}
+    predictor = StatePredictor()
+    builder.AddNamedSystem("state_predictor", predictor)
+    builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
+    builder.Connect(received["state"].age_output_port(), predictor.age_input_port())
+    state = predictor.state_output_port()
+    pilot = AddPilot(builder, scenario, world, state, policy, controller)
+    for codec in image_codecs(scenario, pilot.policy):
+        received[codec.port] = add_subscriber(codec)
+    observed = {"state": state}
+    observed |= {name: received[name].GetOutputPort(name) for name in list(received)[1:]}
+    ConnectObservation(builder, observed, pilot.policy)
+
+    status = BridgeStatus(list(received)[1:], config.max_age)
+    builder.AddNamedSystem("status", status)
+    for signal, subscriber in received.items():
+        for what in ("age", "gaps", "rejected"):
+            port = status.GetInputPort(f"{signal}_{what}")
+            builder.Connect(subscriber.GetOutputPort(what), port)
+    builder.ExportInput(status.overruns_input_port(), "overruns")
+
+    setpoint = _AddVelocitySetpoint(builder, scenario, state, pilot).velocity_setpoint_output_port()
+    command, enabled = pilot.controller.GetOutputPort("command"), status.enabled_output_port()
+    period = decision_period(scenario, pilot.controller)
+    add_publisher(CommandCodec(), command, period, enabled)
+    add_publisher(VelocitySetpointCodec(), setpoint, period, enabled)
+    add_publisher(StatusCodec(), status.status_output_port(), 1 / config.status_rate)
+    if pilot.policy.HasOutputPort("hypotheses"):
+        plans = pilot.policy.GetOutputPort("hypotheses")
+        codec = HypothesesCodec(num_hypotheses_in(plans.size()))
+        add_publisher(codec, plans, decision_period(scenario, pilot.policy))
+
+    for name, port in observed.items():
+        builder.ExportOutput(port, name)
+    builder.ExportOutput(setpoint, "velocity_setpoint")
+    builder.ExportOutput(status.status_output_port(), "status")
+    diagram = builder.Build()
+    diagram.set_name("hardware")
+    return diagram
+
+
+def image_codecs(scenario: Scenario, policy: System) -> list[ImageCodec]:
+    """How the images travel that a policy sees."""
+    camera = camera_of(scenario, policy)
+    size = camera.width, camera.height
+    codecs = {
+        "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), "policy_camera"),
+        "color_image": ColorImageCodec(ImageRgba8U(*size), "policy_camera"),
+    }
+    return [codecs[name] for name in images_of(policy)]
+
+
+def require_messages_for(scenario: Scenario, world: World) -> None:
+    """Raises ValueError for what a scenario or its world has that no message carries."""
+    sensors = getattr(scenario.policy, "sensors", {}) | scenario.sensors
+    if sensors:
+        raise ValueError(
+            f"no message carries what the sensors {', '.join(sensors)} measure; leave them out"
+        )
+    if world.moving:
+        raise ValueError(
+            f"in {world.name} something moves, and no message says where it is; fly in another "
+            "world"
+        )
+
+
+def _AddVelocitySetpoint(
+    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, pilot: Pilot
+) -> VelocitySetpoint:
+    setpoint = VelocitySetpoint(scenario.controller.lookahead)
+    builder.AddNamedSystem("velocity_setpoint", setpoint)
+    builder.Connect(state, setpoint.state_input_port())
+    builder.Connect(pilot.decision, setpoint.GetInputPort(pilot.decision.get_name()))
+    if pilot.policy.HasOutputPort("heading"):
+        builder.Connect(pilot.policy.GetOutputPort("heading"), setpoint.heading_input_port())
+    return setpoint

@@ -1,0 +1,73 @@
+"""Diagrams that run with the wall clock."""
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram
+
+from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
+from splatpilot.systems.messaging.unix_clock import UnixClock
+
+MAX_LAG = 0.05
+"""[s] by which a diagram may be behind the wall clock."""
+
+
+def run_in_real_time(
+    simulator: Simulator,
+    diagram: Diagram,
+    tick: float,
+    over: Callable[[float], bool],
+    ready: Callable[[], object] = lambda: None,
+) -> int:
+    """
+    Advances a diagram, which has a `UnixClock` named `clock`, tick by tick: none begins before its
+    time on the wall clock.
+
+    A tick that ends after the next should have begun is an overrun; the input `overruns` of the
+    diagram, where it has one, counts them. The next tick is then as long as it takes to catch up,
+    and nothing that happens in it is left out. What it is behind by more than `MAX_LAG` is never
+    caught up with: the diagram's time passes more slowly for once, and its `UnixClock` says so.
+
+    The first tick, at time 0, may take as long as it likes.
+
+    Args:
+        simulator, diagram: at time 0.
+        tick: [s].
+        ready: called after the first tick; when it returns, time begins to pass.
+        over: called with the time [s] after each tick; the last was that where it says yes.
+
+    Returns:
+        The number of overruns.
+    """
+    root = simulator.get_mutable_context()
+    clock = diagram.GetSubsystemByName("clock")
+    assert isinstance(clock, UnixClock)
+    clock_context = clock.GetMyMutableContextFromRoot(root)
+    simulator.Initialize()  # Here and in the first tick is made what is kept for the whole flight.
+    clock.set_epoch(clock_context, time.time())
+    simulator.AdvanceTo(2 * PUBLISH_OFFSET)
+    ready()
+    # The wall clock is not read again: when it is set, messages do not seem to be older.
+    epoch, started, number, overruns = time.time(), time.monotonic(), 0, 0
+    clock.set_epoch(clock_context, epoch)
+    while True:
+        # What happens at a tick is sent just after it.
+        simulator.AdvanceTo(number * tick + 2 * PUBLISH_OFFSET)
+        if over(number * tick):
+            return overruns
+        number += 1
+        late = time.monotonic() - (started + number * tick)
+        if late <= 0.0:
+            time.sleep(-late)
+            continue
+        overruns += 1
+        if diagram.HasInputPort("overruns"):
+            diagram.GetInputPort("overruns").FixValue(root, np.array([float(overruns)]))
+        if late > MAX_LAG:
+            started += late - MAX_LAG
+            epoch += late - MAX_LAG
+            clock.set_epoch(clock_context, epoch)
+        number += math.floor(min(late, MAX_LAG) / tick)

@@ -1,0 +1,102 @@
+"""The vehicle of the flight diagram behind messages: who flies it is somewhere else."""
+
+import numpy as np
+from lcm import LCM
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import LogVectorOutput
+
+from splatpilot.diagrams.flight_diagram import LOG_PERIOD
+from splatpilot.diagrams.hardware_config import HardwareConfig
+from splatpilot.diagrams.hardware_diagram import image_codecs, require_messages_for
+from splatpilot.diagrams.observation import AddObservation, decision_period
+from splatpilot.diagrams.pilot import make_policy
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_collision import EsdfCollision
+from splatpilot.systems.messaging.codecs import Codec, CommandCodec, StateCodec
+from splatpilot.systems.messaging.message_publisher import MessagePublisher
+from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
+from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.state_to_pose import StateToPose
+
+
+def BuildVehicleDiagram(
+    scenario: Scenario, world: World, lcm: LCM, config: HardwareConfig | None = None
+) -> Diagram:
+    """
+    Builds the diagram of a simulated vehicle that speaks as a real one: it is told body rates, and
+    says its state and, to policies that see, what its camera sees.
+
+    Systems, by name: `clock`, `plant`, `pose`, `collision`, those of `AddObservation`,
+    `command_subscriber`, `state_publisher` and one `{image}_publisher` for each image that the
+    scenario's policy sees, and the loggers `state_log`, `command_log`.
+
+    .. pydrake_system::
+
+        name: vehicle
+        output_ports:
+        - state
+        - command
+        - command_age
+        - clearance
+        - in_collision
+        - field_state
+
+    The ports are those of `BuildFlightDiagram`; `command` is the thrust that carries the weight
+    until one has come, and `command_age` [s] is infinite until then.
+
+    Args:
+        scenario: the vehicle, what its policy sees, and how well.
+        world: what is flown in.
+        lcm: where messages travel.
+        config: how often.
+
+    Raises:
+        ValueError: for a configuration out of range or that no policy has, sensors, and worlds in
+            which something moves.
+    """
+    config = config or HardwareConfig()
+    config.validate()
+    require_messages_for(scenario, world)
+    builder = DiagramBuilder()
+    hover = np.array([scenario.vehicle.gravity, 0.0, 0.0, 0.0])
+    subscriber = MessageSubscriber(lcm, CommandCodec(), config.tick, initial=hover)
+    clock, plant, pose = UnixClock(), QuadrotorPlant(scenario.vehicle), StateToPose()
+    collision = EsdfCollision(world.distance_field)
+    for name, system in (
+        ("clock", clock),
+        ("plant", plant),
+        ("pose", pose),
+        ("collision", collision),
+        ("command_subscriber", subscriber),
+    ):
+        builder.AddNamedSystem(name, system)
+
+    state, command = plant.GetOutputPort("state"), subscriber.GetOutputPort("command")
+    builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
+    builder.Connect(command, plant.GetInputPort("command"))
+    builder.Connect(state, pose.state_input_port())
+    builder.Connect(state, collision.state_input_port())
+
+    def add_publisher(codec: Codec, source: OutputPort, period: float) -> None:
+        publisher = MessagePublisher(lcm, codec, period)
+        builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
+        builder.Connect(source, publisher.GetInputPort(codec.port))
+        builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+
+    policy = make_policy(scenario, world)  # Only to know what it sees, and how often.
+    add_publisher(StateCodec(), state, 1 / config.state_rate)
+    images = AddObservation(builder, scenario, world, state, pose.pose_output_port(), policy)
+    for codec in image_codecs(scenario, policy):
+        add_publisher(codec, images[codec.port], decision_period(scenario, policy))
+
+    for name, port in (("state", state), ("command", command)):
+        LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
+        builder.ExportOutput(port, name)
+    builder.ExportOutput(subscriber.age_output_port(), "command_age")
+    for name in ("clearance", "in_collision", "field_state"):
+        builder.ExportOutput(collision.GetOutputPort(name), name)
+    diagram = builder.Build()
+    diagram.set_name("vehicle")
+    return diagram

@@ -1,0 +1,64 @@
+"""Logs of messages, as `lcm-logger` writes and `lcm-logplayer` plays them."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lcm import LCM, EventLog
+from pydrake.systems.analysis import Simulator
+
+from splatpilot.systems.messaging.unix_clock import UnixClock
+
+
+@contextmanager
+def recorded(lcm: LCM, path: Path) -> Iterator[None]:
+    """
+    Writes what comes by LCM, on all channels, into a log, each message with the time at which the
+    LCM was asked for it.
+
+    Raises:
+        OSError: if there is such a file already, or it cannot be written.
+    """
+    if path.exists():
+        raise FileExistsError(f"{path} is there already; name another file for the log")
+    log = EventLog(path, "w")
+    subscription = lcm.subscribe(
+        ".*", lambda channel, data: log.write_event(time.time_ns() // 1000, channel, data)
+    )
+    subscription.set_queue_capacity(10_000)  # Nobody looks while a world is made.
+    try:
+        yield
+    finally:
+        lcm.unsubscribe(subscription)
+        log.close()
+
+
+def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None:
+    """
+    Simulates a diagram while it receives the messages of a log, each when it came.
+
+    The same log gives the same simulation, bit for bit.
+
+    Args:
+        path: of the log.
+        lcm: that the diagram's systems were made with, of `memq://`.
+        simulator: of the diagram, at time 0, which is when the first message came.
+        clock: of the diagram.
+
+    Raises:
+        OSError: if the log cannot be read.
+        ValueError: if it has no messages.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such log")
+    events = [(event.timestamp, event.channel, event.data) for event in EventLog(path)]
+    if not events:
+        raise ValueError(f"{path} holds no messages; it is empty, or no log of LCM")
+    root = simulator.get_mutable_context()
+    first = events[0][0]
+    clock.set_epoch(clock.GetMyMutableContextFromRoot(root), first * 1e-6)
+    for timestamp, channel, data in events:
+        simulator.AdvanceTo(max((timestamp - first) * 1e-6, root.get_time()))
+        lcm.publish(channel, data)
+    simulator.AdvancePendingEvents()

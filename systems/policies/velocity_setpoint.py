@@ -1,0 +1,63 @@
+"""VelocitySetpoint: what a policy decides, for autopilots that are told velocities."""
+
+import math
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
+from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+
+
+class VelocitySetpoint(LeafSystem):
+    """Says at which velocity a policy's decision would be flown.
+
+    .. pydrake_system::
+
+        name: VelocitySetpoint
+        input_ports:
+        - state
+        - waypoint
+        - acceleration
+        - heading
+        output_ports:
+        - velocity_setpoint
+
+    - ``state`` (13), ``waypoint`` (3), ``acceleration`` (3), ``heading`` (1): those of
+      :class:`~splatpilot.systems.vehicle.flatness_controller.FlatnessController`; connect exactly
+      one of ``waypoint`` and ``acceleration``.
+    - ``velocity_setpoint`` (4): v [m/s], W frame, and the heading [rad], NaN where it is free.
+
+    Stateless. With T the time in which an autopilot takes a velocity up, and that to the waypoint::
+
+        v = v_WB + T a_WB,  T = RESPONSE_TIME
+        v = (p_WR - p_WB) / lookahead
+    """
+
+    state_input_port = input_port("state")
+    waypoint_input_port = input_port("waypoint")
+    acceleration_input_port = input_port("acceleration")
+    heading_input_port = input_port("heading")
+    velocity_setpoint_output_port = output_port("velocity_setpoint")
+
+    def __init__(self, lookahead: float):
+        """Constructs the system; `lookahead` is how far ahead of now the waypoint lies [s]."""
+        super().__init__()
+        self._lookahead = lookahead
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorInputPort("waypoint", 3)
+        self.DeclareVectorInputPort("acceleration", 3)
+        self.DeclareVectorInputPort("heading", 1)
+        self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
+        waypoint, heading = self.GetInputPort("waypoint"), self.GetInputPort("heading")
+        if waypoint.HasValue(context):
+            velocity = (np.asarray(waypoint.Eval(context)) - state.p_WB) / self._lookahead
+        else:
+            a_WB = np.asarray(self.GetInputPort("acceleration").Eval(context))
+            velocity = state.v_WB + RESPONSE_TIME * a_WB
+        looks = np.asarray(heading.Eval(context)) if heading.HasValue(context) else [math.nan]
+        output.SetFromVector(np.concatenate([velocity, looks]))

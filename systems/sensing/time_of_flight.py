@@ -1,0 +1,122 @@
+"""From the raw frame of a time-of-flight sensor to the grid that policies see.
+
+The order of the steps is that of the streamer which feeds such a policy on a Starling 2 Max: turn
+the frame upright, crop it to the policy's field of view, take what was not measured for far, turn
+depth into range, take the nearest of each cell, encode it, and turn the grid upside down.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+_LEAST_DEPTH = 1e-3  # [m], up to which the sensor has measured nothing
+
+
+@dataclass
+class TimeOfFlight:
+    """The sensor, and what part of its frame the policy sees; defaults are those of the drone."""
+
+    # [px] Of a frame that stands upright.
+    width: int = 180
+    height: int = 240
+    # [deg] Field of view of a frame that stands upright.
+    fov_x: float = 86.0
+    fov_y: float = 106.0
+    # [deg] Field of view, both ways, that is left by the crop.
+    fov: float = 86.0
+    # Which part of the height is left: "top", "center" or "bottom".
+    anchor: str = "bottom"
+    # [px] By how much that part then moves down; what leaves the frame is lost.
+    shift: int = -100
+    # [m] From which on nothing is near.
+    max_range: float = 5.0
+    # Cells.
+    columns: int = 16
+    rows: int = 9
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("fov_x", "fov_y", "fov"):
+            value = getattr(self, name)
+            _check(name, value, 1.0 <= value < 180.0, "at least 1 and below 180 deg")
+        _check("anchor", self.anchor, self.anchor in _ANCHORS, f"one of {', '.join(_ANCHORS)}")
+        _check("max_range", self.max_range, 0.0 < self.max_range < math.inf, "positive and finite")
+        for name in ("width", "height", "columns", "rows"):
+            value = getattr(self, name)
+            _check(name, value, value >= 1, "at least 1")
+        _check("width", self.width, self.width <= self.height, "at most the height: stand upright")
+        crop = self.crop(self.height, self.width, self.fov_x, self.fov_y)
+        for count, part, name in zip(
+            (self.rows, self.columns), crop, ("rows", "columns"), strict=True
+        ):
+            left = part.stop - part.start
+            _check(name, count, count <= left, f"at most {left}, the pixels that the crop leaves")
+
+    def crop(self, height: int, width: int, fov_x: float, fov_y: float) -> tuple[slice, slice]:
+        """The rows and columns that are left of an upright frame with these fields of view."""
+        half_x, half_y = (
+            focal_length(size, fov) * math.tan(math.radians(0.5 * self.fov))
+            for size, fov in ((width, fov_x), (height, fov_y))
+        )
+        left, right = math.floor(0.5 * width - half_x), math.ceil(0.5 * width + half_x)
+        tall = min(math.ceil(2.0 * half_y), height)
+        top, bottom = {
+            "top": (0, tall),
+            "center": (math.floor(0.5 * height - half_y), math.ceil(0.5 * height + half_y)),
+            "bottom": (height - tall, height),
+        }[self.anchor]
+        top, bottom = max(0, top), min(height, bottom)
+        top = max(0, min(height - 1, top + self.shift))
+        bottom = max(top + 1, min(height, bottom + self.shift))
+        return slice(top, bottom), slice(max(0, left), min(width, right))
+
+
+_ANCHORS = ("top", "center", "bottom")
+
+
+def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
+    """
+    The proximities (rows, columns) in a frame: 1 - range / max_range, 1 touched, 0 nothing near.
+
+    Row 0 is the lowest: the grid is upside down.
+
+    Args:
+        depth: (H, W) [m] along the optical axis; what is not finite, or at most 1 mm, was not
+            measured. A frame that is wider than high is turned by 90 degrees, counterclockwise.
+        sensor: a valid configuration.
+
+    Raises:
+        ValueError: for a frame of another size.
+    """
+    lying = depth.shape[1] > depth.shape[0]
+    upright = np.rot90(depth) if lying else depth
+    H, W = upright.shape
+    if (H, W) != (sensor.height, sensor.width):
+        raise ValueError(
+            f"the frame has {depth.shape[1]}x{depth.shape[0]} pixels; it must have "
+            f"{sensor.width}x{sensor.height}, or lie on its side"
+        )
+    # The streamer takes the fields of view of a frame that lay with it as they were.
+    fov_x, fov_y = (sensor.fov_y, sensor.fov_x) if lying else (sensor.fov_x, sensor.fov_y)
+    rows, columns = sensor.crop(H, W, fov_x, fov_y)
+    cropped = upright[rows, columns]
+    measured = np.isfinite(cropped) & (cropped > _LEAST_DEPTH)
+    cropped = np.where(measured, cropped, sensor.max_range)
+    x = (np.arange(W)[columns] - 0.5 * W) / focal_length(W, fov_x)
+    y = (np.arange(H)[rows] - 0.5 * H) / focal_length(H, fov_y)
+    ranges = cropped * np.sqrt(1.0 + x**2 + y[:, None] ** 2)
+    for axis, count in ((0, sensor.rows), (1, sensor.columns)):
+        edges = np.linspace(0, ranges.shape[axis], count + 1).astype(int)
+        ranges = np.minimum.reduceat(ranges, edges[:-1], axis=axis)
+    return (1.0 - np.clip(ranges, 0.0, sensor.max_range) / sensor.max_range)[::-1]
+
+
+def focal_length(size: int, fov: float) -> float:
+    """[px], of an axis with `size` pixels and a field of view [deg]."""
+    return 0.5 * size / math.tan(math.radians(0.5 * fov))
+
+
+def _check(name: str, value: object, valid: bool, limit: str) -> None:
+    if not valid:
+        raise ValueError(f"TimeOfFlight.{name} is {value}; it must be {limit}")

@@ -1,0 +1,174 @@
+"""The flight diagram, cut in two between which messages travel."""
+
+import dataclasses
+import gc
+import weakref
+
+import lcm
+import numpy as np
+import pytest
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+
+from splatpilot.diagrams.flight import fly, sample_initial_state
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.hardware_config import HardwareConfig
+from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
+from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_trajectory_hypotheses
+from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
+from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+
+TICK = HardwareConfig().tick
+
+
+class Halves:
+    """Vehicle and pilot, each a diagram, the pilot's time 4 ms behind; the test advances both."""
+
+    def __init__(self, scenario: Scenario, world, vehicle: Scenario | None = None):
+        self.lcm = lcm.LCM("memq://")
+        self.vehicle = BuildVehicleDiagram(vehicle or scenario, world, self.lcm)
+        self.hardware = BuildHardwareDiagram(scenario, world, self.lcm)
+        self.simulators = [Simulator(self.vehicle), Simulator(self.hardware)]
+        ApplySimulatorConfig(scenario.simulator, self.simulators[0])
+        self.vehicle_root, self.root = (s.get_mutable_context() for s in self.simulators)
+        plant = self.vehicle.GetSubsystemByName("plant")
+        start = sample_initial_state(scenario, world)
+        plant.GetMyMutableContextFromRoot(self.vehicle_root).SetContinuousState(start)
+        clock = self.hardware.GetSubsystemByName("clock")
+        clock.set_epoch(clock.GetMyMutableContextFromRoot(self.root), 2 * TICK)
+        self.tick = 0
+
+    def advance_to(self, time: float, vehicle: bool = True) -> None:
+        while self.tick * TICK <= time + 1e-9:
+            now = self.tick * TICK + 2 * PUBLISH_OFFSET
+            if vehicle:
+                self.simulators[0].AdvanceTo(now)
+            self.simulators[1].AdvanceTo(max(now - 2 * TICK, 2 * PUBLISH_OFFSET))
+            self.tick += 1
+
+    def state(self) -> np.ndarray:
+        return self.vehicle.GetOutputPort("state").Eval(self.vehicle_root)
+
+    def status(self) -> np.ndarray:
+        return self.hardware.GetOutputPort("status").Eval(self.root)
+
+
+@pytest.mark.parametrize("name", ["planner", "reactive", "depthnav"])
+def test_the_two_halves_fly_as_the_whole(post_world, name):
+    """Cut in two, a flight is the same but for the 6 ms of messages: within 15 cm after 3 s, for
+    policies with plans, with accelerations and with headings, blind and seeing."""
+    scenario = Scenario(
+        timeout=3.0, policy=policy_named(name), start=[1.0, 1.0, 2.0], goal=[9.0, 1.0, 2.0]
+    )
+    whole = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    halves = Halves(scenario, post_world)
+    halves.advance_to(3.0)
+    np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.15)
+    assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 2.0
+    mode, state_age, _, gaps, rejected, overruns = halves.status()
+    assert mode == lcmt_bridge_status.FLYING
+    assert 0.0 <= state_age <= 0.02
+    assert (gaps, rejected, overruns) == (0, 0, 0)
+
+
+def test_ports_are_those_of_the_flight_diagram(post_world):
+    """Each output of the flight diagram, but the onlooker's images of a policy that sees none, is
+    an output of the same size."""
+    scenario = Scenario(policy=policy_named("planner"))
+    flight = BuildFlightDiagram(scenario, post_world, camera=False)
+    hardware = BuildHardwareDiagram(scenario, post_world, lcm.LCM("memq://"))
+    for index in range(flight.num_output_ports()):
+        port = flight.get_output_port(index)
+        assert hardware.GetOutputPort(port.get_name()).size() == port.size()
+
+
+def test_commands_stop_where_the_vehicle_falls_silent(post_world):
+    """Without states for longer than allowed nothing is commanded and the status says why; with
+    states again it flies on."""
+    halves = Halves(Scenario(policy=policy_named("straight")), post_world)
+    heard = []
+    halves.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
+    halves.advance_to(0.5)
+    assert halves.status()[0] == lcmt_bridge_status.FLYING
+    halves.advance_to(0.9, vehicle=False)
+    assert halves.status()[0] == lcmt_bridge_status.STALE
+    before = len(heard)
+    halves.advance_to(2.0, vehicle=False)
+    assert len(heard) == before > 25
+    assert halves.status()[1] == pytest.approx(1.5, abs=0.03)
+    halves.advance_to(2.2)
+    assert halves.status()[0] == lcmt_bridge_status.FLYING
+    assert len(heard) > before
+
+
+def test_before_the_first_state_nothing_is_commanded(post_world):
+    """A pilot whose vehicle has said nothing waits."""
+    hardware = BuildHardwareDiagram(Scenario(), post_world, lcm.LCM("memq://"))
+    status = hardware.GetOutputPort("status").Eval(hardware.CreateDefaultContext())
+    np.testing.assert_array_equal(status, [lcmt_bridge_status.WAITING, np.inf, 0, 0, 0, 0])
+
+
+def test_plans_travel(post_world):
+    """The plans of a policy are sent as they are made, with the time of each."""
+    halves = Halves(Scenario(policy=policy_named("planner")), post_world)
+    heard = []
+    decode = lcmt_trajectory_hypotheses.decode
+    halves.lcm.subscribe("TRAJECTORY_HYPOTHESES", lambda _, data: heard.append(decode(data)))
+    halves.advance_to(0.5)
+    while halves.lcm.handle_timeout(0):
+        pass
+    plan = halves.hardware.GetOutputPort("hypotheses").Eval(halves.root)
+    assert heard[-1].plan_utime == pytest.approx((plan[0] + 2 * TICK) * 1e6, abs=1)
+    np.testing.assert_array_equal(np.ravel(heard[-1].waypoints_P), plan[8 : 8 + 90])
+
+
+def test_velocity_setpoint_leads_where_the_policy_wants(post_world):
+    """An autopilot that is told velocities is told that of the straight policy's way."""
+    scenario = Scenario(policy=policy_named("straight", speed=1.5))
+    halves = Halves(scenario, post_world)
+    halves.advance_to(2.0)
+    setpoint = halves.hardware.GetOutputPort("velocity_setpoint").Eval(halves.root)
+    np.testing.assert_allclose(setpoint[:3], [1.5, 0, 0], atol=0.05)
+
+
+def test_what_no_message_carries_is_refused(post_world):
+    """Sensors, moving things, and a period that is none are errors that say so."""
+    transport = lcm.LCM("memq://")
+    with pytest.raises(ValueError, match="no message carries what the sensors down measure"):
+        BuildHardwareDiagram(Scenario(sensors={"down": OnboardCamera()}), post_world, transport)
+    moving = dataclasses.replace(post_world, moving=object())
+    for build in (BuildHardwareDiagram, BuildVehicleDiagram):
+        with pytest.raises(ValueError, match="in post something moves"):
+            build(Scenario(), moving, transport)
+    with pytest.raises(ValueError, match=r"tick is 0.0; it must be positive"):
+        BuildHardwareDiagram(Scenario(), post_world, transport, HardwareConfig(tick=0.0))
+
+
+def test_images_of_another_size_are_refused_by_the_other_half(post_world):
+    """A vehicle whose camera is not the policy's is noticed: nothing is flown by its images."""
+    camera = OnboardCamera(width=32, height=18)
+    policy = policy_named("diffaero")
+    assert isinstance(policy, DepthPolicyConfig)
+    other = Scenario(policy=dataclasses.replace(policy, camera=camera))
+    halves = Halves(Scenario(policy=policy), post_world, vehicle=other)
+    heard = []
+    halves.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
+    halves.advance_to(0.3)
+    mode, state_age, image_age, _, rejected, _ = halves.status()
+    assert (mode, image_age, rejected) == (lcmt_bridge_status.WAITING, np.inf, 5)
+    assert state_age < 0.03
+    assert not heard
+
+
+def test_both_halves_are_freed(post_world):
+    """Whoever drops the diagrams gets their memory back, though they share an LCM that stays."""
+    halves = Halves(Scenario(policy=policy_named("diffaero")), post_world)
+    transport, freed = halves.lcm, [weakref.ref(d) for d in (halves.vehicle, halves.hardware)]
+    halves.advance_to(0.1)
+    del halves
+    gc.collect()
+    assert [reference() for reference in freed] == [None, None]
+    assert transport is not None

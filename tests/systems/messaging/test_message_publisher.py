@@ -1,0 +1,80 @@
+"""What goes out by LCM."""
+
+import lcm
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+
+from splatpilot.systems.messaging.codecs import CommandCodec
+from splatpilot.systems.messaging.generated import lcmt_body_rate_command
+from splatpilot.systems.messaging.message_publisher import MessagePublisher
+from splatpilot.systems.messaging.unix_clock import UnixClock
+
+EPOCH = 1_800_000_000.25  # [s]
+
+
+class Counter(LeafSystem):
+    """Its output is the number of its updates, every 0.02 s."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareStateOutputPort("command", self.DeclareDiscreteState(4))
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            0.02, 0.0, lambda context, x: x.set_value(context.get_discrete_state(0).value() + 1)
+        )
+
+
+def published(source: LeafSystem, until: float, enabled: float | None = None) -> list:
+    """The messages that a publisher with a period of 0.02 s sends of a source of commands."""
+    transport = lcm.LCM("memq://")
+    heard = []
+    transport.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
+    builder = DiagramBuilder()
+    clock = builder.AddSystem(UnixClock())
+    builder.AddSystem(source)
+    publisher = builder.AddSystem(MessagePublisher(transport, CommandCodec(), 0.02))
+    builder.Connect(source.get_output_port(), publisher.GetInputPort("command"))
+    builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+    if enabled is not None:
+        switch = builder.AddSystem(ConstantVectorSource(np.array([enabled])))
+        builder.Connect(switch.get_output_port(), publisher.enabled_input_port())
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    clock.set_epoch(clock.GetMyMutableContextFromRoot(root), EPOCH)
+    simulator.AdvanceTo(until)
+    while transport.handle_timeout(0):
+        pass
+    return [lcmt_body_rate_command.decode(data) for data in heard]
+
+
+def test_messages_are_numbered_and_stamped():
+    """Numbers go up by one, times by the period, to the microsecond."""
+    messages = published(ConstantVectorSource(np.array([9.0, 1.0, 2.0, 3.0])), 25.0)
+    assert len(messages) == 1250
+    assert [m.header.seq for m in messages] == list(range(1250))
+    first = round(EPOCH * 1e6)
+    for k, message in enumerate(messages):
+        assert abs(message.header.utime - first - 20_000 * k - 1) <= 1
+        assert message.header.frame_name == "body"
+    assert (messages[-1].thrust, messages[-1].w_cmd_B) == (9.0, (1.0, 2.0, 3.0))
+
+
+def test_what_was_decided_at_an_instant_is_sent_at_it():
+    """The result of an update goes out with the message of the same instant, not with the next."""
+    assert [m.thrust for m in published(Counter(), 0.05)] == [1.0, 2.0, 3.0]
+
+
+def test_nothing_is_sent_while_disabled():
+    """A publisher whose input `enabled` is 0 is silent, and speaks where it is 1."""
+    source = np.array([9.0, 0.0, 0.0, 0.0])
+    assert published(ConstantVectorSource(source), 0.1, enabled=0.0) == []
+    assert len(published(ConstantVectorSource(source), 0.1, enabled=1.0)) == 5
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.inf, np.nan])
+def test_period_must_be_positive(period):
+    """A period that is none is an error that names the channel."""
+    with pytest.raises(ValueError, match=r"BODY_RATE_COMMAND are .* apart"):
+        MessagePublisher(lcm.LCM("memq://"), CommandCodec(), period)
