@@ -37,17 +37,7 @@ SP_INLINE F16 to_float(const D16& a) {
   return load(lanes);
 }
 
-#define SP_BINARY(op)                                     \
-  SP_INLINE D16 operator op(const D16& a, const D16& b) { \
-    D16 c;                                                \
-    SP_EACH_DOUBLE(k) c.r[k] = a.r[k] op b.r[k];          \
-    return c;                                             \
-  }
-SP_BINARY(+)
-SP_BINARY(-)
-SP_BINARY(*)
-SP_BINARY(/)
-#undef SP_BINARY
+SP_ARITHMETIC(D16, SP_EACH_DOUBLE)
 #undef SP_EACH_DOUBLE
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -18,6 +18,19 @@
 #define SP_INLINE inline __attribute__((always_inline))
 #define SP_EACH_REGISTER(k) _Pragma("GCC unroll 4") for (int k = 0; k < kRegisters; ++k)
 
+// An operator on packs, register by register as `each` loops over k.
+#define SP_BINARY(Pack, each, op)                            \
+  SP_INLINE Pack operator op(const Pack& a, const Pack& b) { \
+    Pack c;                                                  \
+    each(k) c.r[k] = a.r[k] op b.r[k];                       \
+    return c;                                                \
+  }
+#define SP_ARITHMETIC(Pack, each) \
+  SP_BINARY(Pack, each, +)        \
+  SP_BINARY(Pack, each, -)        \
+  SP_BINARY(Pack, each, *)        \
+  SP_BINARY(Pack, each, /)
+
 namespace splatpilot::SIMD_LEVEL {
 
 constexpr int kLanes = 16;
@@ -65,17 +78,7 @@ SP_INLINE void store(float* p, const F16& a) {
   SP_EACH_REGISTER(k) std::memcpy(p + k * kRegisterLanes, &a.r[k], kRegisterBytes);
 }
 
-#define SP_BINARY(op)                                     \
-  SP_INLINE F16 operator op(const F16& a, const F16& b) { \
-    F16 c;                                                \
-    SP_EACH_REGISTER(k) c.r[k] = a.r[k] op b.r[k];        \
-    return c;                                             \
-  }
-SP_BINARY(+)
-SP_BINARY(-)
-SP_BINARY(*)
-SP_BINARY(/)
-#undef SP_BINARY
+SP_ARITHMETIC(F16, SP_EACH_REGISTER)
 
 SP_INLINE F16 operator-(const F16& a) {
   F16 c;

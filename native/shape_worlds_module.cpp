@@ -55,18 +55,18 @@ class ShapeWorlds : Casting {
                     [this](size_t w, auto&&... rest) { kernels_.cast_shapes(view(w), rest...); });
   }
 
-  void nearest(const Points& p, const Numbers& world, const DepthRows& distances,
+  void nearest(const Points& p, const Numbers& world, const DepthRows& values,
                const Output& gradients) {
-    const size_t n = p.shape(0), count = distances.shape(1);
-    require(distances.shape(0) == n && gradients.shape(0) == n && gradients.shape(1) == count &&
+    const size_t n = p.shape(0), count = values.shape(1);
+    require(values.shape(0) == n && gradients.shape(0) == n && gradients.shape(1) == count &&
                 gradients.shape(2) == 3,
-            "points, distances and gradients differ in shape");
+            "points, values and gradients differ in shape");
     require(count >= 1 && count <= kMostNearest, "1 to 16 nearest shapes can be asked for");
     require_worlds(world, n, size());
     const nb::gil_scoped_release release;
     for (size_t i = 0; i < n; ++i) {
       kernels_.nearest_shapes(view(static_cast<size_t>(world.data()[i])), p.data() + 3 * i, count,
-                              distances.data() + i * count, gradients.data() + 3 * i * count);
+                              values.data() + i * count, gradients.data() + 3 * i * count);
     }
   }
 
@@ -136,7 +136,7 @@ void bind_shape_worlds(nb::module_& m) {
       .def("__len__", &ShapeWorlds::size)
       .def("depth", &ShapeWorlds::depth, nb::kw_only(), "p_WC"_a, "R_WC"_a, "world"_a,
            "directions_C"_a, "half_pixel"_a, "depth"_a, "Writes the depth images of N cameras.")
-      .def("nearest", &ShapeWorlds::nearest, nb::kw_only(), "p_WQ"_a, "world"_a, "distances"_a,
+      .def("nearest", &ShapeWorlds::nearest, nb::kw_only(), "p_WQ"_a, "world"_a, "values"_a,
            "gradients"_a,
            "Writes the distances (N, K) of the K nearest shapes and their gradients (N, K, 3).");
 }

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Generator, Iterable, Iterator
-from typing import Any
+from itertools import chain
 
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
 from splatpilot.analysis.benchmark.study import RolloutSpec
@@ -12,6 +12,7 @@ from splatpilot.diagrams.sensors import SENSORS
 from splatpilot.diagrams.worlds.make_world import WORLDS
 from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.extras import import_extra
+from splatpilot.systems.processes import map_processes
 
 CONNECT_TIMEOUT = 10.0
 """[s], for a scheduler to answer."""
@@ -46,27 +47,7 @@ def fly_all(
     if cluster is not None:
         yield from _on_cluster(fly, work, cluster)
         return
-    yield from _in_processes(fly, work, jobs)
-
-
-def _in_processes(fly: _Fly, work: _Work, jobs: int) -> Iterator[Rollout | Fault]:
-    from joblib import Parallel, delayed
-    from joblib.externals.loky import get_reusable_executor
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    # One more than the jobs are handed out ahead, so that no worker waits.
-    parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
-    try:
-        for rollouts in parallel(map(delayed(fly), work)):
-            yield from rollouts
-    except TerminatedWorkerError as error:
-        raise OSError(
-            f"a worker process was killed, perhaps for want of memory ({error}); what was flown is "
-            "kept: run the same command again, with fewer --jobs if it repeats"
-        ) from None
-    finally:
-        if jobs > 1:
-            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+    yield from chain.from_iterable(map_processes(fly, work, jobs))
 
 
 def _on_cluster(fly: _Fly, work: _Work, address: str) -> Iterator[Rollout | Fault]:

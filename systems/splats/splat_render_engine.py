@@ -93,8 +93,11 @@ class SplatRenderEngine(RenderEngine):
             ValueError: `background` is not three numbers in [0, 1].
         """
         super().__init__()
-        environment = background if isinstance(background, EnvironmentMap) else None
-        color = np.asarray(BLACK if isinstance(background, EnvironmentMap) else background)
+        environment, color = None, np.asarray(BLACK)
+        if isinstance(background, EnvironmentMap):
+            environment = background
+        else:
+            color = np.asarray(background)
         if color.shape != (3,) or not np.all((color >= 0) & (color <= 1)):
             raise ValueError(f"background is {background}; it must be three numbers in [0, 1]")
         if shapes is None:

@@ -91,7 +91,7 @@ class ShapeGeometry:
         return _depth(self._native, p_WC, R_WC, rays, world)
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        return _query(self._native.nearest, "distances", p_WQ, world, count)
+        return _query(self._native.nearest, p_WQ, world, count)
 
 
 class Grids:
@@ -127,7 +127,7 @@ class Grids:
     def interpolate(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
         """Values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; beyond the outermost centres
         of voxels those at the nearest point between them."""
-        return _query(self._native.interpolate, "values", p_WQ, world)
+        return _query(self._native.interpolate, p_WQ, world)
 
 
 class EsdfGeometry(Grids):
@@ -177,16 +177,15 @@ def _depth(
 
 
 def _query(
-    answer: Callable[..., None], name: str, p_WQ: Tensor, world: Tensor, *shape: int
+    answer: Callable[..., None], p_WQ: Tensor, world: Tensor, *shape: int
 ) -> tuple[Tensor, Tensor]:
-    """Values (N, *shape) and their gradients (N, *shape, 3) at p_WQ, as `answer` writes them; it
-    knows the values by a name."""
+    """Values (N, *shape) and their gradients (N, *shape, 3) at p_WQ, as `answer` writes them."""
     values, gradients = torch.empty(len(p_WQ), *shape), torch.empty(len(p_WQ), *shape, 3)
     answer(
         p_WQ=_array(p_WQ),
         world=_array(world),
+        values=values.numpy(),
         gradients=gradients.numpy(),
-        **{name: values.numpy()},
     )
     return values.to(p_WQ.device), gradients.to(p_WQ.device)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatpilot.systems.processes import map_processes
 from splatpilot.training.policies import train
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.trainer import TrainingConfig
@@ -34,22 +35,10 @@ def run_side_by_side(runs: Sequence[TrainingRun], jobs: int) -> list[dict[str, A
         ValueError: if a run stopped, as `train.run` says; the others were finished.
         OSError: if a process was killed: the same call goes on.
     """
-    from joblib import Parallel, delayed
-    from joblib.externals.loky import get_reusable_executor
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
     jobs = min(jobs, len(runs))
-    work = [delayed(_run)(run, line % jobs) for line, run in enumerate(runs)]
-    try:
-        results: Any = Parallel(jobs)(work)
-    except TerminatedWorkerError as error:
-        raise OSError(
-            f"a training process was killed, perhaps for want of memory ({error}); run the same "
-            "command again to go on, with fewer --jobs if it repeats"
-        ) from None
-    finally:
-        if jobs > 1:
-            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+    work = [(index, run, index % jobs) for index, run in enumerate(runs)]
+    ended = dict(map_processes(_run, work, jobs))
+    results = [ended[index] for index in range(len(runs))]
     stopped = [
         f"{run.out}: {result}"
         for run, result in zip(runs, results, strict=True)
@@ -60,10 +49,11 @@ def run_side_by_side(runs: Sequence[TrainingRun], jobs: int) -> list[dict[str, A
     return results
 
 
-def _run(run: TrainingRun, line: int) -> dict[str, Any] | str:
-    """The summary of a run, or why it stopped."""
+def _run(work: tuple[int, TrainingRun, int]) -> tuple[int, Any]:
+    """The index of a run, and its summary, or why it stopped."""
+    index, run, line = work
     make = TRAINERS.find(run.trainer).make
     try:
-        return train.run(config=run.config, out=run.out, make=make, bar_line=line)
+        return index, train.run(config=run.config, out=run.out, make=make, bar_line=line)
     except (ValueError, OSError) as error:
-        return str(error)
+        return index, str(error)

@@ -140,9 +140,9 @@ def run[Config: TrainingConfig](
 def _shown(progress: _Progress) -> dict[str, str]:
     """What the progress bar says: the loss, and the success measured last and best."""
     shown = {"loss": f"{sum(progress.means.values()):.3f}"}
-    measured = [row["success"] for row in progress.curves if "success" in row]
-    if measured:
-        shown |= {"success": f"{measured[-1]:.0%}", "best": f"{progress.best['success']:.0%}"}
+    measured = (row["success"] for row in reversed(progress.curves) if "success" in row)
+    if progress.best:
+        shown |= {"success": f"{next(measured):.0%}", "best": f"{progress.best['success']:.0%}"}
     return shown
 
 

@@ -1,0 +1,35 @@
+"""Work in processes, each on a core of its own."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+
+def map_processes[Work, Result](
+    function: Callable[[Work], Result], work: Iterable[Work], jobs: int
+) -> Iterator[Result]:
+    """
+    Yields `function` of each piece of work as it ends, in any order.
+
+    Args:
+        function: of the module's level, as processes receive it by name.
+        work: taken as processes become free, and one ahead, so that none waits.
+        jobs: processes, 1 or more; with one, all is done in this one.
+
+    Raises:
+        OSError: if a process was killed; all that was yielded before is good.
+    """
+    from joblib import Parallel, delayed
+    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
+    try:
+        yield from parallel(map(delayed(function), work))
+    except TerminatedWorkerError:
+        raise OSError(
+            "a worker process was killed, perhaps for want of memory; what had ended is kept: run "
+            "the same command again, with fewer --jobs if it repeats"
+        ) from None
+    finally:
+        if jobs > 1:
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)
