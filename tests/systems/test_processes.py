@@ -31,6 +31,6 @@ def test_results_are_those_of_the_function(jobs):
 
 def test_killed_process_is_named_and_the_next_call_works(tmp_path):
     """A process that is killed ends the call with the remedy; the same call again goes on."""
-    with pytest.raises(OSError, match="was killed.*run the same command again, with fewer --jobs"):
+    with pytest.raises(OSError, match=r"was killed.*run the same command again, with fewer --jobs"):
         list(map_processes(_killed, [tmp_path] * 3, jobs=2))
     assert list(map_processes(_killed, [tmp_path] * 3, jobs=2)) == ["ended"] * 3
