@@ -14,7 +14,7 @@ from splatpilot.diagrams.observation import (
     decision_period,
     sensors_of,
 )
-from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, goal_of, require_ports
+from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, require_ports
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -63,7 +63,7 @@ def BuildFlightDiagram(
     Args:
         scenario: who flies, how, from where to where; see `sample_initial_state` for its start.
         world: what is flown in.
-        meshcat: draws the flight there when given.
+        meshcat: draws the flight there when given; see `open_meshcat`.
         video: records the camera's images at its rate, for `VideoRecorder.save` to write.
         camera: whether the scenario's camera is there; Meshcat and videos need it, flights do not.
         policy: flies instead of the scenario's. Any system with one of the outputs `hypotheses`
@@ -116,7 +116,7 @@ def BuildFlightDiagram(
         log.set_name("hypotheses_log")
 
     if meshcat is not None:
-        AddMeshcat(builder, scenario, world, goal_of(scenario, world), meshcat)
+        AddMeshcat(builder, scenario, world, meshcat)
 
     if video:
         onboard = cast(SplatCamera, builder.GetSubsystemByName("camera"))

@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.framework import Diagram
 from tqdm import tqdm
 
 from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.pilot import goal_of
+from splatpilot.diagrams.flight_page import (
+    recorded_frames,
+    replayed_flight,
+    write_flight_page,
+)
+from splatpilot.diagrams.meshcat import open_meshcat
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
@@ -24,12 +29,17 @@ from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 
 def run(
-    *, scenario: Scenario, out: Path, live: bool = False, graphviz: Path | None = None
+    *,
+    scenario: Scenario,
+    out: Path,
+    live: bool = False,
+    video: bool = True,
+    graphviz: Path | None = None,
 ) -> dict[str, float | str]:
     """
     Flies a scenario and leaves in `out`:
 
-    - `flight.html`: the flight in Meshcat, to replay in a browser;
+    - `flight.html`: a page to watch it in, see `replay_page`;
     - `flight.mp4`: what the onboard camera saw, colour beside depth;
     - `trajectory.npz`: the arrays of `Flight`;
     - `summary.json`: the summary this function returns;
@@ -37,6 +47,7 @@ def run(
 
     Args:
         live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed.
+        video: whether to write `flight.mp4`.
         graphviz: where to write the diagram as Graphviz source.
 
     Returns:
@@ -54,18 +65,15 @@ def run(
     if graphviz is not None:
         require_writable_folder(graphviz.parent)
 
-    meshcat = open_meshcat(scenario, world)
-    if live:
+    meshcat = open_meshcat(scenario, world) if live else None
+    if meshcat is not None:
         print(f"Meshcat shows the flight at {meshcat.web_url()}", flush=True)
-    camera, flight = film_flight(
-        scenario,
-        world,
-        meshcat,
-        page=out / "flight.html",
-        video=out / "flight.mp4",
-        graphviz=graphviz,
-        realtime_rate=1.0 if live else 0.0,
-    )
+    diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
+    if graphviz is not None:
+        with written_atomically(graphviz) as path:
+            path.write_text(diagram.GetGraphvizString())
+    flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
+    camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
     summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
     with written_atomically(out / "trajectory.npz") as path:
         flight.save(path)
@@ -73,71 +81,39 @@ def run(
         path.write_text(dump_config(scenario))
     with written_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=2) + "\n")
+    recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
+    frames = recorded_frames(recorder, scenario)
+    name = f"{world.name}, seed {scenario.seed}"
+    shown = replayed_flight(name, flight, frames)
+    write_flight_page(out / "flight.html", scenario, world, [shown])
+    written = ["flight.html", "trajectory.npz", "summary.json", "scenario.yaml"]
+    if video:
+        recorder.save(out / "flight.mp4", scenario.camera.z_far)
+        written.insert(1, "flight.mp4")
 
     print(format_summary(summary))
-    print(f"Wrote flight.html, flight.mp4, trajectory.npz, summary.json, scenario.yaml in {out}")
+    print(f"Wrote {', '.join(written)} in {out}")
     if live:
         with contextlib.suppress(EOFError):
             input("Press Enter to stop serving Meshcat. ")
     return summary
 
 
-def film_flight(
-    scenario: Scenario,
-    world: World,
-    meshcat: Meshcat | None = None,
-    *,
-    page: Path | None = None,
-    video: Path | None = None,
-    graphviz: Path | None = None,
-    realtime_rate: float = 0.0,
-) -> tuple[SplatCamera, Flight]:
-    """
-    Flies a scenario and films it; what is filmed changes nothing of the flight.
-
-    Args:
-        scenario, world: the flight.
-        meshcat: draws the flight there.
-        page: where to write what Meshcat shows, to replay in a browser.
-        video: where to write what the onboard camera saw, colour beside depth.
-        graphviz: where to write the diagram as Graphviz source.
-        realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
-
-    Returns:
-        The onboard camera and the flight.
-
-    Raises:
-        ValueError: for a scenario that cannot be flown.
-        OSError: if a file cannot be written.
-    """
-    diagram = BuildFlightDiagram(scenario, world, meshcat, video=video is not None)
-    if graphviz is not None:
-        with written_atomically(graphviz) as path:
-            path.write_text(diagram.GetGraphvizString())
-
-    if meshcat is not None:
-        meshcat.StartRecording(frames_per_second=scenario.policy.rate)
+def fly_with_bar(
+    diagram: Diagram, scenario: Scenario, world: World, realtime_rate: float = 0.0
+) -> Flight:
+    """`fly`, with a progress bar of simulated time."""
     layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
     with tqdm(
         total=scenario.timeout, desc="flying", bar_format=layout, leave=False, disable=None
     ) as bar:
-        flight = fly(
+        return fly(
             diagram,
             scenario,
             world,
             progress=lambda now: bar.update(now - bar.n),
             realtime_rate=realtime_rate,
         )
-    if video is not None:
-        recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
-        recorder.save(video, max_depth=scenario.camera.z_far)
-    if meshcat is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-        if page is not None:
-            with written_atomically(page) as path:
-                path.write_text(meshcat.StaticHtml())
-    return cast(SplatCamera, diagram.GetSubsystemByName("camera")), flight
 
 
 def format_summary(summary: dict[str, float | str]) -> str:
@@ -152,18 +128,6 @@ def format_summary(summary: dict[str, float | str]) -> str:
         ("render", "render_ms", "{:.1f} ms"),
     )
     return "\n".join(f"{title:<18} {form.format(summary[key])}" for title, key, form in rows)
-
-
-def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
-    """A Meshcat whose camera is behind and above the start and looks towards the goal."""
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
-    along = goal_of(scenario, world) - p_WS
-    along /= max(np.linalg.norm(along), 1e-6)
-    meshcat.SetCameraPose(p_WS - 4.0 * along + [0.0, 0.0, 2.0], p_WS + 4.0 * along)
-    return meshcat
 
 
 def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:

@@ -3,10 +3,10 @@
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.framework import DiagramBuilder
 
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.splats.background import mean_color
@@ -23,26 +23,41 @@ from splatpilot.systems.visualization.drawing import (
 from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
 
 
-def AddMeshcat(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    world: World,
-    p_WG: NDArray[np.float64],
-    meshcat: Meshcat,
-) -> None:
+def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
     """
-    Draws what stands still, and adds the systems that draw what moves.
+    A Meshcat that shows what stands still: goal, distance field and background.
+
+    Its camera sees the start and the goal from behind and above the start.
+    """
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    for end in ("top_color", "bottom_color"):
+        meshcat.SetProperty("/Background/<object>", end, list(mean_color(world.background)))
+    p_WG = goal_of(scenario, world)
+    draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
+    draw_distance_slice(meshcat, "/splatpilot/distance_slice", world.distance_field, float(p_WG[2]))
+    meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
+
+    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+    p_SG_W = p_WG - p_WS
+    distance = max(float(np.linalg.norm(p_SG_W)), 1e-6)
+    eye = p_WS - 0.2 * p_SG_W + [0.0, 0.0, 3.0 + 0.35 * distance]
+    meshcat.SetCameraPose(eye, p_WS + 0.4 * p_SG_W)
+    return meshcat
+
+
+def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshcat: Meshcat) -> None:
+    """
+    Draws the world's Gaussians and the vehicle, and adds the systems that draw what moves.
 
     Args:
         builder: of a flight with `plant`, `policy` and `camera`.
         scenario, world: what is flown.
-        p_WG: (3,) [m] the goal.
-        meshcat: where.
+        meshcat: where, as `open_meshcat` has made it.
     """
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings that are drawn too.
-    for end in ("top_color", "bottom_color"):
-        meshcat.SetProperty("/Background", end, list(mean_color(world.background)))
     draw_gaussians(
         meshcat,
         "/splatpilot/scene",
@@ -50,10 +65,7 @@ def AddMeshcat(
         field.lower_W - margin,
         field.upper_W + margin,
     )
-    draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
     draw_vehicle(meshcat, "/splatpilot/vehicle", VEHICLE_RADIUS)
-    draw_distance_slice(meshcat, "/splatpilot/distance_slice", field, float(p_WG[2]))
-    meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
 
     plant, policy = (builder.GetSubsystemByName(name) for name in ("plant", "policy"))
     plans = policy.HasOutputPort("hypotheses")

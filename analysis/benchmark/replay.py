@@ -1,7 +1,8 @@
 """`splatpilot replay`: one flight of a study, flown again."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -9,11 +10,18 @@ from splatpilot.analysis.benchmark.rollout import digest, study_world
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.study_inputs import kept_flights
-from splatpilot.diagrams.flight import Flight, fly
+from splatpilot.diagrams.flight import Flight
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.fly import film_flight, open_meshcat
+from splatpilot.diagrams.flight_page import (
+    recorded_frames,
+    replayed_flight,
+    write_flight_page,
+)
+from splatpilot.diagrams.fly import fly_with_bar
 from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.visualization.replay_page import ReplayedFlight
+from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 
 class Agreement(NamedTuple):
@@ -38,7 +46,7 @@ def run(
         study: the folder.
         id: of the flight, as in `rollouts.csv`.
         out: folder for what is filmed; `replays/ID` in the study by default.
-        meshcat: writes `flight.html`, the flight in Meshcat.
+        meshcat: writes `flight.html`, a page to watch it in.
         video: writes `flight.mp4`, what the onboard camera saw.
 
     Raises:
@@ -53,17 +61,19 @@ def run(
     _, scenario = next(kept_flights(folder, [spec]))
     world = study_world(scenario)
     out = out or study / "replays" / id
-    if meshcat or video:
+    filmed = meshcat or video
+    if filmed:
         require_writable_folder(out)
-        _, flight = film_flight(
-            scenario,
-            world,
-            open_meshcat(scenario, world) if meshcat else None,
-            page=out / "flight.html" if meshcat else None,
-            video=out / "flight.mp4" if video else None,
-        )
-    else:
-        flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    diagram = BuildFlightDiagram(scenario, world, video=filmed, camera=filmed)
+    flight = fly_with_bar(diagram, scenario, world)
+    if filmed:
+        recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
+        if meshcat:
+            frames = recorded_frames(recorder, scenario)
+            shown = replayed_flight(id, flight, frames)
+            write_flight_page(out / "flight.html", scenario, world, [shown])
+        if video:
+            recorder.save(out / "flight.mp4", scenario.camera.z_far)
     result = compare(flight, recorded, row["digest"])
     print(f"{id}: {result.outcome} after {flight.times[-1]:.2f} s")
     if result.exact:
@@ -74,11 +84,57 @@ def run(
             f"{result.deviation:.3g} m. Another processor or other versions of libraries round "
             "differently; study.yaml says which program flew it."
         )
-    if meshcat or video:
+    if filmed:
         files = {"flight.html": meshcat, "flight.mp4": video}
         written = [name for name, wanted in files.items() if wanted]
         print(f"Wrote {' and '.join(written)} in {out}")
     return result
+
+
+def overlay(*, study: Path, ids: Sequence[str], out: Path | None = None) -> Path:
+    """
+    Writes a page that shows several recorded flights through one world at once, told apart by
+    colour. Nothing is flown again, so it has neither plans nor what cameras saw.
+
+    Args:
+        study: the folder.
+        ids: of the flights, as in `rollouts.csv`.
+        out: folder for `flights.html`; `replays/FIRST-ID` in the study by default.
+
+    Returns:
+        The page.
+
+    Raises:
+        FileNotFoundError: if there is no study, or a flight is not there yet.
+        ValueError: if the study has no such flight, its file is damaged, or two flights are of
+            different scenarios or seeds.
+    """
+    folder = StudyFolder(study)
+    specs = [find_flight(folder, id) for id in ids]
+    first = specs[0]
+    for spec in specs:
+        if (spec.scenario, spec.seed) != (first.scenario, first.seed):
+            raise ValueError(
+                f"{spec.id} flew another world than {first.id}; name flights of one scenario and "
+                "seed"
+            )
+    flights = []
+    for spec in specs:
+        row, arrays = folder.read(spec)
+        if not arrays:
+            raise ValueError(f"{spec.id} could not be flown and cannot be shown: {row['reason']}")
+        times, states, clearances = (
+            arrays[name].astype(float) for name in ("times", "states", "clearances")
+        )
+        no_plans = np.empty((0, 0))
+        flights.append(ReplayedFlight(spec.id, row["outcome"], times, states, clearances, no_plans))
+    _, scenario = next(kept_flights(folder, [first]))
+    out = out or study / "replays" / first.id
+    require_writable_folder(out)
+    page = out / "flights.html"
+    write_flight_page(page, scenario, study_world(scenario), flights)
+    print(f"Wrote {page}")
+    return page
 
 
 def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:

@@ -15,6 +15,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         "--out", type=Path, default=Path("out/fly"), help="output folder (%(default)s)"
     )
     fly.add_argument("--live", action="store_true", help="serve Meshcat while flying, in real time")
+    fly.add_argument("--no-video", action="store_true", help="leave flight.mp4 out")
     fly.add_argument("--graphviz", type=Path, metavar="FILE", help="write the diagram as Graphviz")
 
 
@@ -26,5 +27,6 @@ def _fly(options: argparse.Namespace) -> None:
         scenario=read_scenario(options),
         out=options.out,
         live=options.live,
+        video=not options.no_video,
         graphviz=options.graphviz,
     )

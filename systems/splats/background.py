@@ -46,13 +46,17 @@ class EnvironmentMap:
         return cls((image[..., ::-1] / 255).astype(np.float32))
 
     def save(self, file: Path) -> None:
-        """Writes the texels as an image of 8 bits.
+        """Writes the texels as `png` has them.
 
         Raises:
             OSError: if it cannot be written.
         """
+        file.write_bytes(self.png())
+
+    def png(self) -> bytes:
+        """The texels as an image of 8 bits."""
         levels = np.clip(255 * self.texels + 0.5, 0, 255).astype(np.uint8)
-        file.write_bytes(cv2.imencode(".png", levels[..., ::-1])[1].tobytes())
+        return cv2.imencode(".png", levels[..., ::-1])[1].tobytes()
 
     def color(self, v_W: "ArrayLike") -> "NDArray[np.float32]":
         """Returns the colours (n, 3) seen in the directions v_W (n, 3), of any length but zero."""

@@ -15,7 +15,6 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from splatpilot.systems.gltf import add_primitive, data_uri
 from splatpilot.systems.ports import input_port
 from splatpilot.systems.splats.splat_camera import SplatCamera
-from splatpilot.systems.visualization.flipbook import page_path, show_page
 
 
 class CameraVisualizer(LeafSystem):
@@ -83,15 +82,12 @@ class CameraVisualizer(LeafSystem):
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
-        page, skipped = divmod(round(time / self._period), self._stride)
-        if skipped:
+        if round(time / self._period) % self._stride:
             return EventStatus.DidNothing()
         image = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
         rgb = np.asarray(image.data)[..., :3]
         gltf = MemoryFile(picture_gltf(rgb, self._p_CCorners), ".gltf", "onboard picture")
-        path = f"{self._path}/picture"
-        self._meshcat.SetObject(page_path(path, page), Mesh(InMemoryMesh(mesh_file=gltf)))
-        show_page(self._meshcat, path, page, time)
+        self._meshcat.SetObject(f"{self._path}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
         return EventStatus.Succeeded()
 
 

@@ -40,8 +40,12 @@ def draw_gaussians(
 
 
 def draw_goal(meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float) -> None:
-    """Draws the goal region: a translucent ball of `radius` [m] about p_WG (3,) [m]."""
-    meshcat.SetObject(path, Sphere(radius), Rgba(0.1, 0.9, 0.3, 0.4))
+    """Draws the goal region, a translucent ball of `radius` [m] about p_WG (3,) [m], below a pole
+    of 3 m that is seen from afar."""
+    color = Rgba(0.1, 0.9, 0.3, 0.4)
+    meshcat.SetObject(path, Sphere(radius), color)
+    meshcat.SetObject(f"{path}/pole", Cylinder(0.04, 3.0), color)
+    meshcat.SetTransform(f"{path}/pole", RigidTransform([0.0, 0.0, 1.5]))
     meshcat.SetTransform(path, RigidTransform(p_WG))
 
 

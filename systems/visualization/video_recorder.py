@@ -1,15 +1,18 @@
 """A video of what the camera saw: colour beside depth."""
 
 import tempfile
+from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import cast
 
+import av
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
-from tqdm import tqdm
 
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.ports import input_port
@@ -18,7 +21,8 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 
 class VideoRecorder(LeafSystem):
     """
-    Collects colour and depth images at a fixed rate; `save` writes them as a video afterwards.
+    Collects colour and depth images at a fixed rate; afterwards `frames` has them as pictures and
+    `save` writes them as a video.
 
     .. pydrake_system::
 
@@ -27,9 +31,9 @@ class VideoRecorder(LeafSystem):
         - color_image
         - depth_image_16u
 
-    The images wait in a temporary file (0.4 MB each at 320x240) and are encoded after the flight,
-    because encoding takes longer than rendering and would be charged to the simulation. Like every
-    recorder it writes outside the Context: one recorder is for one simulation at a time.
+    The images wait in a temporary file (0.4 MB each at 320x240) and are encoded after the flight.
+    Like every recorder it writes outside the Context: one recorder is for one simulation at a
+    time.
     """
 
     color_image_input_port = input_port("color_image")
@@ -76,31 +80,50 @@ class VideoRecorder(LeafSystem):
         self._file.write(frame.tobytes())
         return EventStatus.Succeeded()
 
+    def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+        """
+        Yields the pictures of colour and of depth, (H, W, 3) each in OpenCV's channel order.
+
+        Args:
+            max_depth: depth at which the depth picture's colours end [m].
+        """
+        frames = self._file.tell() // self._frame.itemsize
+        self._file.seek(0)
+        for _ in range(frames):
+            frame = np.frombuffer(self._file.read(self._frame.itemsize), self._frame)[0]
+            yield frame["rgb"][..., ::-1], colorize_depth(frame["depth"] * 1e-3, max_depth)
+
     def save(self, path: Path, max_depth: float) -> None:
         """
-        Writes the video (VP9 in MP4, which every browser plays) atomically.
+        Writes the video (H.264 in MP4, which every browser and player plays) atomically.
 
         Args:
             path: the file, ending in .mp4.
-            max_depth: depth at which the depth picture's colours end [m].
+            max_depth: as for `frames`.
 
         Raises:
             OSError: if the file cannot be written.
         """
+        try:
+            with written_atomically(path) as partial:
+                self._encode(partial, max_depth)
+        except OSError as error:
+            raise OSError(
+                f"{path}: cannot be written ({error.strerror}); is there room, and is the folder "
+                "writable?"
+            ) from None
+
+    def _encode(self, path: Path, max_depth: float) -> None:
         height, width = self._frame["depth"].shape
-        size = (2 * width, height)
-        frames = self._file.tell() // self._frame.itemsize
-        self._file.seek(0)
-        fourcc = cv2.VideoWriter.fourcc(*"vp09")
-        with written_atomically(path) as partial:
-            writer = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, self._fps, size)
-            if not writer.isOpened():
-                raise OSError(f"{path}: OpenCV cannot write a video here; is the folder writable?")
-            for _ in tqdm(range(frames), "video", unit="frame", leave=False, disable=None):
-                frame = np.frombuffer(self._file.read(self._frame.itemsize), self._frame)[0]
-                depth = colorize_depth(frame["depth"] * 1e-3, max_depth)
-                writer.write(np.hstack([frame["rgb"][..., ::-1], depth]))
-            writer.release()
+        odd = height % 2  # Players want even numbers of rows and columns.
+        with av.open(str(path), "w") as container:
+            rate = Fraction(self._fps).limit_denominator(1000)
+            stream = container.add_stream("libx264", rate, {"preset": "ultrafast", "crf": "20"})
+            stream.width, stream.height, stream.pix_fmt = 2 * width, height + odd, "yuv420p"
+            for pictures in self.frames(max_depth):
+                picture = np.pad(np.hstack(pictures), ((0, odd), (0, 0), (0, 0)))
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "bgr24")))
+            container.mux(stream.encode())
 
 
 def colorize_depth(depth: np.ndarray, max_depth: float) -> np.ndarray:

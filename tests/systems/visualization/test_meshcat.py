@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+from pydrake.trajectories import PiecewisePolynomial
 
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
@@ -30,7 +31,7 @@ from splatpilot.systems.visualization.drawing import (
     draw_goal,
     draw_vehicle,
 )
-from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
+from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer, fan_mesh
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +45,15 @@ def meshcat(shared_meshcat):
     return shared_meshcat
 
 
-def test_flight_is_drawn_page_by_page(meshcat):
-    """At 10 Hz, 0.35 s of flight draws the vehicle, four pieces of trail and four fans of three."""
+def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
+    """At 10 Hz, 0.35 s of flight draws the vehicle, a trail through the four places it was shown
+    at, and one fan."""
     waypoints_B = np.cumsum(np.full((3, 10, 3), 0.1), axis=1)
     plan = Hypotheses(0.0, RigidTransform([1, 0, 2]), waypoints_B, np.array([1.0, 2.0, 3.0]))
+    ends = [hover_state([x, 0, 2]) for x in (1, 3)]
     builder = DiagramBuilder()
-    state = builder.AddSystem(ConstantVectorSource(hover_state([1, 0, 2])))
+    motion = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack(ends))
+    state = builder.AddSystem(TrajectorySource(motion))
     hypotheses = builder.AddSystem(ConstantVectorSource(plan.to_vector()))
     visualizer = builder.AddSystem(FlightVisualizer(meshcat, num_hypotheses=3, period=0.1))
     builder.Connect(state.get_output_port(), visualizer.GetInputPort("state"))
@@ -57,12 +61,31 @@ def test_flight_is_drawn_page_by_page(meshcat):
     draw_vehicle(meshcat, "/splatpilot/vehicle", radius=0.354)
     Simulator(builder.Build()).AdvanceTo(0.35)
     assert meshcat.HasPath("/splatpilot/vehicle/body")
-    for page in range(4):
-        assert meshcat.HasPath(f"/splatpilot/trail/{page:05d}")
-        for k in range(3):
-            assert meshcat.HasPath(f"/splatpilot/hypotheses/{page:05d}/{k}")
-    assert not meshcat.HasPath("/splatpilot/trail/00004")
-    assert not meshcat.HasPath("/splatpilot/hypotheses/00000/3")
+    trail = vertices(drawn(meshcat, "/splatpilot/trail"), "position")
+    np.testing.assert_allclose(trail, [[1 + 0.2 * k, 0, 2] for k in range(4)], atol=1e-6)
+    fan = vertices(drawn(meshcat, "/splatpilot/hypotheses"), "position")
+    assert len(fan) == 3 * 11 * 2
+
+
+def test_fan_is_ribbons_along_the_plans_in_the_colours_of_their_costs():
+    """Each ribbon is as wide as asked for, level, and centred on its plan; the cheapest is green,
+    the dearest red; every triangle is of one ribbon."""
+    generator = np.random.default_rng(0)
+    waypoints_B = np.cumsum(generator.uniform(-0.1, 0.4, (4, 10, 3)), axis=1)
+    X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1, 2, 3])
+    plan = Hypotheses(0.0, X_WB, waypoints_B, np.array([2.0, 1.0, 4.0, 3.0]))
+    points, faces, colors = fan_mesh(plan, width=0.05)
+    sides = points.T.reshape(4, 11, 2, 3)
+    np.testing.assert_allclose(sides.mean(axis=2)[:, 1:], plan.waypoints_W, atol=1e-12)
+    np.testing.assert_allclose(sides.mean(axis=2)[:, 0], np.tile([1, 2, 3], (4, 1)))
+    across = sides[:, :, 1] - sides[:, :, 0]
+    np.testing.assert_allclose(np.linalg.norm(across, axis=-1), 0.05)
+    np.testing.assert_allclose(across[..., 2], 0, atol=1e-12)
+    shades = colors.T.reshape(4, 22, 3)
+    assert (shades == shades[:, :1]).all()
+    np.testing.assert_allclose(shades[[1, 2], 0], [[0, 1, 0.1], [1, 0, 0.1]])
+    assert faces.min() == 0 and faces.max() == 4 * 22 - 1
+    assert (faces // 22 == faces[0] // 22).all()
 
 
 def test_balls_are_drawn_where_they_are(meshcat):
@@ -168,16 +191,27 @@ def test_distance_slice_is_coloured_by_distance(meshcat):
 
 
 def test_camera_picture_is_hung_at_its_rate(meshcat):
-    """Every second of 10 images a second: half a second hangs three pictures into the frustum."""
+    """Every second of 10 images a second is hung into the frustum: after half a second that of
+    0.4 s."""
     info = CameraInfo(width=32, height=24, fov_y=1.0)
     builder = DiagramBuilder()
-    image = builder.AddSystem(ConstantValueSource(Value(ImageRgba8U(32, 24))))
+    shown_at = []
+
+    class Image(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareAbstractOutputPort("image", lambda: Value(ImageRgba8U(32, 24)), self._note)
+
+        def _note(self, context, value):
+            shown_at.append(context.get_time())
+
+    image = builder.AddSystem(Image())
     picture = builder.AddSystem(CameraVisualizer(meshcat, info, RigidTransform(), 0.1, stride=2))
     builder.Connect(image.get_output_port(), picture.GetInputPort("color_image"))
     Simulator(builder.Build()).AdvanceTo(0.5)
     assert meshcat.HasPath("/splatpilot/vehicle/camera/frustum")
-    pages = [meshcat.HasPath(f"/splatpilot/vehicle/camera/picture/{i:05d}") for i in range(4)]
-    assert pages == [True, True, True, False]
+    assert meshcat.HasPath("/splatpilot/vehicle/camera/picture")
+    assert shown_at == pytest.approx([0.0, 0.2, 0.4])
 
 
 def test_picture_document_is_the_picture():

@@ -1,0 +1,75 @@
+"""A page to watch flights in."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from splatpilot.diagrams.flight import Flight
+from splatpilot.diagrams.flight_diagram import MakeCamera
+from splatpilot.diagrams.meshcat import open_meshcat
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.files import written_atomically
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.visualization.drawing import draw_vehicle
+from splatpilot.systems.visualization.replay_page import (
+    Frames,
+    ReplayedFlight,
+    ReplayView,
+    replay_page,
+)
+from splatpilot.systems.visualization.video_recorder import VideoRecorder
+
+
+def replayed_flight(name: str, flight: Flight, frames: Frames | None) -> ReplayedFlight:
+    """A flight as a page shows it, with what its camera saw."""
+    return ReplayedFlight(
+        name,
+        str(flight.outcome),
+        flight.times,
+        flight.states,
+        flight.clearances,
+        flight.hypotheses,
+        frames,
+    )
+
+
+def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
+    """The pictures of the scenario's camera."""
+    color, depth = zip(*recorder.frames(scenario.camera.z_far), strict=True)
+    return Frames(1 / scenario.camera.fps, color, depth)
+
+
+def write_flight_page(
+    path: Path, scenario: Scenario, world: World, flights: Sequence[ReplayedFlight]
+) -> None:
+    """
+    Writes a page that shows flights from one start to one goal, see `replay_page`.
+
+    Args:
+        path: the file, ending in .html.
+        scenario, world: what was flown.
+        flights: one or more.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    camera = MakeCamera(scenario, world)
+    field = world.distance_field
+    view = ReplayView(
+        X_BC=camera.X_BC(),
+        fov_y=camera.camera_info().fov_y(),
+        radius=VEHICLE_RADIUS,
+        lower=float(np.asarray(field.lower_W)[2]),
+        upper=float(np.asarray(field.upper_W)[2]),
+    )
+    meshcat = open_meshcat(scenario, world)
+    for k in range(len(flights)):
+        draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
+    balls = world.moving.balls if world.moving else None
+    page = replay_page(
+        meshcat.StaticHtml(), world.gaussians, world.background, view, flights, balls
+    )
+    with written_atomically(path) as partial:
+        partial.write_text(page)

@@ -1,0 +1,39 @@
+"""Gaussians as a page holds them, for `page/splats.js` to show."""
+
+import base64
+import gzip
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+
+_COVARIANCE_SCALE = 256.0
+"""Keeps the covariances of 1 mm to 16 m within what a half holds."""
+
+
+def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
+    """
+    N Gaussians as the page's shader reads them, (N, 8) words each of 32 bits.
+
+    The centre as three floats [m]; red, green, blue (without their dependence on direction) and
+    opacity as bytes, lowest first; the covariance's xx, xy, xz, yy, yz, zz as halves
+    [m^2 / 256], lowest first; and nothing.
+    """
+    words = np.zeros((len(scene.means), 8), np.uint32)
+    words[:, :3] = scene.means.view(np.uint32)
+    shades = np.column_stack([scene.base_colors, scene.opacities])
+    words[:, 3] = np.round(255 * shades).astype(np.uint8).view(np.uint32)[:, 0]
+    R_WA = Rotation.from_quat(scene.quats, scalar_first=True).as_matrix()
+    axes = R_WA * scene.scales[:, None, :]
+    covariances = _COVARIANCE_SCALE * axes @ axes.transpose(0, 2, 1)
+    rows, columns = np.triu_indices(3)
+    halves = np.minimum(covariances[:, rows, columns], np.finfo(np.float16).max)
+    words[:, 4:7] = np.ascontiguousarray(halves, np.float16).view(np.uint32)
+    return words
+
+
+def packed_base64(data: bytes) -> str:
+    """Bytes, compressed, as text for a page; `unpack` of `page/page.js` reads them."""
+    return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()

@@ -1,0 +1,409 @@
+// A flight, or several through one world, in a Meshcat page: vehicle, trail, plans, what the camera
+// saw, speed and clearance, all at the time of one slider.
+//
+// Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches colour and depth.
+"use strict";
+
+const lerp = (a, b, s) => a + (b - a) * s;
+
+// One flight's samples, plans and pictures.
+class ReplayFlight {
+  constructor(data, k, replay) {
+    const THREE = MeshCat.THREE;
+    Object.assign(this, data);
+    this.vehicle = replay.viewer.scene_tree.find(["splatpilot", "vehicles", `${k}`]).object;
+    this.vehicle.matrixAutoUpdate = false;
+    this.points = data.p_WB.map((p) => new THREE.Vector3(...p));
+    this.rotations = data.q_WB.map(([w, x, y, z]) => new THREE.Quaternion(x, y, z, w));
+    this.duration = this.times.at(-1);
+    this.lengths = [0];
+    for (let i = 1; i < this.points.length; ++i) {
+      this.lengths.push(this.lengths[i - 1] + this.points[i].distanceTo(this.points[i - 1]));
+    }
+    this.group = new THREE.Group();
+    if (this.lengths.at(-1) > 0) {
+      const curve = new THREE.CatmullRomCurve3(this.points), color = this.color;
+      const tube = () => new THREE.TubeGeometry(curve, this.points.length, 0.012, 5);
+      this.trail = new THREE.Mesh(tube(), new THREE.MeshBasicMaterial({color}));
+      this.path = new THREE.Mesh(tube(), new THREE.MeshBasicMaterial(
+        {color, transparent: true, opacity: 0.35, depthWrite: false}));
+      this.group.add(this.trail, this.path);
+    }
+    this.sphere = new THREE.Mesh(
+      new THREE.SphereGeometry(replay.radius, 32, 16),
+      new THREE.MeshBasicMaterial({transparent: true, opacity: 0.25, depthWrite: false}));
+    this.group.add(this.sphere);
+    if (this.plans.length) {
+      this.fan = new THREE.Mesh(
+        new THREE.BufferGeometry(),
+        new THREE.MeshBasicMaterial({vertexColors: true, side: THREE.DoubleSide}));
+      this.fan.frustumCulled = false;
+      this.group.add(this.fan);
+    }
+  }
+
+  // Index and share of the way to the next of the sample before a time.
+  at(time) {
+    const last = this.times.length - 1;
+    let low = 0, high = last;
+    while (low < high) {
+      const mid = (low + high + 1) >> 1;
+      if (this.times[mid] <= time) low = mid; else high = mid - 1;
+    }
+    const i = Math.min(low, Math.max(last - 1, 0)), j = Math.min(i + 1, last);
+    const span = this.times[j] - this.times[i];
+    return {i, j, s: span > 0 ? Math.min(Math.max((time - this.times[i]) / span, 0), 1) : 0};
+  }
+
+  position(time) {
+    const {i, j, s} = this.at(time);
+    return this.points[i].clone().lerp(this.points[j], s);
+  }
+
+  pose(time) {
+    const THREE = MeshCat.THREE, {i, j, s} = this.at(time);
+    return new THREE.Matrix4().compose(
+      this.points[i].clone().lerp(this.points[j], s),
+      this.rotations[i].clone().slerp(this.rotations[j], s), new THREE.Vector3(1, 1, 1));
+  }
+
+  value(name, time) {
+    const {i, j, s} = this.at(time), a = this[name][i], b = this[name][j];
+    return a === null || b === null ? null : lerp(a, b, s);
+  }
+
+  show(time, replay) {
+    const pose = this.pose(time), {i, j, s} = this.at(time);
+    this.vehicle.matrix.copy(pose);
+    this.vehicle.matrixWorldNeedsUpdate = true;
+    this.sphere.position.setFromMatrixPosition(pose);
+    const clearance = this.value("clearances", time);
+    const safe = clearance !== null && clearance >= replay.margin;
+    this.sphere.material.color.set(safe ? 0x30c060 : 0xff2020);
+    this.sphere.material.opacity = safe ? 0.18 : 0.45;
+    if (this.trail) {
+      const flown = lerp(this.lengths[i], this.lengths[j], s) / this.lengths.at(-1);
+      const count = this.trail.geometry.index.count;
+      this.trail.geometry.setDrawRange(0, 30 * Math.round(flown * count / 30));
+    }
+    if (this.fan) {
+      const index = this.plans.findLastIndex((plan) => plan.time <= time + 1e-6);
+      this.showPlan(index, this.points[i], replay.view === "onboard" ? 0.6 : 0);
+    }
+  }
+
+  // All hypotheses of a plan as one mesh of level ribbons, from green (cheapest) to red (dearest),
+  // but for what is nearer than `nearest` [m] to `eye` and would cover the view.
+  showPlan(index, eye, nearest) {
+    const THREE = MeshCat.THREE;
+    this.fan.visible = index >= 0 && this.chosen;
+    if (index < 0 || (index === this.shownPlan && !nearest && !this.shownNearest)) return;
+    this.shownPlan = index;
+    this.shownNearest = nearest;
+    const {p_WB, waypoints_W, costs} = this.plans[index];
+    const least = Math.min(...costs), span = Math.max(Math.max(...costs) - least, 1e-9);
+    const positions = [], colors = [], halfWidth = 0.012;
+    waypoints_W.forEach((waypoints, k) => {
+      const dear = (costs[k] - least) / span;
+      let a = p_WB;
+      for (const b of waypoints) {
+        if (eye.distanceTo(new THREE.Vector3(...a)) < nearest) {
+          a = b;
+          continue;
+        }
+        const dx = b[0] - a[0], dy = b[1] - a[1];
+        const scale = halfWidth / Math.max(Math.hypot(dx, dy), 1e-6);
+        const x = -dy * scale, y = dx * scale;
+        const corners = [
+          [a[0] - x, a[1] - y, a[2]], [a[0] + x, a[1] + y, a[2]],
+          [b[0] + x, b[1] + y, b[2]], [b[0] - x, b[1] - y, b[2]],
+        ];
+        for (const corner of [0, 1, 2, 0, 2, 3]) {
+          positions.push(...corners[corner]);
+          colors.push(Math.min(1, 2 * dear), Math.min(1, 2 * (1 - dear)), 0.1);
+        }
+        a = b;
+      }
+    });
+    const geometry = this.fan.geometry;
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(positions, 3));
+    geometry.setAttribute("color", new THREE.Float32BufferAttribute(colors, 3));
+  }
+}
+
+// Balls that move; a centre of nulls is nowhere.
+class ReplayBalls {
+  constructor({period, radii, centers}) {
+    const THREE = MeshCat.THREE;
+    Object.assign(this, {period, radii, centers});
+    this.mesh = new THREE.InstancedMesh(
+      new THREE.SphereGeometry(1, 24, 12), new THREE.MeshLambertMaterial({color: 0xe6bf1a}),
+      radii.length);
+    this.mesh.frustumCulled = false;
+  }
+
+  show(time) {
+    const THREE = MeshCat.THREE, last = this.centers.length - 1;
+    const index = Math.min(Math.floor(time / this.period), last);
+    const share = Math.min(time / this.period - index, 1);
+    const before = this.centers[index], after = this.centers[Math.min(index + 1, last)];
+    this.radii.forEach((radius, k) => {
+      const [a, b] = [before[k], after[k]];
+      const seen = a[0] !== null && b[0] !== null;
+      const p = seen ? a.map((value, i) => lerp(value, b[i], share)) : [0, 0, 0];
+      this.mesh.setMatrixAt(k, new THREE.Matrix4().makeScale(...Array(3).fill(seen ? radius : 0))
+        .setPosition(...p));
+    });
+    this.mesh.instanceMatrix.needsUpdate = true;
+  }
+}
+
+class Replay {
+  constructor(viewer, splats, data) {
+    const THREE = MeshCat.THREE;
+    Object.assign(this, data);
+    this.viewer = viewer;
+    this.splats = splats;
+    this.flights = data.flights.map((flight, k) => new ReplayFlight(flight, k, this));
+    this.duration = Math.max(...this.flights.map((flight) => flight.duration));
+    this.X_BC = new THREE.Matrix4().fromArray(data.X_BC).transpose();
+    this.playing = false;
+    this.depth = false;
+    this.pictures = new Map();
+    for (const flight of this.flights) viewer.scene.add(flight.group);
+    this.balls = data.balls && new ReplayBalls(data.balls);
+    if (this.balls) viewer.scene.add(this.balls.mesh);
+    this.build();
+    this.choose(this.flights[0]);
+    this.look("overview");
+    this.setCut(data.cut);
+    viewer.render_callback = () => this.placeCamera();
+    const ended = this.flights[0].outcome === "collision" ? this.flights[0].duration : 0;
+    this.seek(Math.max(ended - 2, 0));
+    let before = performance.now();
+    const tick = (now) => {
+      if (this.playing) this.seek(this.time + (now - before) / 1000);
+      before = now;
+      requestAnimationFrame(tick);
+    };
+    requestAnimationFrame(tick);
+  }
+
+  build() {
+    const add = (parent, tag, properties = {}) =>
+      parent.appendChild(Object.assign(document.createElement(tag), properties));
+    const panel = add(document.body, "div", {id: "replay-panel"});
+    for (const flight of this.flights) {
+      flight.button = add(panel, "button", {
+        className: "flight", onclick: () => this.choose(flight)});
+      flight.button.innerHTML = `<span class="mark" style="background:${flight.color}"></span>`;
+      flight.button.append(`${flight.name}: ${flight.outcome}, ${flight.duration.toFixed(1)} s`);
+    }
+    this.picture = add(panel, "canvas", {width: 648, height: 486, id: "replay-picture"});
+    this.depthButton = add(panel, "button", {
+      textContent: "colour / depth (d)", id: "replay-depth", onclick: () => this.switchDepth()});
+    this.plot = add(panel, "canvas", {width: 648, height: 300, id: "replay-plot"});
+    this.plot.onclick = (event) =>
+      this.seek(event.offsetX / this.plot.clientWidth * this.duration);
+    add(panel, "div", {className: "legend", innerHTML: `
+      <span class="mark" style="background:#6fb7ff"></span>speed
+      <span class="mark" style="background:#ffc04d"></span>clearance, red below
+      ${this.margin} m<br>
+      <span class="mark" style="background:#1aff1a"></span>cheapest plan
+      <span class="mark" style="background:#ff1a1a"></span>dearest plan
+      <span class="mark" style="background:#1ae64d"></span>goal`});
+
+    const bar = add(document.body, "div", {id: "replay-bar"});
+    this.playButton = add(bar, "button", {onclick: () => this.play(!this.playing)});
+    this.slider = add(bar, "input", {
+      type: "range", min: 0, max: this.duration, step: 0.01, id: "replay-time"});
+    this.slider.oninput = () => {
+      this.play(false);
+      this.seek(Number(this.slider.value));
+    };
+    this.clock = add(bar, "span");
+    this.viewButtons = ["overview", "chase", "onboard"].map((name, k) => add(bar, "button", {
+      textContent: `${name} (${k + 1})`, id: `replay-${name}`, onclick: () => this.look(name)}));
+    add(bar, "span", {textContent: "hide above"});
+    this.cutSlider = add(bar, "input", {
+      type: "range", id: "replay-cut", min: this.lower, max: this.upper, step: 0.05});
+    this.cutSlider.oninput = () => this.setCut(Number(this.cutSlider.value));
+    document.addEventListener("keydown", (event) => this.key(event));
+    this.play(false);
+  }
+
+  key(event) {
+    const keys = {
+      " ": () => this.play(!this.playing),
+      ArrowLeft: () => this.seek(this.time - 0.1),
+      ArrowRight: () => this.seek(this.time + 0.1),
+      1: () => this.look("overview"),
+      2: () => this.look("chase"),
+      3: () => this.look("onboard"),
+      d: () => this.switchDepth(),
+    };
+    if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
+    event.preventDefault();
+    keys[event.key]();
+  }
+
+  play(playing) {
+    if (playing && this.time >= this.duration) this.seek(0);
+    this.playing = playing;
+    this.playButton.textContent = playing ? "❚❚" : "▶";
+  }
+
+  look(view) {
+    this.view = view;
+    ["overview", "chase", "onboard"].forEach((name, k) =>
+      this.viewButtons[k].classList.toggle("chosen", name === view));
+    this.viewer.controls.enabled = view === "overview";
+    if (view === "overview" && this.orbit) {
+      this.viewer.camera.position.copy(this.orbit);
+    } else if (view !== "overview") {
+      this.orbit ??= this.viewer.camera.position.clone();
+    }
+    this.viewer.camera.fov = view === "onboard" ? this.fov_y : 75;
+    this.splats.cut = view === "overview" ? this.cut : Infinity;
+    this.hideOwn();
+    this.seek(this.time ?? 0);
+  }
+
+  setCut(height) {
+    this.cut = height;
+    this.cutSlider.value = height;
+    if (this.view === "overview") this.splats.cut = height;
+    this.viewer.set_dirty();
+  }
+
+  choose(chosen) {
+    for (const flight of this.flights) {
+      flight.chosen = flight === chosen;
+      flight.button.classList.toggle("chosen", flight.chosen);
+    }
+    this.chosen = chosen;
+    this.hideOwn();
+    this.seek(this.time ?? 0);
+  }
+
+  switchDepth() {
+    this.depth = !this.depth;
+    this.drawPicture();
+  }
+
+  seek(time) {
+    this.time = Math.min(Math.max(time, 0), this.duration);
+    if (this.time >= this.duration && this.playing) this.play(false);
+    this.slider.value = this.time;
+    this.clock.textContent = `${this.time.toFixed(2)} s`;
+    for (const flight of this.flights) flight.show(this.time, this);
+    this.balls?.show(this.time);
+    this.drawPicture();
+    this.drawPlot();
+    this.viewer.set_dirty();
+  }
+
+  // Who looks out of a vehicle does not see it, nor its trail; the way to come is seen from above.
+  hideOwn() {
+    for (const flight of this.flights) {
+      const seen = !(this.view === "onboard" && flight.chosen);
+      flight.vehicle.visible = flight.sphere.visible = seen;
+      if (flight.trail) {
+        flight.trail.visible = seen;
+        flight.path.visible = this.view === "overview";
+      }
+    }
+  }
+
+  // The view's pose in W, z backwards; null where Meshcat's own controls decide.
+  cameraPose() {
+    const THREE = MeshCat.THREE, flight = this.chosen;
+    if (this.view === "overview") return null;
+    if (this.view === "onboard") {
+      return flight.pose(this.time).multiply(this.X_BC)
+        .multiply(new THREE.Matrix4().makeScale(1, -1, -1));
+    }
+    // It follows the vehicle where that has flown, a second behind, so that nothing is between.
+    const p = flight.position(this.time), eye = flight.position(this.time - 1.0);
+    const ahead = flight.position(this.time + 0.5).sub(eye).setZ(0);
+    if (ahead.lengthSq() < 1e-6) {
+      ahead.set(1, 0, 0).applyMatrix4(new THREE.Matrix4().extractRotation(flight.pose(this.time)));
+    }
+    const distance = p.clone().sub(eye).length();
+    eye.addScaledVector(ahead.setZ(0).normalize(), -Math.max(2 - distance, 0));
+    eye.z += 0.5;
+    const pose = new THREE.Matrix4().lookAt(eye, p, new THREE.Vector3(0, 0, 1));
+    return pose.setPosition(eye);
+  }
+
+  placeCamera() {
+    const pose = this.cameraPose();
+    if (!pose) return;
+    const camera = this.viewer.camera;
+    this.viewer.scene.updateMatrixWorld();
+    pose.premultiply(this.viewer.scene.matrixWorld)
+      .premultiply(camera.parent.matrixWorld.clone().invert())
+      .decompose(camera.position, camera.quaternion, camera.scale);
+  }
+
+  drawPicture() {
+    const frames = this.chosen.frames, canvas = this.picture;
+    this.picture.hidden = this.depthButton.hidden = !frames;
+    if (!frames) return;
+    const row = this.depth ? frames.depth : frames.color;
+    const index = Math.min(Math.floor(this.time / frames.period + 1e-6), row.length - 1);
+    const url = row[index];
+    if (!this.pictures.has(url)) {
+      const image = new Image();
+      image.onload = () => this.drawPicture();
+      image.src = `data:image/jpeg;base64,${url}`;
+      if (this.pictures.size > 60) this.pictures.clear();
+      this.pictures.set(url, image);
+    }
+    const image = this.pictures.get(url);
+    if (!image.complete || !image.naturalWidth) return;
+    canvas.height = Math.round(canvas.width * image.naturalHeight / image.naturalWidth);
+    canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
+  }
+
+  drawPlot() {
+    const canvas = this.plot, context = canvas.getContext("2d"), flight = this.chosen;
+    const {width, height} = canvas;
+    const known = (name) => flight[name].filter((value) => value !== null);
+    const top = Math.max(1, ...known("speeds"), ...known("clearances"));
+    const bottom = Math.min(0, ...known("clearances"));
+    const x = (time) => time / this.duration * width;
+    const y = (value) => 10 + (top - value) / (top - bottom) * (height - 40);
+    context.fillStyle = "#15171b";
+    context.fillRect(0, 0, width, height);
+    context.font = "22px system-ui, sans-serif";
+    context.fillStyle = context.strokeStyle = "#888";
+    context.lineWidth = 1;
+    for (let value = Math.ceil(bottom); value <= top; ++value) {
+      context.beginPath();
+      context.moveTo(0, y(value));
+      context.lineTo(width, y(value));
+      context.stroke();
+      context.fillText(`${value}`, 2, y(value) - 3);
+    }
+    context.fillStyle = "rgba(255, 32, 32, 0.3)";
+    context.fillRect(0, y(this.margin), width, y(bottom) - y(this.margin));
+    for (const [name, color] of [["speeds", "#6fb7ff"], ["clearances", "#ffc04d"]]) {
+      context.strokeStyle = color;
+      context.lineWidth = 3;
+      context.beginPath();
+      flight.times.forEach((time, i) => {
+        if (flight[name][i] !== null) context.lineTo(x(time), y(flight[name][i]));
+      });
+      context.stroke();
+    }
+    context.fillStyle = "#fff";
+    context.fillRect(x(this.time) - 1, 0, 3, height - 28);
+    const tell = (name, unit) => {
+      const value = flight.value(name, this.time);
+      return value === null ? "–" : `${value.toFixed(2)} ${unit}`;
+    };
+    context.fillText(
+      `${tell("speeds", "m/s")}   clearance ${tell("clearances", "m")}`, 30, height - 6);
+  }
+}

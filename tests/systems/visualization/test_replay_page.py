@@ -1,0 +1,247 @@
+"""Pages of flights, in a real browser where there is one."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.sensors import CameraInfo
+
+from splatpilot.systems.collision.moving_balls import MovingBalls
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.drake_images import render_view
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.visualization.drawing import draw_vehicle
+from splatpilot.systems.visualization.replay_page import (
+    Frames,
+    ReplayedFlight,
+    ReplayView,
+    replay_page,
+)
+
+WIDTH, HEIGHT, FOV_Y = 240, 180, 1.2
+# Optical axes (x right, y down, z forward) in a body with x forward, y left, z up.
+X_BC = RigidTransform(RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])), [0.1, 0, 0])
+VIEW = ReplayView(X_BC, FOV_Y, radius=0.35, lower=0.0, upper=4.0)
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+in_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on the PATH")
+
+
+def cloud(generator: np.random.Generator, count: int = 400) -> GaussianScene:
+    """Blobs of all shapes and shades within a box ahead of the origin."""
+    return GaussianScene.from_colors(
+        means=generator.uniform([2, -3, 0], [9, 3, 3], (count, 3)),
+        quats=generator.normal(size=(count, 4)),
+        scales=generator.uniform(0.02, 0.35, (count, 3)),
+        opacities=generator.uniform(0.2, 1.0, count),
+        colors=generator.uniform(size=(count, 3)),
+    )
+
+
+def straight(name: str, outcome: str, y: float = 0.0, roll: float = 0.0) -> ReplayedFlight:
+    """4 s along x at 0.25 m/s; clearance falls from 1 m to 0; plans and frames every 0.5 s."""
+    times = np.linspace(0, 4, 81)
+    states = np.array([hover_state([0.25 * t, y, 1.5]) for t in times])
+    q = RollPitchYaw(roll, 0, 0).ToQuaternion().wxyz()
+    states[:, 6:10], states[:, 3] = q, 0.25
+    ahead = np.linspace(0.2, 2, 10)[:, None] * np.array([1.0, 0, 0])
+    waypoints = ahead + np.array([0, 0.5, -0.5])[:, None, None] * np.array([0.0, 1, 0])
+    plans = [
+        Hypotheses(t, RigidTransform([0.25 * t, y, 1.5]), waypoints, np.array([1.0, 2, 3]))
+        for t in np.arange(0, 4, 0.5)
+    ]
+    vectors = np.array([plan.to_vector() for plan in plans])
+    shades = [np.full((48, 64, 3), 30 * k, np.uint8) for k in range(8)]
+    frames = Frames(0.5, shades, [255 - shade for shade in shades])
+    return ReplayedFlight(name, outcome, times, states, 1 - times / 4, vectors, frames)
+
+
+class Page:
+    """A page in a browser, with the errors that it reports."""
+
+    def __init__(self, tab, path):
+        self.tab, self.errors = tab, []
+        tab.on("console", lambda message: self._note(message.type, message.text))
+        tab.on("pageerror", lambda error: self._note("error", str(error)))
+        tab.goto(path.as_uri())
+        self.settle()
+
+    def _note(self, kind: str, text: str) -> None:
+        if kind in ("error", "warning") and not any(
+            word in text for word in ("GPU stall", "swiftshader", "getImageData")
+        ):
+            self.errors.append(text)
+
+    def settle(self) -> None:
+        """Waits until the picture shows what was asked for."""
+        self.tab.wait_for_function(
+            "window.replay && replay.splats.settled && !viewer.needs_render"
+            " && viewer.scene_tree.find(['splatpilot', 'vehicles', '0', 'body']).object.children"
+            ".length > 0"
+        )
+
+    def run(self, script: str):
+        """The value of an expression in the page, once it has been drawn."""
+        value = self.tab.evaluate(script)
+        self.settle()
+        return value
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) uint8, blue first, of the scene alone."""
+        self.tab.add_style_tag(
+            content="#replay-panel, #replay-bar, .dg { display: none !important }"
+        )
+        self.settle()
+        return cv2.imdecode(np.frombuffer(self.tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+
+
+@pytest.fixture
+def open_page(browser, tmp_path):
+    """Opens a page of flights; its window is as large as the onboard camera's image."""
+    tabs = []
+
+    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), balls=None) -> Page:
+        meshcat = Meshcat()
+        meshcat.SetCameraPose([-2, 0, 4], [4, 0, 1.5])
+        color = background if isinstance(background, tuple) else (0.0, 0.0, 0.0)
+        for name in ("top_color", "bottom_color"):
+            meshcat.SetProperty("/Background/<object>", name, list(color))
+        for path in ("/Grid", "/Axes"):
+            meshcat.SetProperty(path, "visible", False)
+        for k in range(len(flights)):
+            draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", 0.35)
+        path = tmp_path / "page.html"
+        html = meshcat.StaticHtml()
+        path.write_text(replay_page(html, gaussians, background, VIEW, flights, balls))
+        tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        tab.set_default_timeout(120_000)
+        tabs.append(tab)
+        return Page(tab, path)
+
+    yield opened
+    for tab in tabs:
+        tab.close()
+
+
+def seen(gaussians, background, X_WB: RigidTransform) -> np.ndarray:
+    """What the onboard camera sees, as `Page.picture` has it."""
+    info = CameraInfo(WIDTH, HEIGHT, FOV_Y)
+    view = render_view(BakedScene(gaussians), info, X_WB @ X_BC, 0.01, 1e3, background)
+    return np.round(255 * np.clip(view.color[..., ::-1], 0, 1)).astype(np.uint8)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return 10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
+
+
+SKY = EnvironmentMap(
+    cv2.resize(np.random.default_rng(5).uniform(size=(4, 8, 3)).astype(np.float32), (64, 32))
+)
+
+
+@in_browser
+@pytest.mark.parametrize("background", [(0.2, 0.4, 0.6), SKY])
+def test_page_shows_what_the_camera_sees(open_page, background):
+    """Seen from the vehicle in a banked turn, splats and what is behind them are those of the
+    onboard camera, to 30 dB; without the splats they are not."""
+    gaussians = cloud(np.random.default_rng(0))
+    page = open_page(gaussians, [straight("a", "goal", roll=0.4)], background)
+    page.run(
+        "() => { replay.look('onboard'); replay.seek(2);"
+        " replay.flights[0].fan.scale.set(0, 0, 0); }"
+    )
+    X_WB = RigidTransform(RollPitchYaw(0.4, 0, 0), [0.5, 0, 1.5])
+    truth = seen(gaussians, background, X_WB)
+    assert psnr(page.picture(), truth) > 30
+    page.run("() => { replay.splats.mesh.visible = false; viewer.set_dirty(); }")
+    assert psnr(page.picture(), truth) < 20
+    assert page.errors == []
+
+
+@in_browser
+def test_controls_move_time_and_view(open_page):
+    """The slider, the keys and the views change the picture; in the chase view the vehicle is
+    within the middle of the window; the sphere is red where the clearance is below the margin, and
+    the picture is the camera's at that time."""
+    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
+    page.run("() => replay.look('chase')")
+    for time in (0.0, 1.0, 3.9):
+        x, y, depth = page.run(
+            f"""() => {{
+              replay.seek({time});
+              viewer.render();
+              const p = replay.flights[0].sphere.getWorldPosition(new MeshCat.THREE.Vector3());
+              return p.project(viewer.camera).toArray();
+            }}"""
+        )
+        assert abs(x) < 0.5 and abs(y) < 0.5 and -1 < depth < 1
+        red, green, _ = page.run("() => replay.flights[0].sphere.material.color.toArray()")
+        assert (red > green) == (1 - time / 4 < VIEW.margin)
+        shade = page.run(
+            "() => document.getElementById('replay-picture').getContext('2d')"
+            ".getImageData(9, 9, 1, 1).data[0]"
+        )
+        assert shade == pytest.approx(30 * int(time / 0.5), abs=3)
+    page.tab.evaluate(
+        "() => { const s = document.getElementById('replay-time'); s.value = 1;"
+        " s.dispatchEvent(new Event('input')); }"
+    )
+    assert page.run("() => replay.time") == 1.0
+    page.tab.keyboard.press("ArrowRight")
+    assert page.run("() => replay.time") == pytest.approx(1.1)
+    before = page.picture()
+    page.tab.keyboard.press("1")
+    assert page.run("() => replay.view") == "overview"
+    assert psnr(page.picture(), before) < 25
+    # Half of the Gaussians are above 1.5 m; the cut hides them.
+    whole = page.run("() => { replay.setCut(9); }") or page.picture()
+    page.run("() => { replay.setCut(1.5); }")
+    assert psnr(page.picture(), whole) < 25
+    assert page.errors == []
+
+
+@in_browser
+def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
+    """Two flights have vehicles and trails of their own, and colours; the page starts two seconds
+    before the crash of the first; a chosen flight's plan alone is shown; balls are where they
+    are."""
+    balls = MovingBalls([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
+    flights = [straight("a", "collision"), straight("b", "goal", y=1.0)]
+    page = open_page(cloud(np.random.default_rng(2)), flights, balls=balls)
+    assert page.run("() => replay.time") == pytest.approx(2.0)
+    colors = page.run("() => replay.flights.map((f) => f.trail.material.color.getHex())")
+    assert len(set(colors)) == 2
+    places = page.run("() => replay.flights.map((f) => f.vehicle.matrix.elements.slice(12, 15))")
+    np.testing.assert_allclose(places, [[0.5, 0, 1.5], [0.5, 1, 1.5]], atol=1e-3)
+    page.run("() => replay.choose(replay.flights[1])")
+    assert page.run("() => replay.flights.map((f) => Boolean(f.fan.visible))") == [False, True]
+    for time, x in ((1, 3.0), (2.5, 4.0)):
+        page.run(f"() => replay.seek({time})")
+        ball = page.run("() => Array.from(replay.balls.mesh.instanceMatrix.array)")
+        placed = np.array([[0.5, 0, 0, x], [0, 0.5, 0, 0], [0, 0, 0.5, 1]])
+        np.testing.assert_allclose(np.reshape(ball, (4, 4)).T[:3], placed, atol=1e-6)
+    page.run("() => replay.seek(4)")
+    ball = page.run("() => Array.from(replay.balls.mesh.instanceMatrix.array)")
+    assert ball[0] == 0
+    assert page.errors == []
+
+
+def test_page_without_flights_is_refused():
+    """There is nothing to replay."""
+    with pytest.raises(ValueError, match="flights is empty"):
+        replay_page("<body></body>", cloud(np.random.default_rng(3)), (0.0, 0.0, 0.0), VIEW, [])
