@@ -45,7 +45,7 @@ def draw_goal(meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float) -> N
     color = Rgba(0.1, 0.9, 0.3, 0.4)
     meshcat.SetObject(path, Sphere(radius), color)
     meshcat.SetObject(f"{path}/pole", Cylinder(0.04, 3.0), color)
-    meshcat.SetTransform(f"{path}/pole", RigidTransform([0.0, 0.0, 1.5]))
+    meshcat.SetTransform(f"{path}/pole", RigidTransform(np.array([0.0, 0.0, 1.5])))
     meshcat.SetTransform(path, RigidTransform(p_WG))
 
 

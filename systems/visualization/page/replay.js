@@ -23,10 +23,10 @@ class ReplayFlight {
     this.group = new THREE.Group();
     if (this.lengths.at(-1) > 0) {
       const curve = new THREE.CatmullRomCurve3(this.points), color = this.color;
-      const tube = () => new THREE.TubeGeometry(curve, this.points.length, 0.012, 5);
-      this.trail = new THREE.Mesh(tube(), new THREE.MeshBasicMaterial({color}));
-      this.path = new THREE.Mesh(tube(), new THREE.MeshBasicMaterial(
-        {color, transparent: true, opacity: 0.35, depthWrite: false}));
+      const tube = (radius) => new THREE.TubeGeometry(curve, this.points.length, radius, 5);
+      this.trail = new THREE.Mesh(tube(0.015), new THREE.MeshBasicMaterial({color}));
+      this.path = new THREE.Mesh(tube(0.05), new THREE.MeshBasicMaterial(
+        {color, transparent: true, opacity: 0.6, depthWrite: false}));
       this.group.add(this.trail, this.path);
     }
     this.sphere = new THREE.Mesh(
