@@ -11,9 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpilot.training.corpus.sample import Samples, SampleSize
+from splatpilot.systems.configuration import load_config
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.corpus.sample import Samples
 from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.corpus.world_record import WorldRecord
+
+CONFIG = "corpus.yaml"
 
 
 class Corpus:
@@ -32,6 +36,7 @@ class Corpus:
             raise FileNotFoundError(
                 f"{folder} holds no corpus; gather one with `splatpilot corpus make --out {folder}`"
             )
+        self.config = load_config(CorpusConfig(), folder / CONFIG)
         self.shards = [Shard(path) for path in entries(folder / "shards")]
         self.worlds: Sequence[WorldRecord] = [
             WorldRecord(path) for path in entries(folder / "worlds")
@@ -48,11 +53,18 @@ class Corpus:
             raise ValueError(f"{folder} holds no samples yet; run `splatpilot corpus make` again")
         self._world = [number[shard.world] for shard in self._filled]
         self._first = np.cumsum([0, *map(len, self._filled)])
-        first = self._filled[0].arrays
-        self.size = SampleSize(*first["depth"].shape[1:], first["trajectories_B"].shape[1])
 
     def __len__(self) -> int:
         return int(self._first[-1])
+
+    def __str__(self) -> str:
+        flights = [flight for shard in self.shards for flight in shard.flights]
+        states = sum(flight["states"] for flight in flights)
+        shown = sum(flight["states"] > 0 for flight in flights)
+        return (
+            f"{len(self)} samples of {states} states, {shown} of {len(flights)} flights and "
+            f"{len(self.worlds)} worlds"
+        )
 
     def samples(self, indices: np.ndarray) -> Samples:
         """Copies of the samples of `indices` (N,), in their order.
@@ -63,7 +75,7 @@ class Corpus:
         indices = np.asarray(indices)
         if len(indices) and not (indices.min() >= 0 and indices.max() < len(self)):
             raise IndexError(f"samples are numbered 0 to {len(self) - 1}")
-        found = Samples.empty(len(indices), self.size)
+        found = Samples.zeros(len(indices), self.config.size)
         within = np.searchsorted(self._first, indices, side="right") - 1
         for k in np.unique(within):
             chosen = np.flatnonzero(within == k)

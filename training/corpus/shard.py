@@ -11,7 +11,6 @@ unchanged since 2007, read by every language, and mapped into memory by NumPy it
 
 import json
 import zlib
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,55 +18,54 @@ from typing import Any
 import numpy as np
 
 from splatpilot.systems.files import folder_written_atomically
-from splatpilot.training.corpus.sample import SampleSize
+from splatpilot.training.corpus.sample import Samples
 
 FORMAT_VERSION = 1
 
 _ABOUT = "shard.json"
+_ARRAYS = "color.npy", "depth.npy", "labels.npy"
 _REMEDY = "delete that folder and run the command that gathered it again"
 _CHUNK = 1 << 22  # bytes
 
 
 def write_shard(
     path: Path,
-    size: SampleSize,
-    arrays: Mapping[str, np.ndarray],
+    samples: Samples,
     *,
     world: str,
     source: int,
     flights: list[dict[str, Any]],
+    revision: str,
 ) -> None:
     """
     Writes the folder `path`, whole or not at all; one that is there stays.
 
     Args:
-        size: of the samples.
-        arrays: the fields of `Samples` that the samples do not share; may be of length zero.
+        samples: what to write, perhaps none; their `world` and `source` are stated once:
         world: name of the world that all are from.
         source: `EXPERT` or `RECOVERY`, of all.
-        flights: what each flight was that samples come from, as what JSON can hold.
+        flights: of each flight that they come from, what JSON can hold.
+        revision: of the program.
 
     Raises:
         OSError: if it cannot be written.
     """
-    count = len(arrays["color"])
-    labels = np.empty(count, size.label_type())
+    labels = np.empty(len(samples), samples.size.label_type())
     for name in labels.dtype.names or ():
-        labels[name] = arrays[name]
+        labels[name] = getattr(samples, name)
     with folder_written_atomically(path) as folder:
-        for name, dtype in size.image_types().items():
-            assert (arrays[name].dtype, arrays[name].shape[1:]) == (dtype.base, dtype.shape)
-            np.save(folder / f"{name}.npy", arrays[name])
-        np.save(folder / "labels.npy", labels)
+        for name, array in zip(_ARRAYS, (samples.color, samples.depth, labels), strict=True):
+            np.save(folder / name, array)
         files = {
-            file.name: {"bytes": file.stat().st_size, "crc32": _checksum(file)}
-            for file in sorted(folder.iterdir())
+            name: {"bytes": (folder / name).stat().st_size, "crc32": _checksum(folder / name)}
+            for name in _ARRAYS
         }
         about = {
             "format_version": FORMAT_VERSION,
+            "revision": revision,
             "world": world,
             "source": source,
-            "samples": count,
+            "samples": len(samples),
             "files": files,
             "flights": flights,
         }
@@ -93,6 +91,7 @@ class Shard:
                 f"{path}: a shard of format version {version}, this program knows {FORMAT_VERSION};"
                 " use the version of the program that gathered it, or gather anew in another folder"
             )
+        self.revision: str = about["revision"]
         self.world: str = about["world"]
         self.source: int = about["source"]
         self.flights: list[dict[str, Any]] = about["flights"]
@@ -122,10 +121,7 @@ class Shard:
         """The fields of `Samples` that samples do not share, read-only."""
         if not self._count:  # nothing cannot be mapped
             return {}
-        color, depth, labels = (
-            np.load(self.path / f"{name}.npy", mmap_mode="r")
-            for name in ("color", "depth", "labels")
-        )
+        color, depth, labels = (np.load(self.path / name, mmap_mode="r") for name in _ARRAYS)
         fields = {name: labels[name] for name in labels.dtype.names or ()}
         return {"color": color, "depth": depth} | fields
 

@@ -1,4 +1,4 @@
-"""Rollouts to imitate: an expert flies, and along its flight says what the best ways are."""
+"""The expert to imitate: who flies, and what the best ways are from any state."""
 
 from dataclasses import dataclass, replace
 
@@ -6,26 +6,34 @@ import numpy as np
 
 from splatpilot.diagrams.flight import Flight, Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.privileged_planner import plan
-from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from splatpilot.systems.policies.privileged_planner import (
+    PrivilegedPlanner,
+    PrivilegedPlannerConfig,
+    plan,
+)
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+
+PLANNER = "planner"
 
 
 @dataclass
 class ExpertConfig:
     """Who flies, how fast, and how often is asked."""
 
-    # A policy of the benchmark: `planner`, which knows the way, or one that flies by depth.
-    policy: str = "planner"
+    # `planner`, which knows the way, or a policy of the benchmark that flies by depth, or a file of
+    # weights.
+    policy: str = PLANNER
     # [m/s]
     speed: float = 2.0
+    # [Hz] Plans a second of the planner in flight: fewer than in the benchmark, as nothing moves.
+    rate: float = 5.0
     # [s] Between two labelled states.
     period: float = 0.4
     # [-] Trajectories a state is labelled with, K.
@@ -36,18 +44,12 @@ class ExpertConfig:
         policy_named(self.policy, self.speed)
         if not 0.02 <= self.period <= 10.0:
             raise ValueError(f"period is {self.period} s; it must be 0.02 to 10")
-        LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses).validate()
+        self.planner().validate()
 
-
-@dataclass(frozen=True, eq=False)
-class ExpertRollout:
-    """A flight that reached its goal with positive clearance, and labels along it."""
-
-    flight: Flight
-    p_WG: np.ndarray  # (3,) [m]
-    states: np.ndarray  # (n, 13), one every `period`
-    waypoints_B: np.ndarray  # (n, K, 10, 3) [m], each state's best trajectories, cheapest first
-    costs: np.ndarray  # (n, K)
+    def planner(self) -> PrivilegedPlannerConfig:
+        """The planner that labels, and flies if it is the expert."""
+        lattice = LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses)
+        return PrivilegedPlannerConfig(rate=self.rate, lattice=lattice)
 
 
 class Labeller:
@@ -70,11 +72,10 @@ class Labeller:
         config: ExpertConfig,
         params: QuadrotorParams | None = None,
     ) -> None:
-        self._field = esdf if esdf.occupied_outside else esdf.conservative()
-        lattice = LatticeConfig(speed=config.speed, num_hypotheses=config.num_hypotheses)
-        self._lattice = TrajectoryLattice(lattice)
-        self._toa: TimeOfArrival = time_of_arrival(self._field, p_WG, lattice.margin)
-        self._params = params
+        self.planner, self._params = config.planner(), params
+        self.field = esdf if esdf.occupied_outside else esdf.conservative()
+        self.toa = time_of_arrival(self.field, p_WG, self.planner.lattice.margin)
+        self._lattice = TrajectoryLattice(self.planner.lattice)
 
     def label(self, time: float, state: np.ndarray) -> Hypotheses:
         """The K best distinct trajectories from a state (13,), cheapest first.
@@ -82,35 +83,36 @@ class Labeller:
         Raises:
             ValueError: if no way leads to the goal from there.
         """
-        return plan(time, state, self._field, self._toa, self._lattice, self._params)
+        return plan(time, state, self.field, self.toa, self._lattice, self._params)
 
 
-def expert_rollout(scenario: Scenario, world: World, config: ExpertConfig) -> ExpertRollout | None:
-    """Flies `scenario` in `world` with the expert, and labels the states of its flight.
+def fly_expert(
+    scenario: Scenario, world: World, config: ExpertConfig, labeller: Labeller
+) -> Flight:
+    """Flies `scenario` in `world` to the labeller's goal with the expert.
 
-    Start and goal are the scenario's, or else the world's; `draw_start_and_goal` draws others from
-    a distance field.
-
-    Returns:
-        The rollout, or None if the flight did not reach the goal or touched anything.
+    The flight ends where the grid of distances says so; its clearances are those of `world`.
 
     Raises:
-        ValueError: on a config out of range, or a scenario that cannot be flown.
+        ValueError: on a scenario that cannot be flown.
     """
-    config.validate()
-    scenario = replace(scenario, policy=policy_named(config.policy, config.speed))
-    scenario.validate()
-    labeller = Labeller(world.esdf, goal_of(scenario, world), config, scenario.vehicle)
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
-    if flight.outcome is not Outcome.GOAL or not np.nanmin(flight.clearances) > 0.0:
-        return None
-    times = np.arange(0.0, flight.times[-1], config.period)
-    rows = np.searchsorted(flight.times, times - 1e-9)
-    labels = [labeller.label(float(flight.times[row]), flight.states[row]) for row in rows]
-    return ExpertRollout(
-        flight,
-        goal_of(scenario, world),
-        flight.states[rows],
-        np.stack([label.waypoints_B for label in labels]),
-        np.stack([label.costs for label in labels]),
+    scenario = replace(
+        scenario,
+        policy=policy_named(config.policy, config.speed),
+        goal=labeller.toa.p_WG.tolist(),
     )
+    scenario.validate()
+    planner = None
+    if config.policy == PLANNER:
+        planner = PrivilegedPlanner(
+            labeller.field, labeller.planner, scenario.vehicle, toa=labeller.toa
+        )
+    # The grid takes a fraction of the time that many shapes do.
+    gridded = replace(world, distance_field=world.esdf)
+    diagram = BuildFlightDiagram(scenario, gridded, camera=False, policy=planner)
+    return fly(diagram, scenario, world)
+
+
+def is_demonstration(flight: Flight) -> bool:
+    """Whether a flight reached its goal and touched nothing."""
+    return flight.outcome is Outcome.GOAL and bool(np.nanmin(flight.clearances) > 0.0)
