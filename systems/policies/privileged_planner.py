@@ -153,7 +153,6 @@ class PrivilegedPlanner(LeafSystem):
         config: PrivilegedPlannerConfig | None = None,
         params: QuadrotorParams | None = None,
         moving: MovingBalls | None = None,
-        toa: TimeOfArrival | None = None,
     ) -> None:
         """Constructs the planner.
 
@@ -162,7 +161,6 @@ class PrivilegedPlanner(LeafSystem):
             config: see `PrivilegedPlannerConfig`.
             params: the vehicle's, see `plan`.
             moving: what moves in the scene.
-            toa: the time of arrival, if it is known already for the goal that will be asked for.
         """
         super().__init__()
         self._config = config or PrivilegedPlannerConfig()
@@ -170,7 +168,7 @@ class PrivilegedPlanner(LeafSystem):
         self._params = params or QuadrotorParams()
         self._params.validate()
         self._field = esdf if esdf.occupied_outside else esdf.conservative()
-        self._moving, self._known = moving, toa
+        self._moving = moving
         self._lattice = TrajectoryLattice(self._config.lattice)
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
@@ -194,13 +192,10 @@ class PrivilegedPlanner(LeafSystem):
     def _calc_time_of_arrival(self, context, value) -> None:
         p_WG = np.asarray(self._goal_port.Eval(context))
         last = value.get_value()
-        if not isinstance(last, TimeOfArrival):
-            last = self._known
         # A goal port reports a change at every step if its source is not a constant; only a
         # change of the goal itself is worth the march.
-        if last is None or not np.array_equal(last.p_WG, p_WG):
-            last = time_of_arrival(self._field, p_WG, self._config.lattice.margin)
-        value.set_value(last)
+        if not isinstance(last, TimeOfArrival) or not np.array_equal(last.p_WG, p_WG):
+            value.set_value(time_of_arrival(self._field, p_WG, self._config.lattice.margin))
 
     def _march(self, context: Context) -> None:
         self.get_cache_entry(self._time_of_arrival).Eval(context)

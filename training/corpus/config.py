@@ -19,8 +19,8 @@ class CorpusConfig:
     worlds: LibraryConfig = field(default_factory=LibraryConfig)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     # [-] Flights of the expert in each world, all to its goal: the first from its start, the others
-    # from anywhere with a way of at least 4 m.
-    flights: int = 8
+    # from anywhere at least half as far away.
+    flights: int = 16
     # What the student will see through.
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(width=160, height=120))
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)

@@ -1,17 +1,18 @@
 """Gathering in one world: the expert flies; its states are labelled, seen and written."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from splatpilot.diagrams.flight import Flight
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.sensors import make_camera
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.drake_images import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
@@ -23,12 +24,10 @@ from splatpilot.training.corpus.perturbation import perturbed
 from splatpilot.training.corpus.sample import EXPERT, Samples
 from splatpilot.training.corpus.shard import write_shard
 from splatpilot.training.corpus.world_record import record_world
-from splatpilot.training.policies.expert import Labeller, fly_expert, is_demonstration
+from splatpilot.training.policies.expert import PLANNER, ExpertFlight, Labeller, fly_policy
+from splatpilot.training.policies.planner_flights import fly_planner
 
-SHORTEST = 4.0
-"""[m], least length of the way from a start that is drawn."""
-
-_ROOM = 0.3  # [m], clearance of such a start
+_ROOM = 0.3  # [m], clearance of a start that is drawn
 
 
 class LabelledState(NamedTuple):
@@ -56,24 +55,36 @@ def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) 
     world = make_world(source.world, source.seed)
     labeller = Labeller(world.esdf, world.p_WG, config.expert)
     record_world(folder / "worlds" / source.name, source, world.esdf)
-    flights, parts = [], []
-    for number in range(config.flights):
-        rng = np.random.default_rng([config.seed, source.seed, number])
-        start = _draw_start(labeller, rng) if number else world.p_WS
-        scenario = Scenario(seed=source.seed, start=start.tolist())
+    rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
+    starts = np.stack([world.p_WS, *(_draw_start(labeller, world.p_WS, rng) for rng in rngs[1:])])
+    parts, entries = [], []
+    for number, (flight, rng) in enumerate(
+        zip(_fly(starts, world, config, labeller), rngs, strict=True)
+    ):
+        labels = zip(flight.states, flight.labels, strict=True)
+        labelled = keep_clear(labels, labeller.field) if flight.is_demonstration else []
         look = draw_appearance(rng, config.appearance)
-        labelled, entry = _fly(scenario, world, config, labeller)
         if labelled:
-            bound = source.perturbation_bound
-            seen = with_appearance(world, look)
+            seen, bound = with_appearance(world, look), source.perturbation_bound
             parts.append(see_states(labelled, seen, labeller, config, bound, rng))
-        flights.append({"flight": number, "seed": source.seed} | entry)
+        entries.append(
+            {
+                "flight": number,
+                "seed": source.seed,
+                "start": starts[number].tolist(),
+                "goal": world.p_WG.tolist(),
+                "outcome": str(flight.outcome),
+                "time_s": flight.time,
+                "least_clearance_m": flight.least_clearance,
+                "states": len(labelled),
+            }
+        )
     write_shard(
         shard_folder(folder, source.name),
         Samples.concatenate(parts, config.size),
         world=source.name,
         source=EXPERT,
-        flights=flights,
+        flights=entries,
         revision=revision,
     )
 
@@ -84,44 +95,26 @@ def shard_folder(folder: Path, world: str) -> Path:
 
 
 def _fly(
-    scenario: Scenario, world: World, config: CorpusConfig, labeller: Labeller
-) -> tuple[list[LabelledState], dict[str, Any]]:
-    """The labelled states of a flight of the expert, none if it failed, and what to say of it."""
-    entry: dict[str, Any] = {"start": scenario.start, "goal": labeller.toa.p_WG.tolist()}
-    try:
-        flight = fly_expert(scenario, world, config.expert, labeller)
-    except InfeasibleFlightError as error:
-        return [], entry | {"outcome": "infeasible", "reason": str(error), "states": 0}
-    labelled = []
-    if is_demonstration(flight):
-        labelled = list(label_states(_states(flight, config.expert.period), labeller))
-    return labelled, entry | {
-        "outcome": str(flight.outcome),
-        "time_s": float(flight.times[-1]),
-        "least_clearance_m": float(np.nanmin(flight.clearances)),
-        "states": len(labelled),
-    }
+    starts: np.ndarray, world: World, config: CorpusConfig, labeller: Labeller
+) -> Iterable[ExpertFlight]:
+    """The expert's flights from each of the starts (N, 3) [m] to the goal of the world."""
+    if config.expert.policy == PLANNER:
+        return fly_planner(starts, world, config.expert, labeller)
+    scenarios = (Scenario(start=start, start_radius=0.0) for start in starts.tolist())
+    return (fly_policy(scenario, world, config.expert, labeller) for scenario in scenarios)
 
 
-def _states(flight: Flight, period: float) -> np.ndarray:
-    """The states (n, 13) of a flight, one every `period` [s] from its start."""
-    times = np.arange(0.0, flight.times[-1], period)
-    return flight.states[np.searchsorted(flight.times, times - 1e-9)]
-
-
-def label_states(states: Iterable[np.ndarray], labeller: Labeller) -> Iterator[LabelledState]:
-    """What the expert would do from each state (13,). States without a way on that touches nothing
-    are left out; of those with fewer than K the ways that do stand first."""
-    for state in states:
-        try:
-            label = labeller.label(0.0, state)
-        except InfeasibleFlightError:
-            continue
+def keep_clear(labels: Iterable[tuple[np.ndarray, Hypotheses]], field: Esdf) -> list[LabelledState]:
+    """The labelled states (13,) less the trajectories that touch something; of those with fewer
+    than K the ones that do not stand first, and states without any are left out."""
+    kept = []
+    for state, label in labels:
         waypoints_W = label.waypoints_W
-        clear = (labeller.field.distance(waypoints_W) > VEHICLE_RADIUS).all(axis=1)  # (K,)
+        clear = (field.distance(waypoints_W) > VEHICLE_RADIUS).all(axis=1)  # (K,)
         if clear.any():
             waypoints_W = np.where(clear[:, None, None], waypoints_W, np.nan)
-            yield LabelledState(state, waypoints_W[np.argsort(~clear, kind="stable")])
+            kept.append(LabelledState(state, waypoints_W[np.argsort(~clear, kind="stable")]))
+    return kept
 
 
 def see_states(
@@ -170,13 +163,11 @@ def see_states(
     return samples
 
 
-def _draw_start(labeller: Labeller, rng: np.random.Generator) -> np.ndarray:
-    """A free place p_WS (3,) [m] with room, from which the way to the goal is long enough."""
+def _draw_start(labeller: Labeller, p_WS: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A free place (3,) [m] with room, at least half as far from the goal as p_WS (3,) [m]."""
     field, toa = labeller.field, labeller.toa
     roomy = toa.reachable & (field.distances > VEHICLE_RADIUS + _ROOM)
-    cells = np.argwhere(roomy & (toa.times > SHORTEST))
+    cells = np.argwhere(roomy & (toa.times > 0.5 * toa.value(p_WS)))
     if len(cells) == 0:
-        raise InfeasibleFlightError(
-            f"no place has room to start from with a way of {SHORTEST} m to the goal"
-        )
+        raise InfeasibleFlightError("no place half as far from the goal as the start has room")
     return field.lower_W + field.voxel_size * (cells[rng.integers(len(cells))] + 0.5)

@@ -4,18 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatpilot.diagrams.flight import Flight, Outcome, fly
+from splatpilot.diagrams.flight import Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.privileged_planner import (
-    PrivilegedPlanner,
-    PrivilegedPlannerConfig,
-    plan,
-)
+from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
@@ -32,10 +28,10 @@ class ExpertConfig:
     policy: str = PLANNER
     # [m/s]
     speed: float = 2.0
-    # [Hz] Plans a second of the planner in flight: fewer than in the benchmark, as nothing moves.
-    rate: float = 5.0
     # [s] Between two labelled states.
     period: float = 0.4
+    # [-] Plans that the planner flies by in that time: fewer than in the benchmark.
+    plans: int = 2
     # [-] Trajectories a state is labelled with, K.
     num_hypotheses: int = 3
 
@@ -44,12 +40,29 @@ class ExpertConfig:
         policy_named(self.policy, self.speed)
         if not 0.02 <= self.period <= 10.0:
             raise ValueError(f"period is {self.period} s; it must be 0.02 to 10")
-        self.planner().validate()
+        if not 1 <= self.plans <= 100:
+            raise ValueError(f"plans is {self.plans}; it must be 1 to 100")
+        self.lattice().validate()
 
-    def planner(self) -> PrivilegedPlannerConfig:
-        """The planner that labels, and flies if it is the expert."""
-        lattice = LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses)
-        return PrivilegedPlannerConfig(rate=self.rate, lattice=lattice)
+    def lattice(self) -> LatticeConfig:
+        """Of the planner, which labels, and flies if it is the expert."""
+        return LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses)
+
+
+@dataclass(frozen=True, eq=False)
+class ExpertFlight:
+    """A flight of the expert, and what it would do from states along it."""
+
+    outcome: Outcome
+    time: float  # [s] that it took
+    least_clearance: float  # [m]
+    states: np.ndarray  # (n, 13), one every `period`
+    labels: list[Hypotheses]  # (n,)
+
+    @property
+    def is_demonstration(self) -> bool:
+        """Whether it reached its goal and touched nothing."""
+        return self.outcome is Outcome.GOAL and self.least_clearance > 0.0
 
 
 class Labeller:
@@ -72,10 +85,9 @@ class Labeller:
         config: ExpertConfig,
         params: QuadrotorParams | None = None,
     ) -> None:
-        self.planner, self._params = config.planner(), params
+        self._lattice, self._params = TrajectoryLattice(config.lattice()), params
         self.field = esdf if esdf.occupied_outside else esdf.conservative()
-        self.toa = time_of_arrival(self.field, p_WG, self.planner.lattice.margin)
-        self._lattice = TrajectoryLattice(self.planner.lattice)
+        self.toa = time_of_arrival(self.field, p_WG, config.lattice().margin)
 
     def label(self, time: float, state: np.ndarray) -> Hypotheses:
         """The K best distinct trajectories from a state (13,), cheapest first.
@@ -86,33 +98,24 @@ class Labeller:
         return plan(time, state, self.field, self.toa, self._lattice, self._params)
 
 
-def fly_expert(
+def fly_policy(
     scenario: Scenario, world: World, config: ExpertConfig, labeller: Labeller
-) -> Flight:
-    """Flies `scenario` in `world` to the labeller's goal with the expert.
-
-    The flight ends where the grid of distances says so; its clearances are those of `world`.
+) -> ExpertFlight:
+    """Flies `scenario` in `world` by the expert's policy, as in the benchmark.
 
     Raises:
-        ValueError: on a scenario that cannot be flown.
+        ValueError: on a scenario that cannot be flown, or if no way leads to the goal from a state
+            along the flight.
     """
-    scenario = replace(
-        scenario,
-        policy=policy_named(config.policy, config.speed),
-        goal=labeller.toa.p_WG.tolist(),
-    )
+    scenario = replace(scenario, policy=policy_named(config.policy, config.speed))
     scenario.validate()
-    planner = None
-    if config.policy == PLANNER:
-        planner = PrivilegedPlanner(
-            labeller.field, labeller.planner, scenario.vehicle, toa=labeller.toa
-        )
-    # The grid takes a fraction of the time that many shapes do.
-    gridded = replace(world, distance_field=world.esdf)
-    diagram = BuildFlightDiagram(scenario, gridded, camera=False, policy=planner)
-    return fly(diagram, scenario, world)
-
-
-def is_demonstration(flight: Flight) -> bool:
-    """Whether a flight reached its goal and touched nothing."""
-    return flight.outcome is Outcome.GOAL and bool(np.nanmin(flight.clearances) > 0.0)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    times = np.arange(0.0, flight.times[-1], config.period)
+    rows = np.searchsorted(flight.times, times - 1e-9)
+    return ExpertFlight(
+        flight.outcome,
+        float(flight.times[-1]),
+        float(np.nanmin(flight.clearances)),
+        flight.states[rows],
+        [labeller.label(float(flight.times[row]), flight.states[row]) for row in rows],
+    )
