@@ -23,7 +23,7 @@ _HUE = 1.0  # [rad]
 _SATURATION = 0.6  # natural logarithm
 _RELIEF = 0.6  # part of the light that comes from one direction
 _MOTTLE = 0.15  # relative, of brightness over space
-_WAVELENGTHS = 0.5, 5.0  # [m], of the mottling
+_SHORTEST, _LONGEST = 0.5, 5.0  # [m], wavelengths of the mottling
 _WAVES = 5
 _SKY = 0.7  # part of another colour in the background
 
@@ -62,7 +62,9 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
     light = rng.normal(size=3)
     waves = rng.normal(size=(_WAVES, 4))
     waves[:, :3] /= np.linalg.norm(waves[:, :3], axis=1, keepdims=True)
-    waves[:, :3] *= 2 * np.pi / np.exp(rng.uniform(*np.log(_WAVELENGTHS), (_WAVES, 1)))
+    waves[:, :3] *= (
+        2 * np.pi / np.exp(rng.uniform(np.log(_SHORTEST), np.log(_LONGEST), (_WAVES, 1)))
+    )
     return Appearance(
         paint=paint.astype(np.float32),
         exposure=float(2 ** uniform(_EXPOSURE)),

@@ -70,7 +70,8 @@ class Samples:
     @property
     def size(self) -> SampleSize:
         """What they have in common."""
-        return SampleSize(*self.depth.shape[1:], self.trajectories_B.shape[1])
+        _, height, width = self.depth.shape
+        return SampleSize(height, width, self.trajectories_B.shape[1])
 
     def __len__(self) -> int:
         return len(self.color)

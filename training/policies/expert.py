@@ -1,6 +1,8 @@
 """The expert to imitate: who flies, and what the best ways are from any state."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
@@ -17,6 +20,13 @@ from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, Trajec
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 PLANNER = "planner"
+
+
+class Label(NamedTuple):
+    """A state and the best trajectories from it."""
+
+    state: np.ndarray  # (13,)
+    plan: Hypotheses  # cheapest first
 
 
 @dataclass
@@ -56,8 +66,7 @@ class ExpertFlight:
     outcome: Outcome
     time: float  # [s] that it took
     least_clearance: float  # [m]
-    states: np.ndarray  # (n, 13), one every `period`
-    labels: list[Hypotheses]  # (n,)
+    labels: list[Label]  # of states along it, one every `period`
 
     @property
     def is_demonstration(self) -> bool:
@@ -97,6 +106,16 @@ class Labeller:
         """
         return plan(time, state, self.field, self.toa, self._lattice, self._params)
 
+    def labels(self, states: Iterable[np.ndarray]) -> list[Label]:
+        """States (13,) with their trajectories, less those that no way leads on from."""
+        labels = []
+        for state in states:
+            try:
+                labels.append(Label(state, self.label(0.0, state)))
+            except InfeasibleFlightError:
+                continue
+        return labels
+
 
 def fly_policy(
     scenario: Scenario, world: World, config: ExpertConfig, labeller: Labeller
@@ -104,18 +123,15 @@ def fly_policy(
     """Flies `scenario` in `world` by the expert's policy, as in the benchmark.
 
     Raises:
-        ValueError: on a scenario that cannot be flown, or if no way leads to the goal from a state
-            along the flight.
+        ValueError: on a scenario that cannot be flown.
     """
     scenario = replace(scenario, policy=policy_named(config.policy, config.speed))
     scenario.validate()
     flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
     times = np.arange(0.0, flight.times[-1], config.period)
-    rows = np.searchsorted(flight.times, times - 1e-9)
     return ExpertFlight(
         flight.outcome,
         float(flight.times[-1]),
         float(np.nanmin(flight.clearances)),
-        flight.states[rows],
-        [labeller.label(float(flight.times[row]), flight.states[row]) for row in rows],
+        labeller.labels(flight.states[np.searchsorted(flight.times, times - 1e-9)]),
     )
