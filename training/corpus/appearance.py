@@ -83,7 +83,7 @@ def with_appearance(world: World, look: Appearance) -> World:
     return replace(
         world,
         gaussians=recolored(world.gaussians, look),
-        background=_recolored_background(world.background, look),
+        background=recolored_background(world.background, look),
     )
 
 
@@ -104,7 +104,9 @@ def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
     return replace(scene, sh=sh)
 
 
-def _recolored_background(background: Background, look: Appearance) -> Background:
+def recolored_background(background: Background, look: Appearance) -> Background:
+    """What is seen behind everything, under the same light, with another sky mixed in."""
+
     def seen(color: NDArray) -> Array:
         mixed = (1 - look.sky_part) * color + look.sky_part * look.sky
         return _developed(look.exposure * mixed**GAMMA @ look.mixing.T)
