@@ -18,7 +18,7 @@ from splatpilot.systems.splats.spherical_harmonics import C0
 _PAINT = 0.35  # sRGB, largest change of a colour of paint
 _PAINTS = 4  # along each axis of the colour cube
 _TINT = 0.25  # natural logarithm of the light's red, green and blue, over the mean
-_EXPOSURE = 1.0  # [EV]
+_EXPOSURE = -1.0, 0.5  # [EV], least and greatest: brighter ones would burn out
 _HUE = 1.0  # [rad]
 _SATURATION = 0.6  # natural logarithm
 _RELIEF = 0.6  # part of the light that comes from one direction
@@ -67,7 +67,7 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
     )
     return Appearance(
         paint=paint.astype(np.float32),
-        exposure=float(2 ** uniform(_EXPOSURE)),
+        exposure=float(2 ** (strength * rng.uniform(*_EXPOSURE))),
         mixing=(hue @ np.diag(tint)).astype(np.float32),
         light_W=(light / np.linalg.norm(light)).astype(np.float32),
         relief=float(strength * rng.uniform(0, _RELIEF)),
