@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("corpus")
     words = ["corpus", "make", "--out", str(out), "--worlds", "1", "--jobs", "1"]
     for setting in (
-        "worlds.kinds=[P10]", "flights=1", "expert.period=1.0", "expert.plans=5",
+        "worlds.kinds=[P10]", "flights=1", "expert.period=0.6",
         "camera.width=48", "camera.height=36", "appearance=0",
     ):  # fmt: skip
         words += ["--set", setting]

@@ -13,13 +13,20 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.policies.hypotheses import (
+    NUM_WAYPOINTS,
+    WAYPOINT_PERIOD,
+    Hypotheses,
+)
 from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 PLANNER = "planner"
+
+_LONGEST = NUM_WAYPOINTS * WAYPOINT_PERIOD - FlatnessControllerConfig.lookahead  # [s]
 
 
 class Label(NamedTuple):
@@ -38,20 +45,19 @@ class ExpertConfig:
     policy: str = PLANNER
     # [m/s]
     speed: float = 2.0
-    # [s] Between two labelled states.
+    # [s] Between two labelled states; when the planner flies, also between two of its plans.
     period: float = 0.4
-    # [-] Plans that the planner flies by in that time: fewer than in the benchmark.
-    plans: int = 2
     # [-] Trajectories a state is labelled with, K.
     num_hypotheses: int = 3
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         policy_named(self.policy, self.speed)
-        if not 0.02 <= self.period <= 10.0:
-            raise ValueError(f"period is {self.period} s; it must be 0.02 to 10")
-        if not 1 <= self.plans <= 100:
-            raise ValueError(f"plans is {self.plans}; it must be 1 to 100")
+        if not 0.02 <= self.period <= _LONGEST:
+            raise ValueError(
+                f"expert.period is {self.period} s; it must be 0.02 to {_LONGEST:g}, as plans last "
+                "1 s and the controller looks 0.4 s ahead"
+            )
         self.lattice().validate()
 
     def lattice(self) -> LatticeConfig:

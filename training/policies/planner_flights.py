@@ -7,7 +7,7 @@ import torch
 
 from splatpilot.diagrams.flight import Outcome
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.policies.hypotheses import WAYPOINT_PERIOD, Hypotheses
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 from splatpilot.training.policies.expert import ExpertConfig, ExpertFlight, Label, Labeller
@@ -26,16 +26,15 @@ def fly_planner(
     """Flies from each of the starts p_WS (N, 3) [m] to the labeller's goal.
 
     The vehicles are `BodyRate`, which has the equations of the simulated plant and the law of its
-    controller; a step of many costs as much as one of one. They look along their way. What they fly
-    by are their labels, and plans in between.
+    controller; a step of many costs as much as one of one. They look along their way, and fly by
+    their labels: a plan every 0.4 s leads to the goal as safely as one every 0.07 s.
 
     Raises:
         ValueError: if no way leads to the goal from a state along a flight.
     """
     control, p_WG = FlatnessControllerConfig(), labeller.toa.p_WG
-    between = config.period / config.plans  # [s]
-    substeps = ceil(between / _STEP - 1e-9)
-    dt = between / substeps
+    substeps = ceil(config.period / _STEP - 1e-9)
+    dt = config.period / substeps
     yaws = np.arctan2(p_WG[1] - p_WS[:, 1], p_WG[0] - p_WS[:, 0])
     states = np.stack([hover_state(p, yaw) for p, yaw in zip(p_WS, yaws, strict=True)])
     vehicle = BodyRate(torch.from_numpy(states), torch.zeros(len(p_WS), 3, dtype=torch.float64))
@@ -43,14 +42,14 @@ def fly_planner(
     outcomes = [Outcome.TIMEOUT] * len(p_WS)
     traces: list[list[np.ndarray]] = [[p] for p in p_WS]
     labels: list[list[Label]] = [[] for _ in p_WS]
-    for number in range(ceil(TIMEOUT / between)):
+    for number in range(ceil(TIMEOUT / config.period)):
         if not len(flying):
             break
-        asked = [Label(s, labeller.label(number * between, s)) for s in vehicle.state.numpy()]
-        if number % config.plans == 0:
-            for n, label in zip(flying, asked, strict=True):
-                labels[n].append(label)
-        ways = np.stack([_best_way(label.plan) for label in asked])  # (n, 11, 3)
+        ways = np.empty((len(flying), NUM_WAYPOINTS + 1, 3))
+        for row, (n, state) in enumerate(zip(flying, vehicle.state.numpy(), strict=True)):
+            plan = labeller.label(number * config.period, state)
+            labels[n].append(Label(state, plan))
+            ways[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
         for step in range(substeps):
             p_WR = torch.from_numpy(_along(ways, step * dt + control.lookahead))
             motion = p_WR - vehicle.p
@@ -77,11 +76,6 @@ def fly_planner(
 def _least_clearance(p_WB: np.ndarray, world: World) -> float:
     """[m], of a path (n, 3) [m]."""
     return float(np.nanmin(world.distance_field.distance(p_WB))) - VEHICLE_RADIUS
-
-
-def _best_way(plan: Hypotheses) -> np.ndarray:
-    """The cheapest trajectory from the pose it was planned at on: (11, 3) [m] in W, each 0.1 s."""
-    return np.vstack([plan.X_WB.translation(), plan.waypoints_W[plan.best]])
 
 
 def _along(ways: np.ndarray, time: float) -> np.ndarray:

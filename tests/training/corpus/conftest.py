@@ -25,7 +25,7 @@ def small(small_forests) -> CorpusConfig:
     """Two short flights in each small forest."""
     return CorpusConfig(
         worlds=LibraryConfig(kinds=["P02"]),
-        expert=ExpertConfig(period=0.8, plans=4),
+        expert=ExpertConfig(period=0.5),
         flights=2,
         camera=OnboardCamera(width=32, height=24),
     )

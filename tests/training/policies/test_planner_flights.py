@@ -41,12 +41,9 @@ def flights(starts, world, labeller):
 def test_flies_as_the_diagram_does(world, starts, flights):
     """The same planner in Drake, with its plant and controller, takes the same way: every labelled
     state is within 0.15 m of the diagram's at that time, and both arrive together."""
-    scenario = Scenario(
-        world=WORLD,
-        start_radius=0.0,
-        start=starts[0].tolist(),
-        policy=PrivilegedPlannerConfig(rate=5.0),
-    )
+    policy = PrivilegedPlannerConfig(rate=2.5)
+    start = starts[0].tolist()
+    scenario = Scenario(world=WORLD, start_radius=0.0, start=start, policy=policy)
     drake = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
     ours = flights[0]
     assert ours.outcome is drake.outcome is Outcome.GOAL
@@ -84,11 +81,11 @@ def test_labels_keep_the_period_and_lead_on(world, flights):
 def test_flights_that_fail_are_no_demonstrations(starts, world, labeller, monkeypatch):
     """A flight that takes too long ends as a timeout; one that begins against a surface ends at
     once, as a collision."""
-    monkeypatch.setattr(planner_flights, "TIMEOUT", 1.0)
+    monkeypatch.setattr(planner_flights, "TIMEOUT", 0.8)
     low = starts[0] * [1, 1, 0] + [0, 0, VEHICLE_RADIUS - 0.05]
     slow, low = fly_planner(np.stack([starts[0], low]), world, ExpertConfig(), labeller)
     assert (slow.outcome, slow.is_demonstration) == (Outcome.TIMEOUT, False)
-    assert slow.time == pytest.approx(1.0)
+    assert slow.time == pytest.approx(0.8)
     assert (low.outcome, low.is_demonstration) == (Outcome.COLLISION, False)
     assert low.time < 0.1
     assert low.least_clearance < 0.0
