@@ -13,12 +13,9 @@ ROUNDABOUT = ("P06", "P07", "P08", "P09", "P10", "P12")
 
 
 def world_of(kind: str) -> WorldConfig:
-    """The configuration of a scenario's world."""
+    """The configuration of the world of a scenario: the benchmark's, or a file.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no such scenario.
+    """
     return load_config(Scenario(), scenario_file(kind)).world
-
-
-def check_kinds(kinds: list[str]) -> None:
-    """Raises ValueError for what is no kind of generated world, and for none at all."""
-    unknown = [kind for kind in kinds if kind not in PROCEDURAL]
-    if unknown or not kinds:
-        raise ValueError(f"worlds.kinds is {kinds}; choose from {', '.join(PROCEDURAL)}")

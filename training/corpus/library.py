@@ -7,19 +7,21 @@ from pathlib import Path
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
+from splatpilot.diagrams.worlds.make_world import is_procedural
 from splatpilot.diagrams.worlds.scene import SceneConfig, SceneSource, find_scene
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.training.corpus.world_record import WorldSource
-from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, check_kinds, world_of
+from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, world_of
 
 
 @dataclass
 class LibraryConfig:
     """Which worlds; a corpus is gathered in so many of them, in turn."""
 
-    # Scenarios whose worlds are generated; naming one twice doubles its part.
+    # Scenarios whose worlds are generated, the benchmark's or files; naming one twice doubles its
+    # part.
     kinds: list[str] = field(default_factory=lambda: [*PROCEDURAL, *ROUNDABOUT])
     # Scene folders, each with other obstacles, start and goal every time its turn comes. None that
     # the benchmark flies in, and each with its fidelity bound (`splatpilot fidelity`).
@@ -33,8 +35,14 @@ class LibraryConfig:
             FileNotFoundError: for a scene that is not there.
             ValueError: on a value out of range, naming it, its limit and the remedy.
         """
-        if self.kinds or not self.scenes:
-            check_kinds(self.kinds)
+        if not self.kinds and not self.scenes:
+            raise ValueError("worlds has neither kinds nor scenes; name some")
+        for kind in self.kinds:
+            if not is_procedural(world_of(kind)):
+                raise ValueError(
+                    f"worlds.kinds has {kind}, whose world is not generated; choose kinds from "
+                    f"{', '.join(PROCEDURAL)} and files, and put scene folders into worlds.scenes"
+                )
         for scene in self.scenes:
             fidelity_bound(scene)
 
@@ -58,10 +66,11 @@ def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
     first = VALIDATION_SEEDS if library.held_out else first_training_seed(seed)
     kinds = [*library.kinds, *library.scenes]
     kind, seed = kinds[index % len(kinds)], first + index
+    name = f"{Path(kind).stem}-{seed}"
     if kind in library.scenes:
         world = InsertedConfig(path=kind, draw_ends=True)
-        return WorldSource(f"{Path(kind).name}-{seed}", world, seed, fidelity_bound(kind))
-    return WorldSource(f"{kind}-{seed}", world_of(kind), seed, inf)
+        return WorldSource(name, world, seed, fidelity_bound(kind))
+    return WorldSource(name, world_of(kind), seed, inf)
 
 
 def fidelity_bound(scene: str) -> float:

@@ -7,7 +7,7 @@ import torch
 from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.training.policies.world_batch import TrainingWorld, WorldBatch
-from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, check_kinds, world_of
+from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, world_of
 
 
 @dataclass
@@ -25,7 +25,9 @@ class WorldSelection:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        check_kinds(self.kinds)
+        unknown = [kind for kind in self.kinds if kind not in PROCEDURAL]
+        if unknown or not self.kinds:
+            raise ValueError(f"worlds.kinds is {self.kinds}; choose from {', '.join(PROCEDURAL)}")
         for name in ("count", "held_out"):
             value = getattr(self, name)
             if not 1 <= value <= SEEDS_PER_RUN:

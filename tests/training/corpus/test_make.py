@@ -93,7 +93,7 @@ def test_worlds_that_cannot_be_flown_are_left_out(small, gathered, tmp_path, mon
         ("expert.policy=nobody", "no policy 'nobody'"),
         ("perturbation.distance=-1", "perturbation.distance is -1"),
         ("perturbation.copies=-1", "perturbation.copies is -1"),
-        ("worlds.kinds=[R13]", "worlds.kinds"),
+        ("worlds.kinds=[R13]", "R13, whose world is not generated"),
     ],
 )
 def test_values_out_of_range_are_named(small, tmp_path, override, message):
