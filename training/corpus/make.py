@@ -17,6 +17,7 @@ from splatpilot.training.corpus.gather import gather_world, shard_folder
 from splatpilot.training.corpus.ledger import write_ledger
 from splatpilot.training.corpus.library import world_source
 from splatpilot.training.corpus.shard import Shard
+from splatpilot.training.corpus.world_record import WorldRecord
 
 
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
@@ -52,7 +53,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
         (out / part).mkdir(exist_ok=True)
         for left in (out / part).glob(".*.partial"):  # by a kill
             shutil.rmtree(left)
-    missing = [k for k in range(worlds) if not _is_there(shard_folder(out, names[k]))]
+    missing = [k for k in range(worlds) if not _is_there(out, names[k])]
     gather = partial(_gather, out, config, revision())
     with tqdm(total=worlds, initial=worlds - len(missing), desc="worlds", unit="world") as bar:
         for reason in map_processes(gather, missing, jobs):
@@ -64,14 +65,18 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     return corpus
 
 
-def _is_there(shard: Path) -> bool:
-    """Whether a shard is there and whole; what is left of one that is not is removed."""
+def _is_there(out: Path, world: str) -> bool:
+    """Whether a world and its shard are there and whole; what is left of them otherwise is
+    removed."""
+    record, shard = out / "worlds" / world, shard_folder(out, world)
     if not shard.exists():
         return False
     try:
+        WorldRecord(record)
         Shard(shard).verify()
-    except ValueError as error:
-        tqdm.write(f"{error}: it is gathered again")
+    except (ValueError, OSError) as error:
+        tqdm.write(f"{error}: {world} is gathered again")
+        shutil.rmtree(record, ignore_errors=True)
         shutil.rmtree(shard)
         return False
     return True

@@ -38,6 +38,8 @@ class WorldRecord:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.source = load_config(WorldSource(), path / _ABOUT)
+        if not (path / _ESDF).is_file():
+            raise FileNotFoundError(f"{path / _ESDF}: there is no such file; gather it again")
 
     @property
     def name(self) -> str:

@@ -74,6 +74,9 @@ def test_what_is_missing_is_named(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no corpus.*splatpilot corpus make"):
         Corpus(tmp_path)
     name = Corpus(folder).worlds[0].name
+    (folder / "worlds" / name / "esdf.npz").unlink()
+    with pytest.raises(FileNotFoundError, match=f"{name}/esdf.npz"):
+        Corpus(folder)
     shutil.rmtree(folder / "worlds" / name)
     with pytest.raises(ValueError, match=f"lacks {name}"):
         Corpus(folder)

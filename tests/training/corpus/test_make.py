@@ -38,16 +38,21 @@ def test_interrupted_and_run_again_leaves_the_same_bytes(small, gathered, tmp_pa
     assert all_bytes(tmp_path) == whole
 
 
-def test_a_damaged_shard_is_gathered_again(small, gathered, tmp_path, monkeypatch):
-    """One byte too few in one shard: that world alone is gathered again, to the same bytes."""
+def test_what_is_damaged_is_gathered_again(small, gathered, tmp_path, monkeypatch):
+    """One byte too few in one shard, the distances of another's world gone: both are gathered
+    again, to the same bytes, and nothing else is."""
     folder = gathered.shards[0].path.parents[1]
     out = shutil.copytree(folder, tmp_path / "corpus")
-    depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
-    depth.write_bytes(depth.read_bytes()[:-1])
-    gather, asked = make.gather_world, []
+    asked = []
+    gather = make.gather_world
     monkeypatch.setattr(make, "gather_world", lambda *a: (asked.append(a[2]), gather(*a)))
     make.run(config=small, out=out, worlds=2, jobs=1)
-    assert asked == [1]
+    assert asked == []
+    depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
+    depth.write_bytes(depth.read_bytes()[:-1])
+    (out / "worlds" / gathered.worlds[0].name / "esdf.npz").unlink()
+    make.run(config=small, out=out, worlds=2, jobs=1)
+    assert asked == [0, 1]
     assert all_bytes(out) == all_bytes(folder)
 
 
