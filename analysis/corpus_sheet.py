@@ -43,6 +43,7 @@ def draw_sheet(corpus: Corpus, out: Path, count: int, seed: int = 0) -> None:
         world = corpus.worlds[samples.world[i]].name
         source = "" if samples.source[i] == EXPERT else ", recovery"
         text = f"{index}: {world}{source}, {np.linalg.norm(samples.v_B[i]):.1f} m/s"
+        panels[0][:22] //= 3  # for the text to be read
         cv2.putText(panels[0], text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
         tiles.append(np.concatenate(panels))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % min(_COLUMNS, len(tiles)))
