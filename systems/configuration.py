@@ -14,6 +14,7 @@ from typing import Any, cast
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.registry import Registry
 
 _REGISTRY = "registry"
@@ -81,6 +82,30 @@ def dump_config(config: Any) -> str:
     """The configuration as YAML, every field written out."""
     _resolve_open_fields(config, set())
     return cast(str, yaml_dump_typed(config))
+
+
+def claim_folder(file: Path, config: Any) -> str:
+    """
+    Makes the folder of `file` one of what `config` describes, which it may be already, and writes
+    `config` there.
+
+    Returns:
+        The configuration as YAML.
+
+    Raises:
+        ValueError: if the file holds another configuration.
+        OSError: if it cannot be written.
+    """
+    require_writable_folder(file.parent)
+    text = dump_config(config)
+    if file.exists() and dump_config(load_config(type(config)(), file)) != text:
+        raise ValueError(
+            f"{file} holds another configuration; choose another --out, or the same configuration "
+            "to go on there"
+        )
+    with written_atomically(file) as partial:
+        partial.write_text(text)
+    return text
 
 
 def _resolve_open_fields(config: Any, tags: set[str]) -> None:

@@ -1,6 +1,8 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,3 +40,25 @@ def require_writable_folder(path: Path) -> None:
         raise OSError(
             f"cannot write to the output folder {path}: {error.strerror}; choose another with --out"
         ) from None
+
+
+@contextmanager
+def folder_written_atomically(path: Path) -> Iterator[Path]:
+    """
+    Yields a temporary folder beside `path` to write into, which becomes `path` when the block ends.
+
+    An exception in the block removes the temporary folder. What another process put at `path`
+    meanwhile stays.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        try:
+            partial.rename(path)
+        except OSError as error:
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

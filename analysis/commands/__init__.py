@@ -9,6 +9,7 @@ from splatpilot.analysis.commands import (
     ablate,
     benchmark,
     capture,
+    corpus,
     difficulty,
     fidelity,
     fly,
@@ -36,5 +37,6 @@ COMMANDS = (
     capture,
     places,
     tour,
+    corpus,
     train,
 )

@@ -109,7 +109,7 @@ class TimeOfArrival:
                 direction = to_goal / distance
             else:
                 # The mean with the last direction: plain steepest descent zigzags in a valley.
-                direction = _unit(direction - _unit(self.gradient(p_WP)))
+                direction = _unit(direction - _unit(self._gradient_at(p_WP)))
             length = min(step, distance)
             p_WP = p_WP + length * direction
             points.append(p_WP)
@@ -123,6 +123,26 @@ class TimeOfArrival:
         chords = ends - point_at(0.75 * lengths)
         chords[lengths > covered[-1]] = 0.0
         return ends, np.array([_unit(chord) for chord in chords])
+
+    def _gradient_at(self, p_WQ: np.ndarray) -> np.ndarray:
+        """`gradient` at one point (3,) to the last bit, in Python's floats: arrays of one number
+        take several times as long."""
+        nx, ny, nz = self.times.shape
+        x, y, z = ((p_WQ - self.lower_W) / self.voxel_size - 0.5).tolist()
+        x, y, z = (min(max(c, 0.0), n - 1.0) for c, n in ((x, nx), (y, ny), (z, nz)))
+        i, j, k = min(int(x), nx - 2), min(int(y), ny - 2), min(int(z), nz - 2)
+        fx, fy, fz = x - i, y - j, z - k
+        near, far = self.times[i : i + 2, j : j + 2, k : k + 2]  # (2, 2) each, by y and z
+        # What single precision rounds is left to arrays.
+        steps = far - near
+        (s00, s01), (s10, s11) = steps.tolist()
+        t0, t1 = (steps[1] - steps[0]).tolist()
+        (a00, a01), (a10, a11) = near.tolist()
+        a00, a01, a10, a11 = a00 + fx * s00, a01 + fx * s01, a10 + fx * s10, a11 + fx * s11
+        along_x, along_y = (s00 + fy * t0, s01 + fy * t1), (a10 - a00, a11 - a01)
+        along_z = (a01 + fy * along_y[1]) - (a00 + fy * along_y[0])
+        slopes = [*(low + fz * (high - low) for low, high in (along_x, along_y)), along_z]
+        return np.array(slopes) / self.voxel_size
 
     def _cell(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Corner values (2, 2, 2, N) and fractions (3, N) of the cells that hold the points."""

@@ -37,7 +37,6 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.agile_autonomy_agent import (
     LOOKAHEAD,
     AgileAutonomyAgent,
-    reaching_acceleration,
 )
 from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
 from splatpilot.training.policies.evaluation import (
@@ -59,7 +58,7 @@ from splatpilot.training.policies.training_worlds import (
     training_worlds,
     validation_worlds,
 )
-from splatpilot.training.policies.vehicles import BodyRate, choose_rows
+from splatpilot.training.policies.vehicles import BodyRate, choose_rows, reaching_acceleration
 from splatpilot.training.policies.world_batch import STARTS, WorldBatch
 
 EPSILON = 0.05

@@ -10,12 +10,11 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
     PROGRESS,
     RATE,
 )
-from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation, target_velocity
 from splatpilot.training.policies.ray_casting import PixelRays
-from splatpilot.training.policies.vehicles import BodyRate, Vehicle
+from splatpilot.training.policies.vehicles import BodyRate, reaching_acceleration
 
 LOOKAHEAD = 3
 """The waypoint that is tracked: at 0.4 s, as the controller's lookahead."""
@@ -61,9 +60,3 @@ class AgileAutonomyAgent:
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
         p_WR = seen.vehicle.p + (seen.vehicle.attitude() @ best[:, LOOKAHEAD, :, None])[:, :, 0]
         return reaching_acceleration(p_WR, seen.vehicle), None, memory
-
-
-def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
-    """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
-    T = FlatnessControllerConfig.lookahead
-    return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 import torch
 
-from splatpilot.systems.configuration import dump_config, load_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.configuration import claim_folder
+from splatpilot.systems.files import written_atomically
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.provenance import revision
 
@@ -33,16 +33,7 @@ class RunFolder:
             ValueError: if it is of a run of another configuration.
             OSError: if it cannot be written.
         """
-        require_writable_folder(path)
-        text, file = dump_config(config), path / "config.yaml"
-        if file.exists() and dump_config(load_config(type(config)(), file)) != text:
-            raise ValueError(
-                f"{file} is of a run with another configuration; choose another --out, or the same "
-                "configuration to go on with that run"
-            )
-        folder = cls(path, text, revision())
-        folder._write("config.yaml", text)
-        return folder
+        return cls(path, claim_folder(path / "config.yaml", config), revision())
 
     def write_weights(
         self, policy: str, spec: Any, network: torch.nn.Module, best: dict[str, Any]

@@ -4,18 +4,10 @@ from dataclasses import dataclass, field
 
 import torch
 
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.make_world import make_blueprint
-from splatpilot.systems.configuration import load_config
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.training.policies.world_batch import TrainingWorld, WorldBatch
-
-PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
-"""The scenarios whose worlds are made from seeds."""
-
-ROUNDABOUT = ("P06", "P07", "P08", "P09", "P10", "P12")
-"""Those of them whose ways are far from straight: learned slowest, so trained in twice as often."""
+from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, world_of
 
 
 @dataclass
@@ -46,8 +38,7 @@ class WorldSelection:
 
 def make_training_world(kind: str, seed: int) -> TrainingWorld:
     """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
-    world = load_config(Scenario(), scenario_file(kind)).world
-    plan = make_blueprint(world, seed)
+    plan = make_blueprint(world_of(kind), seed)
     shapes = [solid.shape for solid in plan.solids]
     return TrainingWorld(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
 

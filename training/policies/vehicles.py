@@ -133,6 +133,12 @@ class BodyRate(NamedTuple):
 Vehicle = PointMass | BodyRate
 
 
+def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+    """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
+    T = FlatnessControllerConfig.lookahead
+    return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2
+
+
 def choose_rows[V: Vehicle](chosen: Tensor, these: V, others: V) -> V:
     """The rows of `these` vehicles where `chosen` (N,), those of the others elsewhere."""
     return type(these)(*(where_rows(chosen, a, b) for a, b in zip(these, others, strict=True)))

@@ -1,18 +1,19 @@
-"""The expert's rollouts."""
+"""The expert's flights by a policy, and its labels."""
 
 import numpy as np
 import pytest
 
+from splatpilot.diagrams.flight import Outcome
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
-from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.policies.expert import ExpertConfig, expert_rollout
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.training.policies.expert import ExpertConfig, Labeller, fly_policy
 
 WORLD = ForestConfig(length=12.0, width=8.0, height=4.0)
+REACTIVE = ExpertConfig(policy="reactive")
 
 
 @pytest.fixture(scope="module")
@@ -20,28 +21,40 @@ def world():
     return make_world(WORLD, 1_000_000)
 
 
-def test_rollout_reaches_a_drawn_goal_and_labels_lead_on(world):
-    """Between ends drawn from the distance field the expert arrives with room to spare, and the
-    best label of every state keeps clear."""
+def test_a_policy_flies_and_the_planner_labels(world):
+    """Between ends drawn from the distance field a policy that sees arrives with room to spare, and
+    the best label of every 0.4 s keeps clear."""
     p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed=2)
     scenario = Scenario(world=WORLD, start=p_WS.tolist(), goal=p_WG.tolist(), start_radius=0.0)
-    rollout = expert_rollout(scenario, world, ExpertConfig(period=0.4))
-    assert rollout is not None
-    assert np.nanmin(rollout.flight.clearances) > 0.0
-    assert np.linalg.norm(rollout.flight.states[-1, :3] - p_WG) <= scenario.goal_radius
-    count = len(rollout.states)
-    assert count == np.ceil(rollout.flight.times[-1] / 0.4)
-    assert rollout.waypoints_B.shape == (count, 3, 10, 3)
-    assert (np.diff(rollout.costs, axis=1) >= 0.0).all()
-    for state, waypoints, costs in zip(
-        rollout.states, rollout.waypoints_B, rollout.costs, strict=True
-    ):
-        label = Hypotheses(0.0, pose_from_state(state), waypoints, costs).waypoints_W[0]
-        assert (world.distance_field.distance(label) > VEHICLE_RADIUS).all()
+    labeller = Labeller(world.esdf, p_WG, REACTIVE)
+    flight = fly_policy(scenario, world, REACTIVE, labeller)
+    assert flight.outcome is Outcome.GOAL
+    assert flight.is_demonstration
+    assert flight.least_clearance > 0.0
+    assert len(flight.labels) == np.ceil(flight.time / 0.4)
+    np.testing.assert_allclose(flight.labels[0].state[:3], p_WS)
+    for label in flight.labels:
+        assert label.plan.waypoints_B.shape == (3, 10, 3)
+        assert (world.distance_field.distance(label.plan.waypoints_W[0]) > VEHICLE_RADIUS).all()
 
 
-def test_flights_that_fail_are_no_rollouts(world):
-    """A flight that does not arrive in time is None; a policy nobody knows is an error."""
-    assert expert_rollout(Scenario(world=WORLD, timeout=1.0), world, ExpertConfig()) is None
+def test_flights_that_fail_are_no_demonstrations(world):
+    """A flight that does not arrive in time is none; a policy nobody knows is an error."""
+    labeller = Labeller(world.esdf, world.p_WG, REACTIVE)
+    flight = fly_policy(Scenario(world=WORLD, timeout=1.0), world, REACTIVE, labeller)
+    assert (flight.outcome, flight.is_demonstration) == (Outcome.TIMEOUT, False)
     with pytest.raises(ValueError, match="no policy 'nobody'"):
-        expert_rollout(Scenario(world=WORLD), world, ExpertConfig(policy="nobody"))
+        ExpertConfig(policy="nobody").validate()
+
+
+def test_states_without_a_way_on_are_not_labelled():
+    """Of states on either side of a wall that closes off the goal, the one on its side alone has a
+    label."""
+    wall = np.zeros((60, 20, 20), bool)
+    wall[30] = True
+    esdf = esdf_from_occupancy(wall, np.zeros_like(wall), np.zeros(3), 0.2)
+    labeller = Labeller(esdf, np.array([10.0, 2.0, 2.0]), REACTIVE)
+    beside, behind = hover_state([8.0, 2.0, 2.0]), hover_state([3.0, 2.0, 2.0])
+    labels = labeller.labels([behind, beside])
+    assert len(labels) == 1
+    np.testing.assert_array_equal(labels[0].state, beside)

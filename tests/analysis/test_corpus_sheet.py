@@ -1,0 +1,71 @@
+"""Sheets of samples."""
+
+import cv2
+import numpy as np
+import pytest
+
+from splatpilot.analysis.cli import main
+from splatpilot.analysis.corpus_sheet import project
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus.corpus import Corpus
+
+
+def test_points_are_projected_as_a_pinhole_does():
+    """Ahead is the middle, left is left and up is up, by the focal length over the depth from the
+    camera's mount; what is behind is left out."""
+    camera = OnboardCamera(width=160, height=120, fov_x=90.0, p_BC=[0.1, 0.0, 0.0])
+    points = [[2.1, 0, 0], [2.1, 1.0, 0], [4.1, 0, 1.0], [-1.0, 0, 0], [0.1, 0, 0]]
+    expected = [[80, 60], [40, 60], [80, 40]]
+    np.testing.assert_allclose(project(camera, np.array(points)), expected, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A corpus gathered by the command line, in one small room."""
+    out = tmp_path_factory.mktemp("corpus")
+    words = ["corpus", "make", "--out", str(out), "--worlds", "1", "--jobs", "1"]
+    for setting in (
+        "worlds.kinds=[P10]", "flights=1", "expert.period=0.6",
+        "camera.width=48", "camera.height=36", "appearance=0",
+    ):  # fmt: skip
+        words += ["--set", setting]
+    assert main(words) == 0
+    return out
+
+
+def test_inspect_draws_what_the_corpus_holds(folder, tmp_path, capsys):
+    """A sheet has a tile a sample, colour above depth, three times as large; its first pixels are
+    the image's own where nothing is drawn over them."""
+    sheet = tmp_path / "sheets" / "sheet.png"
+    words = ["corpus", "inspect", str(folder), "--out", str(sheet), "--samples", "3"]
+    assert main(words) == 0
+    corpus = Corpus(folder)
+    assert f"{len(corpus)} samples" in capsys.readouterr().out
+    image = cv2.imread(str(sheet))[..., ::-1]
+    assert image.shape == (2 * 3 * 36, 3 * 3 * 48, 3)
+    chosen = np.sort(np.random.default_rng(0).choice(len(corpus), 3, replace=False))
+    colors = corpus.samples(chosen).color
+    for k, color in enumerate(colors):
+        tile = image[: 3 * 36, k * 3 * 48 : (k + 1) * 3 * 48]
+        same = (tile[1::3, 1::3] == color).all(axis=2)
+        assert same.mean() > 0.5
+        assert not same.all()
+
+
+def test_a_damaged_corpus_is_named(folder, tmp_path, capsys):
+    """Of a corpus with a changed byte no sheet is drawn, and the file is named; nor is one drawn of
+    nothing, or into anything but a PNG."""
+    color = next(folder.glob("shards/*/color.npy"))
+    whole = color.read_bytes()
+    color.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    words = ["corpus", "inspect", str(folder), "--out", str(tmp_path / "a.png")]
+    assert main(words) == 1
+    assert "color.npy is damaged" in capsys.readouterr().err
+    color.write_bytes(whole)
+    for wrong, message in (
+        ([*words, "--samples", "0"], "--samples is 0"),
+        ([*words[:-1], str(tmp_path / "a.jpg")], "is a PNG file"),
+        (["corpus", "inspect", str(tmp_path), "--out", "a.png"], "holds no corpus"),
+    ):
+        assert main(wrong) == 1
+        assert message in capsys.readouterr().err

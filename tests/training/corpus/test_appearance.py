@@ -1,0 +1,100 @@
+"""Other looks of the same Gaussians."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.corpus.appearance import draw_appearance, recolored, recolored_background
+
+COUNT = 200
+
+
+@pytest.fixture
+def scene() -> GaussianScene:
+    rng = np.random.default_rng(5)
+    return GaussianScene(
+        means=rng.uniform(-5, 5, (COUNT, 3)),
+        quats=rng.normal(size=(COUNT, 4)),
+        scales=rng.uniform(0.01, 0.1, (COUNT, 3)),
+        opacities=np.full(COUNT, 0.9),
+        sh=rng.uniform(-0.8, 0.8, (COUNT, 4, 3)),
+    )
+
+
+def draw(seed: int, strength: float = 1.0):
+    return draw_appearance(np.random.default_rng(seed), strength)
+
+
+def test_no_strength_changes_nothing(scene):
+    """At strength 0 colours and background are as they were, to rounding, whatever is drawn."""
+    same = recolored(scene, draw(1, strength=0.0))
+    np.testing.assert_allclose(same.base_colors, scene.base_colors, atol=1e-5)
+    np.testing.assert_allclose(same.sh[:, 1:], scene.sh[:, 1:], atol=1e-5)
+    sky = recolored_background((0.2, 0.5, 0.9), draw(1, strength=0.0))
+    np.testing.assert_allclose(sky, (0.2, 0.5, 0.9), atol=1e-5)
+
+
+def test_geometry_stays_and_colours_change(scene):
+    """Shapes and opacities are the very same arrays; two seeds give two looks, one seed one."""
+    first, again, other = (recolored(scene, draw(seed)) for seed in (1, 1, 2))
+    for name in ("means", "quats", "scales", "opacities"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(scene, name))
+    np.testing.assert_array_equal(first.sh, again.sh)
+    assert np.abs(first.base_colors - scene.base_colors).mean() > 0.03
+    assert np.abs(first.base_colors - other.base_colors).mean() > 0.03
+
+
+def test_exposure_is_in_stops(scene):
+    """Twice the light doubles linear brightness, colour by colour, below white."""
+    dark = replace(draw(0, strength=0.0), exposure=0.1)
+    light = replace(dark, exposure=0.2)
+    a, b = (recolored(scene, look).base_colors ** 2.2 for look in (dark, light))
+    np.testing.assert_allclose(b, 2 * a, atol=1e-5)
+
+
+def test_one_paint_stays_one_paint(scene):
+    """Gaussians of one colour, place and orientation have one colour in any look."""
+    one = {name: getattr(scene, name)[np.zeros(COUNT, int)] for name in vars(scene)}
+    alike = GaussianScene(**one)
+    colors = recolored(alike, draw(3)).base_colors
+    np.testing.assert_allclose(colors, np.tile(colors[0], (COUNT, 1)), atol=1e-6)
+
+
+def test_hue_turns_colours_and_leaves_greys(scene):
+    """A turn of the hue by 120 degrees makes red green; grey stays what it is."""
+    grey_axis = np.ones((3, 3)) / 3
+    turn = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
+    hue = grey_axis - (np.eye(3) - grey_axis) / 2 + np.sqrt(3) / 2 * turn
+    look = replace(draw(0, strength=0.0), mixing=hue.astype(np.float32))
+    colors = [[0.8, 0.1, 0.1], [0.4, 0.4, 0.4]]
+    two = GaussianScene.from_colors(
+        scene.means[:2], scene.quats[:2], scene.scales[:2], scene.opacities[:2], colors
+    )
+    expected = [[0.1, 0.8, 0.1], [0.4, 0.4, 0.4]]
+    np.testing.assert_allclose(recolored(two, look).base_colors, expected, atol=1e-5)
+
+
+def test_light_from_one_side_falls_off_with_the_cosine(scene):
+    """Flat Gaussians that face the light are brighter than those it grazes, as |cos| of the angle
+    between their normal and the light."""
+    angles = np.linspace(0, np.pi / 2, 7)
+    quats = np.column_stack([np.cos(angles / 2), np.sin(angles / 2), *np.zeros((2, 7))])
+    flat = GaussianScene.from_colors(
+        np.zeros((7, 3)), quats, np.tile([0.1, 0.1, 0.001], (7, 1)), np.full(7, 0.9),
+        np.full((7, 3), 0.5),
+    )  # fmt: skip
+    look = replace(draw(0, 0.0), light_W=np.float32([0, 0, 1]), relief=1.0)
+    linear = recolored(flat, look).base_colors[:, 0] ** 2.2
+    np.testing.assert_allclose(linear, 2 * 0.5**2.2 * np.cos(angles), atol=1e-5)
+
+
+def test_environments_are_recoloured_in_every_direction():
+    """Each texel of an environment changes as a background of that colour does."""
+    texels = np.random.default_rng(0).uniform(0, 1, (4, 8, 3)).astype(np.float32)
+    look = draw(7)
+    found = recolored_background(EnvironmentMap(texels), look).texels
+    np.testing.assert_allclose(found[2, 3], recolored_background(tuple(texels[2, 3]), look))
+    assert np.abs(found - texels).mean() > 0.02

@@ -1,0 +1,86 @@
+"""Corpora as they are read."""
+
+import shutil
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.sample import EXPERT
+
+
+@pytest.fixture
+def folder(gathered, tmp_path):
+    """A copy of the corpus, to be damaged."""
+    return shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
+
+
+def test_samples_come_in_the_order_asked_for(gathered):
+    """Any indices, repeated and across shards, give the rows of the shards' files."""
+    first, second = gathered.shards
+    assert len(gathered) == len(first) + len(second)
+    indices = np.array([len(first) + 1, 0, len(first) - 1, 0, len(first)])
+    found = gathered.samples(indices)
+    rows = [(second, 1), (first, 0), (first, len(first) - 1), (first, 0), (second, 0)]
+    for name in ("color", "depth", "X_WB", "v_B", "goal_B", "trajectories_B"):
+        expected = np.stack([shard.arrays[name][row] for shard, row in rows])
+        np.testing.assert_array_equal(getattr(found, name), expected)
+        assert getattr(found, name).flags.c_contiguous
+    assert [gathered.worlds[k].name for k in found.world] == [shard.world for shard, _ in rows]
+    assert (found.source == EXPERT).all()
+    assert len(gathered.samples(np.array([], int))) == 0
+
+
+@pytest.mark.parametrize("index", [-1, 10**6])
+def test_indices_out_of_range_are_refused(gathered, index):
+    """There is no sample before the first or after the last."""
+    with pytest.raises(IndexError, match="numbered 0 to"):
+        gathered.samples(np.array([0, index]))
+
+
+def test_sizes_and_types_are_as_documented(gathered):
+    """Each field has the shape and type that `Samples` states, and images show something."""
+    samples = gathered.samples(np.arange(len(gathered)))
+    shapes = {f.name: getattr(samples, f.name).shape[1:] for f in fields(samples)}
+    assert shapes["color"] == (24, 32, 3)
+    assert shapes["depth"] == (24, 32)
+    assert shapes["trajectories_B"] == (3, 10, 3)
+    dtypes = {f.name: getattr(samples, f.name).dtype for f in fields(samples)}
+    assert dtypes["depth"] == np.float16
+    assert dtypes["X_WB"] == np.float64
+    assert samples.color.std() > 10
+    np.testing.assert_allclose(np.linalg.norm(samples.goal_B, axis=1), 1.0, atol=1e-6)
+
+
+def test_worlds_have_their_distances_and_can_be_made_again(gathered):
+    """A world's record gives its distance field, and the very world that has it."""
+    record = gathered.worlds[1]
+    world = record.make()
+    np.testing.assert_array_equal(world.esdf.distances, record.esdf().distances)
+    assert record.esdf().distances.dtype == np.float32
+
+
+def test_a_world_that_changed_is_refused(folder):
+    """If the program or scene no longer makes the recorded world, that is said."""
+    record = Corpus(folder).worlds[0]
+    record.source.seed += 1
+    with pytest.raises(ValueError, match="no longer what"):
+        record.make()
+
+
+def test_what_is_missing_is_named(folder, tmp_path):
+    """No corpus, no samples, and a world whose record is gone: each with the remedy."""
+    with pytest.raises(FileNotFoundError, match=r"no corpus.*splatpilot corpus make"):
+        Corpus(tmp_path)
+    name = Corpus(folder).worlds[0].name
+    (folder / "worlds" / name / "esdf.npz").unlink()
+    with pytest.raises(FileNotFoundError, match=f"{name}/esdf.npz"):
+        Corpus(folder)
+    shutil.rmtree(folder / "worlds" / name)
+    with pytest.raises(ValueError, match=f"lacks {name}"):
+        Corpus(folder)
+    for shard in (folder / "shards").iterdir():
+        shutil.rmtree(shard)
+    with pytest.raises(ValueError, match="no samples yet"):
+        Corpus(folder)

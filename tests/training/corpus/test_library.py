@@ -1,0 +1,103 @@
+"""Which worlds a corpus is gathered in."""
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+
+from splatpilot.diagrams.worlds.inserted import InsertedConfig
+from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.seeds import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.corpus.library import LibraryConfig, world_source
+from splatpilot.training.world_kinds import world_of
+
+
+def write_scene(path, bound, name="attic"):
+    free = np.zeros((10, 10, 10), bool)
+    esdf = esdf_from_occupancy(free, free, np.zeros(3), 0.3)
+    one = np.ones((1, 3))
+    world = World(
+        name=name,
+        gaussians=GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one),
+        distance_field=esdf,
+        esdf=esdf,
+        background=(0.0, 0.0, 0.0),
+        p_WS=np.ones(3),
+        p_WG=2 * np.ones(3),
+    )
+    write_scene_folder(path, world, provenance="a test")
+    write_scene_metadata(path, replace(read_scene_metadata(path), perturbation_bound=bound))
+    return str(path)
+
+
+def test_seeds_are_those_of_training_or_validation_and_never_shared():
+    """Worlds of two corpora, and of training and validation, have no seed in common, and none has
+    one of the benchmark's."""
+
+    def seeds(seed, **changes):
+        library = LibraryConfig(**changes)
+        return {world_source(library, seed, k).seed for k in (0, 1, SEEDS_PER_RUN - 1)}
+
+    first, second, held_out = seeds(0), seeds(1), seeds(0, held_out=True)
+    assert not first & second
+    assert TRAINING_SEEDS <= min(first | second) <= max(first | second) < VALIDATION_SEEDS
+    assert min(held_out) >= VALIDATION_SEEDS
+
+
+def test_kinds_and_scenes_come_in_turn(tmp_path):
+    """Generated worlds are the scenarios' own, exact; scenes get obstacles, and their bound."""
+    scene = write_scene(tmp_path / "attic", 0.25)
+    library = LibraryConfig(kinds=["P02", "P06"], scenes=[scene])
+    library.validate()
+    sources = [world_source(library, 0, k) for k in range(4)]
+    assert [s.name for s in sources] == [
+        f"{kind}-{TRAINING_SEEDS + k}" for k, kind in enumerate(["P02", "P06", "attic", "P02"])
+    ]
+    assert [s.perturbation_bound for s in sources] == [inf, inf, 0.25, inf]
+    assert sources[1].world == world_of("P06")
+    assert sources[2].world == InsertedConfig(path=scene, draw_ends=True)
+
+
+def test_scenes_without_a_bound_are_refused(tmp_path):
+    """A scene whose fidelity nobody measured is named with the command that measures it; a scene
+    that is not there, and a file of Gaussians, are named too."""
+    scene = write_scene(tmp_path / "attic", None)
+    with pytest.raises(ValueError, match=r"attic/scene.yaml .* `splatpilot fidelity .*attic`"):
+        LibraryConfig(scenes=[scene]).validate()
+    with pytest.raises(FileNotFoundError, match="there is no such scene"):
+        LibraryConfig(scenes=["nowhere"]).validate()
+    with pytest.raises(ValueError, match="is no scene folder"):
+        LibraryConfig(scenes=[f"{scene}/gaussians.ply"]).validate()
+
+
+@pytest.mark.parametrize(("folder", "name"), [("hospital", "attic"), ("attic", "warehouse")])
+def test_places_of_the_benchmark_are_not_learned_in(tmp_path, folder, name):
+    """A scene that the benchmark flies in is refused, by its folder's name or its own."""
+    scene = write_scene(tmp_path / folder, 0.2, name)
+    with pytest.raises(ValueError, match="the benchmark flies in"):
+        LibraryConfig(scenes=[scene]).validate()
+
+
+@pytest.mark.parametrize("index", [-1, SEEDS_PER_RUN])
+def test_there_are_as_many_worlds_as_seeds(index):
+    """A corpus has a thousand worlds at most: those after them belong to another seed."""
+    with pytest.raises(ValueError, match="at most 1000 worlds"):
+        world_source(LibraryConfig(), 0, index)
+
+
+def test_some_kind_or_scene_is_needed(tmp_path):
+    """No kinds are fine with a scene, and refused without; so are scenarios of captured places and
+    those that nobody knows."""
+    LibraryConfig(kinds=[], scenes=[write_scene(tmp_path / "attic", 0.1)]).validate()
+    for kinds, message in (
+        ([], "neither kinds nor scenes"),
+        (["R13"], "R13, whose world is not generated"),
+        (["P99"], "there is no scenario 'P99'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            LibraryConfig(kinds=kinds).validate()

@@ -1,0 +1,124 @@
+"""Gathering: resumed, extended, repaired, refused."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.seeds import TRAINING_SEEDS
+from splatpilot.training.corpus import make
+
+
+def all_bytes(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder by its path in it."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_interrupted_and_run_again_leaves_the_same_bytes(small, gathered, tmp_path, monkeypatch):
+    """Stopped within the second world, with a folder half written, the same command ends in the
+    files that an uninterrupted run wrote; so does adding a world to a corpus of one."""
+    whole = all_bytes(gathered.shards[0].path.parents[1])
+    write_shard = make.gather_world.__globals__["write_shard"]
+
+    def killed(path, *args, **kwargs):
+        (path.parent / f".{path.name}.1.partial").mkdir()
+        raise KeyboardInterrupt
+
+    make.run(config=small, out=tmp_path, worlds=1, jobs=1)
+    monkeypatch.setitem(make.gather_world.__globals__, "write_shard", killed)
+    with pytest.raises(KeyboardInterrupt):
+        make.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    monkeypatch.setitem(make.gather_world.__globals__, "write_shard", write_shard)
+    make.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    assert all_bytes(tmp_path) == whole
+
+
+def test_what_is_damaged_is_gathered_again(small, gathered, tmp_path, monkeypatch):
+    """One byte too few in one shard, the distances of another's world gone: both are gathered
+    again, to the same bytes, and nothing else is."""
+    folder = gathered.shards[0].path.parents[1]
+    out = shutil.copytree(folder, tmp_path / "corpus")
+    asked = []
+    gather = make.gather_world
+    monkeypatch.setattr(make, "gather_world", lambda *a: (asked.append(a[2]), gather(*a)))
+    make.run(config=small, out=out, worlds=2, jobs=1)
+    assert asked == []
+    depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
+    depth.write_bytes(depth.read_bytes()[:-1])
+    (out / "worlds" / gathered.worlds[0].name / "esdf.npz").unlink()
+    make.run(config=small, out=out, worlds=2, jobs=1)
+    assert asked == [0, 1]
+    assert all_bytes(out) == all_bytes(folder)
+
+
+def test_the_ledger_accounts_for_every_sample(gathered):
+    """A row for each flight; their states, each from its own pose and one beside it, are all the
+    samples; seeds are those of training."""
+    folder = gathered.shards[0].path.parents[1]
+    rows = list(csv.DictReader((folder / "ledger.csv").open()))
+    assert len(rows) == 4
+    assert 2 * sum(int(row["states"]) for row in rows) == len(gathered) > 0
+    assert {int(row["seed"]) for row in rows} == {TRAINING_SEEDS, TRAINING_SEEDS + 1}
+    assert all(row["outcome"] == "goal" and float(row["least_clearance_m"]) > 0 for row in rows)
+
+
+def test_looks_differ_between_flights_of_one_world(gathered):
+    """The two flights through a world show it in other colours."""
+    shard = gathered.shards[0]
+    first = 2 * shard.flights[0]["states"]
+    means = [c.mean(axis=(0, 1, 2)) for c in np.split(shard.arrays["color"], [first])]
+    assert np.abs(means[0] - means[1]).max() > 5
+
+
+def test_worlds_that_cannot_be_flown_are_left_out(small, gathered, tmp_path, monkeypatch, capsys):
+    """A world without a way is said to be left out, and the others are gathered."""
+
+    def gather(folder, config, index, revision):
+        if index == 0:
+            raise InfeasibleFlightError("no way")
+        shutil.copytree(gathered.shards[0].path.parents[1], folder, dirs_exist_ok=True)
+
+    monkeypatch.setattr(make, "gather_world", gather)
+    make.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    assert "world 0 is left out: no way" in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("appearance=1.5", "appearance is 1.5"),
+        ("flights=0", "flights is 0"),
+        ("seed=1000", "seed is 1000"),
+        ("expert.period=0.8", "expert.period is 0.8"),
+        ("expert.policy=nobody", "no policy 'nobody'"),
+        ("perturbation.distance=-1", "perturbation.distance is -1"),
+        ("perturbation.copies=-1", "perturbation.copies is -1"),
+        ("worlds.kinds=[R13]", "R13, whose world is not generated"),
+    ],
+)
+def test_values_out_of_range_are_named(small, tmp_path, override, message):
+    """Nothing is written for a configuration that makes no sense."""
+    config = load_config(small, overrides=[override])
+    with pytest.raises(ValueError, match=message):
+        make.run(config=config, out=tmp_path / "c", worlds=1)
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("number", ["worlds", "jobs"])
+def test_numbers_below_one_are_refused(small, tmp_path, number):
+    """No worlds and no workers gather nothing."""
+    with pytest.raises(ValueError, match=f"--{number} is 0"):
+        make.run(config=small, out=tmp_path, **{"worlds": 1, "jobs": 1} | {number: 0})
+
+
+def test_another_corpus_is_not_added_to(small, gathered):
+    """A folder keeps to the configuration that it was begun with."""
+    folder = gathered.shards[0].path.parents[1]
+    other = load_config(small, overrides=["flights=3"])
+    with pytest.raises(ValueError, match="another configuration"):
+        make.run(config=other, out=folder, worlds=1)

@@ -1,0 +1,120 @@
+"""States before near-misses, labelled and added."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.recovery import (
+    StudentFlight,
+    add_recovery,
+    near_misses,
+    rows_before,
+)
+from splatpilot.training.corpus.sample import EXPERT, RECOVERY
+
+TIMES = np.arange(0.0, 12.0, 0.02)
+
+
+def clearances(*dips: tuple[float, float]) -> np.ndarray:
+    """3 m, less at the times [s] of `dips`, to their clearance [m], at 1 m/s before and after."""
+    return np.min([3.0 + 0 * TIMES, *(least + np.abs(TIMES - at) for at, least in dips)], axis=0)
+
+
+@pytest.mark.parametrize(
+    ("dips", "expected"),
+    [
+        ([], []),
+        ([(4.0, 1.3)], []),  # not below 1.2 m
+        ([(4.0, 1.1)], [4.0]),
+        ([(4.0, 0.4), (8.0, -0.1)], [4.0, 8.0]),
+        ([(4.0, 0.9), (4.6, 0.4)], [4.6]),  # one miss: within a second the nearer one counts
+        ([(11.98, 0.0)], [11.98]),  # a collision ends the flight
+    ],
+)
+def test_near_misses_are_the_least_clearances(dips, expected):
+    """The times at which a flight came nearest, below the limit and a second apart."""
+    np.testing.assert_allclose(near_misses(TIMES, clearances(*dips)), expected, atol=1e-9)
+
+
+def test_states_are_taken_before_them():
+    """Every 0.4 s from 0.5 to 2.5 s before each near-miss, none before the flight began, none
+    twice."""
+    rows = rows_before(TIMES, np.array([2.0, 8.0]), 0.4)
+    expected = [0.3, 0.7, 1.1, 1.5, 5.5, 5.9, 6.3, 6.7, 7.1, 7.5]
+    np.testing.assert_allclose(TIMES[rows], expected, atol=0.02 + 1e-9)
+    assert len(rows_before(TIMES, np.array([0.3]), 0.4)) == 0
+    assert len(rows_before(TIMES, np.array([8.0, 8.4]), 0.4)) == 7
+
+
+@pytest.fixture
+def folder(gathered, tmp_path):
+    """A copy of the corpus, to be added to."""
+    return shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
+
+
+def straight_flight(record) -> StudentFlight:
+    """Through a world from start to goal in 8 s, as if nothing stood there."""
+    world = record.make()
+    times = np.arange(0.0, 8.0, 0.02)
+    p_WB = world.p_WS + times[:, None] / 8.0 * (world.p_WG - world.p_WS)
+    states = np.stack([hover_state(p) for p in p_WB])
+    states[:, 3:6] = (world.p_WG - world.p_WS) / 8.0
+    clear = world.distance_field.distance(p_WB) - VEHICLE_RADIUS
+    return StudentFlight(record.name, world.p_WG, times, states, clear)
+
+
+def test_what_the_expert_would_have_done_is_added(folder, gathered):
+    """The samples that come new are of source RECOVERY, of the flight's world and poses, half of
+    them exactly and half perturbed, 0.5 to 2.5 s before a near-miss, with a first trajectory that
+    keeps clear; those that were there stay."""
+    record = gathered.worlds[1]
+    flight = straight_flight(record)
+    events = near_misses(flight.times, flight.clearances)
+    assert len(events) > 0
+    corpus = add_recovery(folder, [flight], jobs=1)
+    samples = corpus.samples(np.arange(len(corpus)))
+    old, new = samples.source == EXPERT, samples.source == RECOVERY
+    assert old.sum() == len(gathered)
+    assert new.sum() == len(corpus) - len(gathered) > 0
+    assert {corpus.worlds[k].name for k in samples.world[new]} == {record.name}
+    exact = samples.X_WB[new][::2, 4:]
+    for p_WB in exact:
+        row = np.abs(flight.states[:, :3] - p_WB).sum(axis=1).argmin()
+        np.testing.assert_allclose(flight.states[row, :3], p_WB, atol=1e-9)
+        ahead = events - flight.times[row]
+        assert ((ahead > 0.5 - 0.03) & (ahead < 2.5 + 0.03)).any()
+    field = record.esdf().conservative()
+    first_W = samples.trajectories_B[new][::2, 0] + exact[:, None]  # hovering level: B as W
+    assert (field.distance(first_W.astype(float)) > VEHICLE_RADIUS - 1e-3).all()
+
+
+def test_the_same_flights_add_nothing_twice(folder, gathered):
+    """Called again with the same flights, after a kill say, nothing changes; another flight adds a
+    shard; the ledger has a row for each flight."""
+    flight = straight_flight(gathered.worlds[0])
+    once = add_recovery(folder, [flight], jobs=1)
+    shard = once.shards[-1].path
+    before = (shard / "color.npy").stat().st_mtime_ns
+    assert len(add_recovery(folder, [flight], jobs=1)) == len(once)
+    assert (shard / "color.npy").stat().st_mtime_ns == before
+    shutil.rmtree(shard)
+    add_recovery(folder, [flight], jobs=1)
+    assert np.array_equal(Corpus(folder).samples(np.arange(len(once))).color,
+                          once.samples(np.arange(len(once))).color)  # fmt: skip
+    later = StudentFlight(
+        flight.world, flight.p_WG, flight.times[:300], flight.states[:300], flight.clearances[:300]
+    )
+    assert len(add_recovery(folder, [later], jobs=1).shards) == len(once.shards) + 1
+    rows = (folder / "ledger.csv").read_text().splitlines()
+    assert sum("recovery" in row for row in rows) == 2
+
+
+def test_flights_elsewhere_are_refused(folder, gathered):
+    """A flight in a world that the corpus does not have is named."""
+    flight = straight_flight(gathered.worlds[0])
+    stray = StudentFlight("P99-7", flight.p_WG, flight.times, flight.states, flight.clearances)
+    with pytest.raises(ValueError, match="not gathered in the world 'P99-7'"):
+        add_recovery(folder, [stray])

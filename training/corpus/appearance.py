@@ -1,0 +1,151 @@
+"""How else a world might look: other paint, light, exposure and sky, as functions of its colours.
+
+Of the geometry nothing changes: means, shapes and opacities of the Gaussians stay.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatpilot.diagrams.worlds.solids.light import GAMMA
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.trilinear import corner_offsets, grid_strides, trilinear
+from splatpilot.systems.splats.background import Background, EnvironmentMap
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.spherical_harmonics import C0
+
+_PAINT = 0.35  # sRGB, largest change of a colour of paint
+_PAINTS = 4  # along each axis of the colour cube
+_TINT = 0.25  # natural logarithm of the light's red, green and blue, over the mean
+_EXPOSURE = -1.0, 0.5  # [EV], least and greatest: brighter ones would burn out
+_HUE = 1.0  # [rad]
+_SATURATION = 0.6  # natural logarithm
+_RELIEF = 0.6  # part of the light that comes from one direction
+_MOTTLE = 0.15  # relative, of brightness over space
+_SHORTEST, _LONGEST = 0.5, 5.0  # [m], wavelengths of the mottling
+_WAVES = 5
+_SKY = 0.7  # part of another colour in the background
+
+_GREY = np.full((3, 3), 1 / 3)
+_TURN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)  # about the axis of greys
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """One look, drawn by `draw_appearance`."""
+
+    paint: Array  # (4, 4, 4, 3) added to sRGB colours, a grid over their cube
+    exposure: float  # factor of linear light
+    mixing: Array  # (3, 3) of linear red, green, blue: tint, hue and saturation
+    light_W: Array  # (3,) unit vector to the light
+    relief: float  # in 0 to 1, part of the light that comes from there
+    waves: Array  # (5, 4) wave vectors [rad/m] and phases [rad] of the mottling
+    mottle: float
+    sky: Array  # (3,) sRGB
+    sky_part: float  # in 0 to 1, of it in the background
+
+
+def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
+    """Draws a look. A `strength` of 0 leaves the world as it is, 1 changes it as much as may be."""
+
+    def uniform(most: float, shape: tuple[int, ...] = ()) -> NDArray:
+        return strength * rng.uniform(-most, most, shape)
+
+    paint = uniform(_PAINT, (*[_PAINTS] * 3, 3))
+    tint = np.exp(uniform(_TINT, (3,)))
+    angle, saturation = uniform(_HUE), np.exp(uniform(_SATURATION))
+    colorful = np.eye(3) - _GREY
+    hue = _GREY + saturation * (np.cos(angle) * colorful + np.sin(angle) * _TURN)
+    light = rng.normal(size=3)
+    waves = rng.normal(size=(_WAVES, 4))
+    waves[:, :3] /= np.linalg.norm(waves[:, :3], axis=1, keepdims=True)
+    waves[:, :3] *= (
+        2 * np.pi / np.exp(rng.uniform(np.log(_SHORTEST), np.log(_LONGEST), (_WAVES, 1)))
+    )
+    return Appearance(
+        paint=paint.astype(np.float32),
+        exposure=float(2 ** (strength * rng.uniform(*_EXPOSURE))),
+        mixing=(hue @ np.diag(tint)).astype(np.float32),
+        light_W=(light / np.linalg.norm(light)).astype(np.float32),
+        relief=float(strength * rng.uniform(0, _RELIEF)),
+        waves=waves.astype(np.float32),
+        mottle=float(strength * rng.uniform(0, _MOTTLE)),
+        sky=rng.uniform(0, 1, 3).astype(np.float32),
+        sky_part=float(strength * rng.uniform(0, _SKY)),
+    )
+
+
+def with_appearance(world: World, look: Appearance) -> World:
+    """The same world, seen otherwise. What moves in it keeps its colours."""
+    return replace(
+        world,
+        gaussians=recolored(world.gaussians, look),
+        background=recolored_background(world.background, look),
+    )
+
+
+def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
+    """The same Gaussians in other colours.
+
+    Each is one piece of paint: its colour without view dependence is repainted and relit, and the
+    view dependence grows or shrinks with its brightness.
+    """
+    before = scene.base_colors  # (N, 3)
+    painted = np.clip(before + _paint(before, look), 0, 1)
+    linear = painted**GAMMA * (look.exposure * _light(scene, look))[:, None]
+    after = _developed(linear @ look.mixing.T)
+    sh = scene.sh.copy()
+    sh[:, 0] = (after - 0.5) / C0
+    brighter = (after.sum(axis=1) + 0.01) / (before.sum(axis=1) + 0.01)
+    sh[:, 1:] *= np.minimum(brighter, 2.0)[:, None, None]
+    return replace(scene, sh=sh)
+
+
+def recolored_background(background: Background, look: Appearance) -> Background:
+    """What is seen behind everything, under the same light, with another sky mixed in."""
+
+    def seen(color: NDArray) -> Array:
+        mixed = (1 - look.sky_part) * color + look.sky_part * look.sky
+        return _developed(look.exposure * mixed**GAMMA @ look.mixing.T)
+
+    if isinstance(background, EnvironmentMap):
+        return EnvironmentMap(seen(background.texels))
+    red, green, blue = seen(np.asarray(background, np.float32)).tolist()
+    return red, green, blue
+
+
+def _paint(colors: Array, look: Appearance) -> Array:
+    """What is added to sRGB colours (N, 3): alike for alike ones, so that a material stays one."""
+    position = colors.T * (_PAINTS - 1)  # (3, N)
+    cell = np.minimum(position.astype(np.intp), _PAINTS - 2)
+    shape = look.paint.shape[:3]
+    corners = corner_offsets(shape) + grid_strides(shape) @ cell  # (2, 2, 2, N)
+    fractions = (position - cell).astype(np.float32)
+    channels = np.moveaxis(look.paint, -1, 0)
+    return np.stack([trilinear(grid.take(corners), *fractions) for grid in channels], axis=1)
+
+
+def _light(scene: GaussianScene, look: Appearance) -> Array:
+    """The light (N,) on the Gaussians, 1 in the mean over all directions and places."""
+    w, x, y, z = scene.quats.T
+    axes = np.stack(  # (N, 3, 3) rows: the principal axes in W
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1),
+            np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1),
+            np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1),
+        ],
+        axis=1,
+    )
+    normals = axes[np.arange(len(scene)), scene.scales.argmin(axis=1)]
+    # A Gaussian has no outside: it is lit alike from both sides. |cos| is 1/2 in the mean.
+    facing = 2 * np.abs(normals @ look.light_W)
+    mottled = np.cos(scene.means @ look.waves[:, :3].T + look.waves[:, 3]).sum(axis=1)
+    return (1 - look.relief + look.relief * facing) * (1 + look.mottle * mottled / np.sqrt(_WAVES))
+
+
+def _developed(linear: NDArray) -> Array:
+    """The sRGB colours of linear light."""
+    return (np.clip(linear, 0, 1) ** (1 / GAMMA)).astype(np.float32)

@@ -1,0 +1,103 @@
+"""The worlds that a corpus is gathered in: generated ones, and scenes with obstacles put in."""
+
+from dataclasses import dataclass, field
+from math import inf
+from pathlib import Path
+
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.diagrams.worlds.inserted import InsertedConfig
+from splatpilot.diagrams.worlds.make_world import is_procedural
+from splatpilot.diagrams.worlds.scene import SceneConfig, SceneSource, find_scene
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
+from splatpilot.training.corpus.world_record import WorldSource
+from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, world_of
+
+
+@dataclass
+class LibraryConfig:
+    """Which worlds; a corpus is gathered in so many of them, in turn."""
+
+    # Scenarios whose worlds are generated, the benchmark's or files; naming one twice doubles its
+    # part.
+    kinds: list[str] = field(default_factory=lambda: [*PROCEDURAL, *ROUNDABOUT])
+    # Scene folders, each with other obstacles, start and goal every time its turn comes. None that
+    # the benchmark flies in, and each with its fidelity bound (`splatpilot fidelity`).
+    scenes: list[str] = field(default_factory=list)
+    # Whether the seeds are those of validation instead of training.
+    held_out: bool = False
+
+    def validate(self) -> None:
+        """
+        Raises:
+            FileNotFoundError: for a scene that is not there.
+            ValueError: on a value out of range, naming it, its limit and the remedy.
+        """
+        if not self.kinds and not self.scenes:
+            raise ValueError("worlds has neither kinds nor scenes; name some")
+        for kind in self.kinds:
+            if not is_procedural(world_of(kind)):
+                raise ValueError(
+                    f"worlds.kinds has {kind}, whose world is not generated; choose kinds from "
+                    f"{', '.join(PROCEDURAL)} and files, and put scene folders into worlds.scenes"
+                )
+        for scene in self.scenes:
+            fidelity_bound(scene)
+
+
+def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
+    """
+    The world `index` of a library, whose kinds come in turn and whose seeds count on.
+
+    Args:
+        seed: of the corpus: two of different seeds have no generated world in common.
+        index: 0 to 999.
+
+    Raises:
+        FileNotFoundError, ValueError: see `LibraryConfig.validate`; or if the seed or the index is
+            out of range.
+    """
+    if not 0 <= index < SEEDS_PER_RUN:
+        raise ValueError(
+            f"a corpus has at most {SEEDS_PER_RUN} worlds; gather more with another seed"
+        )
+    first = VALIDATION_SEEDS if library.held_out else first_training_seed(seed)
+    kinds = [*library.kinds, *library.scenes]
+    kind, seed = kinds[index % len(kinds)], first + index
+    name = f"{Path(kind).stem}-{seed}"
+    if kind in library.scenes:
+        world = InsertedConfig(path=kind, draw_ends=True)
+        return WorldSource(name, world, seed, fidelity_bound(kind))
+    return WorldSource(name, world_of(kind), seed, inf)
+
+
+def fidelity_bound(scene: str) -> float:
+    """How far from its capture's poses the images of a scene folder can be trusted [m].
+
+    Raises:
+        FileNotFoundError: if there is no such scene.
+        ValueError: if nobody measured it, or the benchmark flies in it.
+    """
+    folder = find_scene(SceneConfig(path=scene))
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no scene folder; `splatpilot reconstruct` makes one")
+    metadata = read_scene_metadata(folder)
+    flown = {folder.name, metadata.name} & _benchmark_scenes()
+    if flown:
+        raise ValueError(
+            f"{folder}: the benchmark flies in {min(flown)}, so nothing may be learned there; "
+            "leave it out of worlds.scenes"
+        )
+    if metadata.perturbation_bound is None:
+        raise ValueError(
+            f"{folder / 'scene.yaml'} does not say how far from the capture its images can be "
+            f"trusted (perturbation_bound); measure it with `splatpilot fidelity {folder}`"
+        )
+    return metadata.perturbation_bound
+
+
+def _benchmark_scenes() -> set[str]:
+    worlds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
+    return {Path(world.path).name for world in worlds if isinstance(world, SceneSource)}

@@ -1,0 +1,91 @@
+"""Gathering a corpus, in any number of worlds side by side."""
+
+import shutil
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from splatpilot.systems.configuration import claim_folder
+from splatpilot.systems.cores import available_cores
+from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.processes import map_processes
+from splatpilot.systems.provenance import revision
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.corpus.corpus import CONFIG, Corpus
+from splatpilot.training.corpus.gather import gather_world, shard_folder
+from splatpilot.training.corpus.ledger import write_ledger
+from splatpilot.training.corpus.library import world_source
+from splatpilot.training.corpus.shard import Shard
+from splatpilot.training.corpus.world_record import WorldRecord
+
+
+def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
+    """
+    Gathers what a corpus in `out` lacks of its first `worlds` worlds.
+
+    Interrupted, even by `kill -9`, the same command goes on and leaves the same bytes. With more
+    worlds it adds to what is there. A shard that is damaged is gathered again.
+
+    Args:
+        config: how; it decides every sample.
+        out: folder; see `splatpilot.training.corpus.corpus`.
+        worlds: in how many worlds.
+        jobs: worker processes; one for each core by default.
+
+    Returns:
+        The corpus.
+
+    Raises:
+        FileNotFoundError, ValueError: on a config out of range, another corpus in `out`, or if
+            nothing was gathered.
+        OSError: if `out` cannot be written, or a worker process dies.
+    """
+    config.validate()
+    jobs = available_cores() if jobs is None else jobs
+    if jobs < 1:
+        raise ValueError(f"--jobs is {jobs}; it must be at least 1")
+    if worlds < 1:
+        raise ValueError(f"--worlds is {worlds}; it must be at least 1")
+    names = [world_source(config.worlds, config.seed, k).name for k in range(worlds)]
+    claim_folder(out / CONFIG, config)
+    for part in ("worlds", "shards"):
+        (out / part).mkdir(exist_ok=True)
+        for left in (out / part).glob(".*.partial"):  # by a kill
+            shutil.rmtree(left)
+    missing = [k for k in range(worlds) if not _is_there(out, names[k])]
+    gather = partial(_gather, out, config, revision())
+    with tqdm(total=worlds, initial=worlds - len(missing), desc="worlds", unit="world") as bar:
+        for reason in map_processes(gather, missing, jobs):
+            if reason:
+                bar.write(reason)
+            bar.update()
+    corpus = Corpus(out)
+    write_ledger(out, corpus)
+    return corpus
+
+
+def _is_there(out: Path, world: str) -> bool:
+    """Whether a world and its shard are there and whole; what is left of them otherwise is
+    removed."""
+    record, shard = out / "worlds" / world, shard_folder(out, world)
+    if not shard.exists():
+        return False
+    try:
+        WorldRecord(record)
+        Shard(shard).verify()
+    except (ValueError, OSError) as error:
+        tqdm.write(f"{error}: {world} is gathered again")
+        shutil.rmtree(record, ignore_errors=True)
+        shutil.rmtree(shard)
+        return False
+    return True
+
+
+def _gather(out: Path, config: CorpusConfig, revision: str, index: int) -> str:
+    """Gathers a world; returns why not, if it cannot be flown in."""
+    try:
+        gather_world(out, config, index, revision)
+    except InfeasibleFlightError as error:
+        return f"world {index} is left out: {error}"
+    return ""

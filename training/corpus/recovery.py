@@ -1,0 +1,153 @@
+"""Recovery: what the expert would have done just before a student came too near.
+
+The student has flown; nothing is flown here. The states before its near-misses are labelled anew
+and rendered offline.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from splatpilot.systems.cores import available_cores
+from splatpilot.systems.processes import map_processes
+from splatpilot.systems.provenance import revision
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.demonstrations import keep_clear, see_states
+from splatpilot.training.corpus.ledger import write_ledger
+from splatpilot.training.corpus.sample import RECOVERY, Samples
+from splatpilot.training.corpus.shard import write_shard
+from splatpilot.training.corpus.world_record import WorldRecord
+from splatpilot.training.policies.expert import Labeller
+
+NEAR = 1.2
+"""[m], clearance below which the least of a while is a near-miss."""
+
+BEFORE = 0.5, 2.5
+"""[s], how long before a near-miss states are taken."""
+
+APART = 1.0
+"""[s], between two near-misses."""
+
+
+@dataclass(frozen=True, eq=False)
+class StudentFlight:
+    """A flight of a student through a world of a corpus, sampled evenly."""
+
+    world: str  # its name in the corpus
+    p_WG: np.ndarray  # (3,) [m], the goal that it flew to
+    times: np.ndarray  # (N,) [s]
+    states: np.ndarray  # (N, 13)
+    clearances: np.ndarray  # (N,) [m], distances less the vehicle's radius
+
+    def digest(self) -> str:
+        """What tells it from others."""
+        arrays = self.p_WG, self.times, self.states
+        whole = b"".join(np.ascontiguousarray(array, float).tobytes() for array in arrays)
+        return hashlib.sha256(whole).hexdigest()[:16]
+
+
+def near_misses(times: np.ndarray, clearances: np.ndarray) -> np.ndarray:
+    """The times (m,) [s] at which evenly sampled clearances (N,) [m] are least and below `NEAR`,
+    two of them at least `APART` apart; also at the beginning and the end, where flights collide."""
+    closeness = np.concatenate([[-np.inf], -np.nan_to_num(clearances, nan=np.inf), [-np.inf]])
+    samples = max(1.0, APART / np.median(np.diff(times))) if len(times) > 1 else 1.0
+    peaks, _ = find_peaks(closeness, height=np.nextafter(-NEAR, 0.0), distance=samples)
+    return times[peaks - 1]
+
+
+def rows_before(times: np.ndarray, events: np.ndarray, period: float) -> np.ndarray:
+    """The samples (n,) that lie 0.5 to 2.5 s before events (m,) [s], in steps of `period` [s]."""
+    earliest, latest = BEFORE[1], BEFORE[0]
+    ahead = np.arange(latest, earliest + 1e-9, period)
+    wanted = (events[:, None] - ahead).ravel()
+    wanted = wanted[wanted >= times[0] - 1e-9]
+    return np.unique(np.searchsorted(times, wanted - 1e-9))
+
+
+def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | None = None) -> Corpus:
+    """
+    Adds to a corpus what the expert would have done before the near-misses of flights.
+
+    The same flights add the same bytes, and those that were added already add nothing.
+
+    Args:
+        folder: of the corpus.
+        flights: of a student.
+        jobs: worker processes; one for each core by default.
+
+    Returns:
+        The corpus with them.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no corpus, it is damaged, or was not gathered in
+            one of the flights' worlds.
+        OSError: if it cannot be written, or a worker process dies.
+    """
+    corpus = Corpus(folder)
+    records = {record.name: record for record in corpus.worlds}
+    by_world: dict[str, list[StudentFlight]] = {}
+    for flight in flights:
+        if flight.world not in records:
+            raise ValueError(
+                f"{folder} was not gathered in the world {flight.world!r}, where a student flew; "
+                "fly it in one of the corpus"
+            )
+        by_world.setdefault(flight.world, []).append(flight)
+    work = []
+    for world, flown in by_world.items():
+        digest = hashlib.sha256("".join(f.digest() for f in flown).encode()).hexdigest()[:12]
+        path = folder / "shards" / f"recovery-{world}-{digest}"
+        if not path.exists():
+            work.append((path, records[world], flown))
+    add = partial(_add_world, corpus.config, revision())
+    for _ in map_processes(add, work, jobs or available_cores()):
+        pass
+    corpus = Corpus(folder)
+    write_ledger(folder, corpus)
+    return corpus
+
+
+def _add_world(
+    config: CorpusConfig, revision: str, work: tuple[Path, WorldRecord, list[StudentFlight]]
+) -> None:
+    path, record, flights = work
+    world, source = record.make(), record.source
+    labellers: dict[bytes, Labeller] = {}
+    parts, entries = [], []
+    for number, flight in enumerate(flights):
+        goal = flight.p_WG.tobytes()
+        if goal not in labellers:
+            labellers[goal] = Labeller(world.esdf, flight.p_WG, config.expert)
+        events = near_misses(flight.times, flight.clearances)
+        rows = rows_before(flight.times, events, config.expert.period)
+        states = flight.states[rows[flight.clearances[rows] > 0.0]]
+        labeller, bound = labellers[goal], source.perturbation_bound
+        demonstrations = keep_clear(labeller.labels(states), labeller.field)
+        rng = np.random.default_rng(int(flight.digest(), 16))
+        parts.append(see_states(demonstrations, world, labeller, config, bound, rng))
+        entries.append(
+            {
+                "flight": number,
+                "seed": source.seed,
+                "start": flight.states[0, :3].tolist(),
+                "goal": flight.p_WG.tolist(),
+                "time_s": float(flight.times[-1]),
+                "least_clearance_m": float(np.nanmin(flight.clearances)),
+                "near_misses": len(events),
+                "states": len(demonstrations),
+            }
+        )
+    write_shard(
+        path,
+        Samples.concatenate(parts, config.size),
+        world=record.name,
+        source=RECOVERY,
+        flights=entries,
+        revision=revision,
+    )

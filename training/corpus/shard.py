@@ -1,0 +1,134 @@
+"""A block of samples on disk: a folder of three arrays, and `shard.json`, which says whose.
+
+    color.npy    (N, H, W, 3) uint8
+    depth.npy    (N, H, W) float16
+    labels.npy   (N,) records, see `SampleSize.label_type`
+    shard.json   format version, world, source, flights, sizes and checksums
+
+The folder appears whole, by one renaming. The arrays are in NumPy's own format: specified,
+unchanged since 2007, read by every language, and mapped into memory by NumPy itself.
+"""
+
+import json
+import zlib
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatpilot.systems.files import folder_written_atomically
+from splatpilot.training.corpus.sample import Samples
+
+FORMAT_VERSION = 1
+
+_ABOUT = "shard.json"
+_ARRAYS = "color.npy", "depth.npy", "labels.npy"
+_REMEDY = "delete that folder and run the command that gathered it again"
+_CHUNK = 1 << 22  # bytes
+
+
+def write_shard(
+    path: Path,
+    samples: Samples,
+    *,
+    world: str,
+    source: int,
+    flights: list[dict[str, Any]],
+    revision: str,
+) -> None:
+    """
+    Writes the folder `path`, whole or not at all; one that is there stays.
+
+    Args:
+        samples: what to write, perhaps none; their `world` and `source` are stated once:
+        world: name of the world that all are from.
+        source: `EXPERT` or `RECOVERY`, of all.
+        flights: of each flight that they come from, what JSON can hold.
+        revision: of the program.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    labels = np.empty(len(samples), samples.size.label_type())
+    for name in labels.dtype.names or ():
+        labels[name] = getattr(samples, name)
+    with folder_written_atomically(path) as folder:
+        for name, array in zip(_ARRAYS, (samples.color, samples.depth, labels), strict=True):
+            np.save(folder / name, array)
+        files = {
+            name: {"bytes": (folder / name).stat().st_size, "crc32": _checksum(folder / name)}
+            for name in _ARRAYS
+        }
+        about = {
+            "format_version": FORMAT_VERSION,
+            "revision": revision,
+            "world": world,
+            "source": source,
+            "samples": len(samples),
+            "files": files,
+            "flights": flights,
+        }
+        (folder / _ABOUT).write_text(json.dumps(about, indent=1) + "\n")
+
+
+class Shard:
+    """A shard that is there. Its arrays are mapped when first asked for, and read as they are used.
+
+    Raises:
+        ValueError: if it is of another version, or a file is missing or cut short.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            about = json.loads((path / _ABOUT).read_text())
+            version = about["format_version"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path / _ABOUT} describes no shard ({error}); {_REMEDY}") from None
+        if version != FORMAT_VERSION:
+            raise ValueError(
+                f"{path}: a shard of format version {version}, this program knows {FORMAT_VERSION};"
+                " use the version of the program that gathered it, or gather anew in another folder"
+            )
+        self.revision: str = about["revision"]
+        self.world: str = about["world"]
+        self.source: int = about["source"]
+        self.flights: list[dict[str, Any]] = about["flights"]
+        self._files: dict[str, dict[str, int]] = about["files"]
+        self._count: int = about["samples"]
+        for name, said in self._files.items():
+            file = path / name
+            found = file.stat().st_size if file.is_file() else 0
+            if found != said["bytes"]:
+                raise ValueError(f"{file} has {found} bytes instead of {said['bytes']}; {_REMEDY}")
+
+    def __len__(self) -> int:
+        return self._count
+
+    def verify(self) -> None:
+        """Reads all of it.
+
+        Raises:
+            ValueError: if what is there is not what was written.
+        """
+        for name, said in self._files.items():
+            if _checksum(self.path / name) != said["crc32"]:
+                raise ValueError(f"{self.path / name} is damaged (wrong checksum); {_REMEDY}")
+
+    @cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The fields of `Samples` that samples do not share, read-only."""
+        if not self._count:  # nothing cannot be mapped
+            return {}
+        color, depth, labels = (np.load(self.path / name, mmap_mode="r") for name in _ARRAYS)
+        fields = {name: labels[name] for name in labels.dtype.names or ()}
+        return {"color": color, "depth": depth} | fields
+
+
+def _checksum(file: Path) -> int:
+    value = 0
+    with file.open("rb") as stream:
+        while chunk := stream.read(_CHUNK):
+            value = zlib.crc32(chunk, value)
+    return value
