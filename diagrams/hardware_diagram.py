@@ -13,17 +13,19 @@ from splatpilot.systems.messaging.bridge_status import BridgeStatus
 from splatpilot.systems.messaging.codecs import (
     Codec,
     CommandCodec,
+    DepthGridCodec,
     HypothesesCodec,
     StateCodec,
     StatusCodec,
     VelocitySetpointCodec,
 )
-from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec, ImageCodec
+from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity_setpoint import VelocitySetpoint
+from splatpilot.systems.sensing.time_of_flight import sensor_of
 from splatpilot.systems.vehicle.state_prediction import StatePredictor
 
 
@@ -141,13 +143,16 @@ def BuildHardwareDiagram(
     return diagram
 
 
-def image_codecs(scenario: Scenario, policy: System) -> list[ImageCodec]:
+def image_codecs(scenario: Scenario, policy: System) -> list[Codec]:
     """How the images travel that a policy sees."""
     camera = camera_of(scenario, policy)
-    size = camera.width, camera.height
+    size, sensor = (camera.width, camera.height), sensor_of(camera)
     codecs = {
         "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), "policy_camera"),
         "color_image": ColorImageCodec(ImageRgba8U(*size), "policy_camera"),
+        "depth_grid": DepthGridCodec(
+            sensor.columns, sensor.rows, sensor.max_range, "policy_camera"
+        ),
     }
     return [codecs[name] for name in images_of(policy)]
 

@@ -12,6 +12,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
+from splatpilot.systems.policies.velocity_tracker import VelocityTracker
 from splatpilot.systems.vehicle.flatness_controller import FlatnessController
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
@@ -24,7 +25,7 @@ class Pilot(NamedTuple):
     pose: OutputPort
     """X_WB."""
     decision: OutputPort
-    """What the controller does: the port `waypoint` or `acceleration`."""
+    """What is flown: the port `waypoint`, `acceleration` or `velocity`."""
 
 
 def make_policy(scenario: Scenario, world: World) -> System:
@@ -46,8 +47,9 @@ def AddPilot(
 ) -> Pilot:
     """
     Adds the systems `pose`, `collision`, `goal`, `policy`, `controller` and, of a policy that
-    returns hypotheses, `selector`; exports `command`, `hypotheses` where there are any,
-    `clearance`, `in_collision` and `field_state`. `ConnectObservation` is left to do.
+    returns hypotheses, `selector`, or of one that returns velocities, `velocity_tracker`; exports
+    `command`, `hypotheses` where there are any, `clearance`, `in_collision` and `field_state`.
+    `ConnectObservation` is left to do.
 
     Args:
         state: (13) of the vehicle.
@@ -122,7 +124,7 @@ def _ConnectDecision(
     policy: System,
     controller: System,
 ) -> OutputPort:
-    """Leads what the policy decides to the controller's port of that kind, and returns it."""
+    """Leads what the policy decides to the controller, and returns it."""
     if policy.HasOutputPort("hypotheses"):
         hypotheses = policy.GetOutputPort("hypotheses")
         count = num_hypotheses_in(hypotheses.size())
@@ -132,16 +134,25 @@ def _ConnectDecision(
         builder.Connect(state, selector.state_input_port())
         decision = selector.waypoint_output_port()
     else:
-        kind = "acceleration" if policy.HasOutputPort("acceleration") else "waypoint"
-        if not policy.HasOutputPort(kind):
+        kinds = [
+            kind for kind in ("acceleration", "velocity", "waypoint") if policy.HasOutputPort(kind)
+        ]
+        if not kinds:
             raise ValueError(
                 f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
-                "acceleration and waypoint; give it one"
+                "acceleration, velocity and waypoint; give it one"
             )
-        decision = policy.GetOutputPort(kind)
-    kind = decision.get_name()
+        decision = policy.GetOutputPort(kinds[0])
+    flown = decision
+    if decision.get_name() == "velocity":
+        tracker = VelocityTracker()
+        builder.AddNamedSystem("velocity_tracker", tracker)
+        builder.Connect(state, tracker.state_input_port())
+        builder.Connect(decision, tracker.velocity_input_port())
+        flown = tracker.acceleration_output_port()
+    kind = flown.get_name()
     require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
-    builder.Connect(decision, controller.GetInputPort(kind))
+    builder.Connect(flown, controller.GetInputPort(kind))
     if policy.HasOutputPort("heading"):
         builder.Connect(policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
     return decision
