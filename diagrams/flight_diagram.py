@@ -55,6 +55,7 @@ def BuildFlightDiagram(
         - depth_image_32f
         - depth_image_16u
         - clearance
+        - gradient
         - in_collision
         - field_state
 

@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 from splatpilot.analysis.commands.scenario_options import add_scenario, read_scenario
@@ -17,6 +18,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     bridge.set_defaults(verb=_bridge)
     bridge.add_argument("--log", type=Path, help="write all messages to this file, as lcm-logger")
     for parser in (vehicle, bridge):
+        parser.add_argument(
+            "--hardware", type=Path, metavar="FILE", help="YAML with fields of HardwareConfig"
+        )
         parser.add_argument("--lcm-url", metavar="URL", help="where messages travel")
         parser.add_argument(
             "--patience", type=float, metavar="S", help="how long to wait for messages [s]"
@@ -38,7 +42,9 @@ def _bridge(options: argparse.Namespace) -> None:
 
 def _config(options: argparse.Namespace):
     from splatpilot.diagrams.hardware_config import HardwareConfig
+    from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     given = {"url": options.lcm_url, "patience": options.patience}
-    return HardwareConfig(**{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in given.items() if value is not None}
+    return replace(load_config(HardwareConfig(), options.hardware), **given)

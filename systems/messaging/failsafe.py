@@ -1,0 +1,359 @@
+"""Failsafe: what is flown where nobody can be trusted to say."""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
+from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.vehicle.flatness_controller import (
+    FlatnessControllerConfig,
+    flatness_command,
+)
+from splatpilot.systems.vehicle.flight_limits import (
+    LEVEL,
+    FlightLimits,
+    limit_approach,
+    limit_speed,
+    limit_to_box,
+)
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+
+_STOPPED = 0.3  # [m/s], below which a place is held instead of braking.
+_HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
+_HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
+_SLACK = 1.01  # [-], by which a command may exceed what its controller is limited to.
+
+
+@dataclass
+class FailsafeConfig:
+    """When a vehicle is taken from its policy, and what happens then."""
+
+    # [s] Nothing is flown by a state, an observation or a sight by motion capture that is older.
+    max_age: float = 0.3
+    # [s] By which a process may be behind the wall clock.
+    max_lag: float = 0.3
+    # [s] That all must be well again until the policy flies on.
+    recovery: float = 0.5
+    # [s] Of hovering after which the vehicle lands.
+    patience: float = 5.0
+    # [m/s] Of landing.
+    descent: float = 0.5
+    limits: FlightLimits = field(default_factory=FlightLimits)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("max_age", "max_lag", "recovery", "patience", "descent"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(
+                    f"failsafe.{name} is {value}; it must be positive and finite, as "
+                    f"{getattr(type(self), name)}"
+                )
+        self.limits.validate()
+
+
+class _Memory(NamedTuple):
+    """The discrete state."""
+
+    mode: float = status.WAITING
+    reason: float = status.NONE
+    since: float = 0.0  # [s], when the mode began.
+    well: float = math.nan  # [s], since when all has been well.
+    x: float = math.nan  # [m], the place that is held, NaN while there is none.
+    y: float = math.nan
+    z: float = math.nan
+    seen_x: float = math.nan  # [m], the position that was measured last,
+    seen_y: float = math.nan
+    seen_z: float = math.nan
+    moved: float = 0.0  # [s], and when it was another.
+
+
+class Failsafe(LeafSystem):
+    """Lets pass what a policy and its controller want, within limits; where they or what they see
+    cannot be trusted it brakes and hovers, and then lands.
+
+    .. pydrake_system::
+
+        name: Failsafe
+        input_ports:
+        - state
+        - measured_state
+        - velocity_setpoint
+        - command
+        - state_age
+        - observation_age
+        - body_age
+        - lag
+        - clearance
+        - gradient
+        output_ports:
+        - velocity_setpoint
+        - command
+        - mode
+        - state_is_known
+        - in_charge
+
+    - ``state``, ``measured_state`` (13 each): of now, and as it was measured.
+    - ``velocity_setpoint`` (4): v [m/s], W frame, and heading [rad] or NaN; limits are those of
+      commands alone where it is not connected.
+    - ``command`` (4): thrust over mass [m/s^2], body rates [rad/s].
+    - ``state_age``, ``observation_age``, ``body_age`` (1 each) [s]: since each was sent, infinite
+      before the first; the latter two, of what is flown by and of the last sight by motion capture,
+      are optional.
+    - ``lag`` (1) [s], optional: by which the process is behind the wall clock.
+    - ``clearance`` (1) [m], ``gradient`` (3), optional: from the hull to the nearest obstacle that
+      is known, and the direction away from it; NaN and 0 where nothing is known.
+    - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
+    - ``state_is_known`` (1): whether the state can be flown by; body rates need that. Velocity
+      setpoints do not: while the state is unknown they are those to stop, or to descend.
+    - ``in_charge`` (1): 0 while the mode is WAITING, else 1.
+
+    What is wrong is wrong at once, in what goes out; modes change every ``period`` from time 0.
+    WAITING is for the first state and observation; FLYING becomes HOLDING where anything is wrong
+    and FLYING again when all has been well for ``recovery``; after ``patience`` it is LANDING, and
+    remains so.
+    """
+
+    state_input_port = input_port("state")
+    measured_state_input_port = input_port("measured_state")
+    velocity_setpoint_input_port = input_port("velocity_setpoint")
+    command_input_port = input_port("command")
+    state_age_input_port = input_port("state_age")
+    observation_age_input_port = input_port("observation_age")
+    body_age_input_port = input_port("body_age")
+    lag_input_port = input_port("lag")
+    clearance_input_port = input_port("clearance")
+    gradient_input_port = input_port("gradient")
+    velocity_setpoint_output_port = output_port("velocity_setpoint")
+    command_output_port = output_port("command")
+    mode_output_port = output_port("mode")
+    state_is_known_output_port = output_port("state_is_known")
+    in_charge_output_port = output_port("in_charge")
+
+    def __init__(
+        self,
+        config: FailsafeConfig,
+        controller: FlatnessControllerConfig,
+        vehicle: QuadrotorParams,
+        lower_W: np.ndarray,
+        upper_W: np.ndarray,
+    ):
+        """Constructs the system.
+
+        Args:
+            config: when, and what then.
+            controller: the law that flies velocities; commands may not exceed its limits.
+            vehicle: that is flown.
+            lower_W, upper_W: (3,) [m] corners of the box in which it stays, unless `config.limits`
+                has one.
+
+        Raises:
+            ValueError: on a configuration out of range.
+        """
+        super().__init__()
+        config.validate()
+        self._config, self._controller, self._vehicle = config, controller, vehicle
+        fence = config.limits.geofence or (lower_W, upper_W)
+        self._lower, self._upper = (np.asarray(corner, dtype=float) for corner in fence)
+        for name, size in (
+            *(("state", 13), ("measured_state", 13), ("velocity_setpoint", 4), ("command", 4)),
+            *((name, 1) for name in ("state_age", "observation_age", "body_age", "lag")),
+            *(("clearance", 1), ("gradient", 3)),
+        ):
+            self.DeclareVectorInputPort(name, size)
+        self.DeclareDiscreteState(np.array(_Memory()))
+        self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc_velocity_setpoint)
+        self.DeclareVectorOutputPort("command", 4, self._calc_command)
+        self.DeclareVectorOutputPort("mode", 2, self._calc_mode)
+        self.DeclareVectorOutputPort("state_is_known", 1, self._calc_state_is_known)
+        self.DeclareVectorOutputPort("in_charge", 1, self._calc_in_charge)
+        self.DeclarePeriodicDiscreteUpdateEvent(controller.period, 0.0, self._update)
+
+    def _read(self, context: Context, name: str) -> np.ndarray | None:
+        port = self.GetInputPort(name)
+        return np.asarray(port.Eval(context)) if port.HasValue(context) else None
+
+    def _ages(self, context: Context) -> dict[int, float]:
+        """[s], by the reasons for not flying by what is older than allowed."""
+        ports = {
+            status.STATE_OLD: "state_age",
+            status.OBSERVATION_OLD: "observation_age",
+            status.BODY_LOST: "body_age",
+        }
+        read = {reason: self._read(context, name) for reason, name in ports.items()}
+        return {reason: float(age[0]) for reason, age in read.items() if age is not None}
+
+    def _wrong(self, context: Context) -> int:
+        """The first reason not to fly as the policy decides; NONE where there is none."""
+        config, memory = self._config, _memory(context)
+        for reason, age in self._ages(context).items():
+            if not age <= config.max_age:
+                return reason
+        state = QuadrotorState.of(np.asarray(self._read(context, "state")))
+        frozen = context.get_time() - memory.moved > config.max_age
+        if frozen and np.linalg.norm(state.v_WB) > _STOPPED:
+            return status.STATE_FROZEN
+        lag = self._read(context, "lag")
+        if lag is not None and lag[0] > config.max_lag:
+            return status.OVERRUN
+        wanted = self._read(context, "velocity_setpoint")
+        command = np.asarray(self._read(context, "command"))
+        heading_ok = wanted is None or not math.isinf(wanted[3])
+        if not (np.isfinite(command).all() and heading_ok) or (
+            wanted is not None and not np.isfinite(wanted[:3]).all()
+        ):
+            return status.NOT_FINITE
+        law = self._controller
+        most = np.array([law.max_tilt_rate, law.max_tilt_rate, law.max_yaw_rate])
+        if (
+            not 0.0 <= command[0] <= _SLACK * law.max_thrust
+            or (np.abs(command[1:]) > _SLACK * most).any()
+        ):
+            return status.OUT_OF_BOUNDS
+        w, x, y, z = state.q_WB
+        if w * w - x * x - y * y + z * z < math.cos(config.limits.max_tilt):
+            return status.TILTED
+        if wanted is not None and ((state.p_WB < self._lower) | (state.p_WB > self._upper)).any():
+            return status.OUTSIDE
+        return status.NONE
+
+    def _mode(self, context: Context) -> tuple[int, int]:
+        """Mode and reason at this instant."""
+        memory = _memory(context)
+        mode, reason = int(memory.mode), int(memory.reason)
+        if mode != status.FLYING:
+            return mode, reason
+        wrong = self._wrong(context)
+        return (status.HOLDING, wrong) if wrong else (mode, status.NONE)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        now, memory = context.get_time(), _memory(context)
+        measured = self._read(context, "measured_state")
+        if measured is not None:
+            seen = tuple(measured[:3])
+            if seen != (memory.seen_x, memory.seen_y, memory.seen_z):
+                x, y, z = seen
+                memory = memory._replace(seen_x=x, seen_y=y, seen_z=z, moved=now)
+        else:
+            memory = memory._replace(moved=now)
+        mode, waits = memory.mode, any(map(math.isinf, self._ages(context).values()))
+        wrong = status.NONE if waits and mode == status.WAITING else self._wrong(context)
+        well = math.nan if wrong or waits else (now if math.isnan(memory.well) else memory.well)
+        memory = memory._replace(well=well)
+        held_long = now - memory.since > self._config.patience
+        if mode == status.WAITING and not waits:
+            memory = _begun(memory, status.FLYING, status.NONE, now)
+        elif mode == status.FLYING and wrong:
+            memory = _begun(memory, status.HOLDING, wrong, now)
+        elif mode == status.HOLDING and now - well >= self._config.recovery:
+            memory = _begun(memory, status.FLYING, status.NONE, now)
+        elif mode == status.HOLDING and held_long:
+            memory = memory._replace(mode=status.LANDING, since=now)
+        known = self._known(context)
+        if memory.mode != status.FLYING and known and math.isnan(memory.x):
+            p_WB, v_WB, _, _ = QuadrotorState.of(np.asarray(self._read(context, "state")))
+            if np.linalg.norm(v_WB) < _STOPPED:
+                memory = memory._replace(x=p_WB[0], y=p_WB[1], z=p_WB[2])
+        discrete_state.set_value(np.array(memory))
+
+    def _known(self, context: Context) -> bool:
+        memory, age = _memory(context), self._ages(context)[status.STATE_OLD]
+        return age <= self._config.max_age and memory.reason != status.STATE_FROZEN
+
+    def _flown(self, context: Context) -> tuple[np.ndarray, int, int]:
+        """Velocity setpoint (4,), mode and reason."""
+        mode, reason = self._mode(context)
+        landing = mode == status.LANDING
+        descent = np.array([0.0, 0.0, -self._config.descent if landing else 0.0])
+        if not self._known(context):
+            return np.append(descent, math.nan), mode, reason
+        state = QuadrotorState.of(np.asarray(self._read(context, "state")))
+        setpoint = self._read(context, "velocity_setpoint")
+        if mode == status.FLYING:
+            if setpoint is None:
+                return np.full(4, math.nan), mode, reason
+            limited, limit = self._limited(context, setpoint[:3], state, landing=False)
+            return np.append(limited, setpoint[3]), mode, limit
+        memory = _memory(context)
+        place = np.array([memory.x, memory.y, memory.z])
+        back = np.zeros(3)
+        if np.isfinite(place).all():
+            back = limit_speed(_HOLDING_GAIN * (place - state.p_WB), _HOLDING_SPEED)
+        if landing:
+            back[2] = -self._config.descent
+        limited, _ = self._limited(context, back, state, landing)
+        return np.append(limited, math.nan), mode, reason
+
+    def _limited(
+        self, context: Context, wanted: np.ndarray, state: QuadrotorState, landing: bool
+    ) -> tuple[np.ndarray, int]:
+        """The velocity (3,) within limits, and the reason for what was changed last."""
+        limits = self._config.limits
+        away, room = self._room(context, landing)
+        clear = limit_approach(wanted, away, room, limits.deceleration)
+        lower = self._lower - [0.0, 0.0, math.inf if landing else 0.0]
+        inside = limit_to_box(clear, state.p_WB, lower, self._upper, limits.deceleration)
+        slow = limit_speed(inside, limits.max_speed)
+        for before, after, reason in (
+            (inside, slow, status.LIMITED_SPEED),
+            (clear, inside, status.LIMITED_GEOFENCE),
+            (wanted, clear, status.LIMITED_CLEARANCE),
+        ):
+            if not np.allclose(before, after, rtol=0.0, atol=1e-9):
+                return slow, reason
+        return slow, status.NONE
+
+    def _room(self, context: Context, landing: bool) -> tuple[np.ndarray, float]:
+        """The direction (3,) away from the nearest obstacle, and the room towards it [m]."""
+        clearance, gradient = (self._read(context, name) for name in ("clearance", "gradient"))
+        if clearance is None or gradient is None or math.isnan(clearance[0]) or not gradient.any():
+            return np.zeros(3), math.inf
+        away = gradient / np.linalg.norm(gradient)
+        if landing and away[2] > LEVEL:
+            return away, math.inf
+        return away, float(clearance[0]) - self._config.limits.min_clearance
+
+    def _calc_velocity_setpoint(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._flown(context)[0])
+
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        setpoint, mode, reason = self._flown(context)
+        if mode == status.FLYING and reason == status.NONE:
+            output.SetFromVector(np.asarray(self._read(context, "command")))
+            return
+        state = np.asarray(self._read(context, "state"))
+        if not np.isfinite(state).all():
+            output.SetFromVector(np.array([self._vehicle.gravity, 0.0, 0.0, 0.0]))
+            return
+        a_WB = tracking_acceleration(QuadrotorState.of(state).v_WB, setpoint[:3])
+        motion = setpoint[:3] if mode == status.FLYING else np.zeros(3)
+        law, vehicle = self._controller, self._vehicle
+        output.SetFromVector(flatness_command(state, a_WB, motion, setpoint[3], law, vehicle))
+
+    def _calc_mode(self, context: Context, output: BasicVector) -> None:
+        waiting = _memory(context).mode == status.WAITING
+        if waiting:
+            output.SetFromVector(np.array([status.WAITING, status.NONE], dtype=float))
+        else:
+            output.SetFromVector(np.array(self._flown(context)[1:], dtype=float))
+
+    def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
+        output[0] = float(_memory(context).mode != status.WAITING)
+
+    def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
+        output[0] = float(_memory(context).mode != status.WAITING and self._known(context))
+
+
+def _memory(context: Context) -> _Memory:
+    return _Memory(*np.asarray(context.get_discrete_state_vector().value()))
+
+
+def _begun(memory: _Memory, mode: int, reason: int, now: float) -> _Memory:
+    """What is remembered where another mode begins: no place is held yet."""
+    return memory._replace(mode=mode, reason=reason, since=now, x=math.nan, y=math.nan, z=math.nan)
