@@ -19,6 +19,7 @@ from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.message_log import recorded
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.open_lcm import open_lcm
+from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightReceiver
 
 
 def run(
@@ -104,7 +105,9 @@ def wait_for_messages(diagram: Diagram, patience: float) -> None:
         TimeoutError: if nothing comes for one; the message names its channel.
     """
     deadline = time.monotonic() + patience
-    subscribers = [s for s in diagram.GetSystems() if isinstance(s, MessageSubscriber)]
+    subscribers = [
+        s for s in diagram.GetSystems() if isinstance(s, MessageSubscriber | TimeOfFlightReceiver)
+    ]
     for subscriber in subscribers:
         while not subscriber.has_message():
             if time.monotonic() > deadline:

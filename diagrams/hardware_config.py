@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.open_lcm import DEFAULT_URL
+from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightStream
 
 
 @dataclass
@@ -23,6 +24,9 @@ class HardwareConfig:
     patience: float = 10.0
     # The body that motion capture must see; none where empty.
     body: str = ""
+    # The stream of the sensor of a policy that sees by time of flight; LCM's DEPTH_GRID where left
+    # out.
+    time_of_flight: TimeOfFlightStream | None = None
     # When the vehicle is taken from its policy, and what nobody may exceed.
     failsafe: FailsafeConfig = field(default_factory=FailsafeConfig)
 
@@ -36,3 +40,5 @@ class HardwareConfig:
                     f"{getattr(type(self), name)}"
                 )
         self.failsafe.validate()
+        if self.time_of_flight is not None:
+            self.time_of_flight.validate()

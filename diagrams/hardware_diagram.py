@@ -1,5 +1,6 @@
 """The pilot of the flight diagram behind messages: the vehicle is somewhere else."""
 
+import numpy as np
 from lcm import LCM
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
@@ -24,10 +25,12 @@ from splatpilot.systems.messaging.failsafe import Failsafe
 from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
+from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightReceiver
 from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity_setpoint import VelocitySetpoint
 from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.state_prediction import StatePredictor
 
 
@@ -46,11 +49,12 @@ def BuildHardwareDiagram(
     `run_in_real_time`.
 
     Systems, by name: those of `AddPilot`; `clock`; the subscribers `state_subscriber` and one
-    `{image}_subscriber` for each image that the policy sees; `state_predictor`, which brings the
-    state up to date; `velocity_setpoint`, `failsafe`, through which all goes that is sent to the
-    vehicle, `status`; where motion capture must see a body `motion_capture_pose_subscriber`; and
-    one `{port}_publisher` for each of `command`, `velocity_setpoint`, `status`, and `hypotheses`
-    where the policy has them.
+    `{image}_subscriber` for each image that the policy sees, or `depth_grid_receiver` for the
+    stream of a time-of-flight sensor; `state_predictor`, which brings the state up to date;
+    `velocity_setpoint`, `failsafe`, through which all goes that is sent to the vehicle, `status`;
+    where motion capture must see a body `motion_capture_pose_subscriber`; and one
+    `{port}_publisher` for each of `command`, `velocity_setpoint`, `status`, and `hypotheses` where
+    the policy has them. Until messages have come, states and images are arbitrary but finite.
 
     .. pydrake_system::
 
@@ -94,7 +98,8 @@ def BuildHardwareDiagram(
     builder.AddNamedSystem("clock", clock)
 
     def add_subscriber(codec: Codec) -> MessageSubscriber:
-        subscriber = MessageSubscriber(lcm, codec, config.tick)
+        initial = {"state": hover_state(np.zeros(3)), "depth_grid": np.zeros(codec.size)}
+        subscriber = MessageSubscriber(lcm, codec, config.tick, initial.get(codec.port))
         builder.AddNamedSystem(f"{codec.port}_subscriber", subscriber)
         builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
         return subscriber
@@ -109,7 +114,9 @@ def BuildHardwareDiagram(
         if enabled is not None:
             builder.Connect(enabled, publisher.enabled_input_port())
 
-    received = {"state": add_subscriber(StateCodec())}
+    received: dict[str, MessageSubscriber | TimeOfFlightReceiver] = {
+        "state": add_subscriber(StateCodec())
+    }
     predictor = StatePredictor()
     builder.AddNamedSystem("state_predictor", predictor)
     builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
@@ -117,7 +124,12 @@ def BuildHardwareDiagram(
     state = predictor.state_output_port()
     pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
     for codec in image_codecs(scenario, pilot.policy):
-        received[codec.port] = add_subscriber(codec)
+        if codec.port == "depth_grid" and config.time_of_flight is not None:
+            receiver = TimeOfFlightReceiver(config.time_of_flight, config.tick)
+            builder.AddNamedSystem("depth_grid_receiver", receiver)
+            received[codec.port] = receiver
+        else:
+            received[codec.port] = add_subscriber(codec)
     observed = {"state": state}
     observed |= {name: received[name].GetOutputPort(name) for name in list(received)[1:]}
     ConnectObservation(builder, observed, pilot.policy)

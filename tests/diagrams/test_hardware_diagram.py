@@ -2,6 +2,8 @@
 
 import dataclasses
 import gc
+import socket
+import struct
 import weakref
 
 import lcm
@@ -20,7 +22,14 @@ from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_trajectory_hypotheses
 from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET, MessagePublisher
+from splatpilot.systems.messaging.time_of_flight_receiver import (
+    TimeOfFlightReceiver,
+    TimeOfFlightStream,
+)
+from splatpilot.systems.messaging.udp_inbox import UdpConfig
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 TICK = HardwareConfig().tick
@@ -191,6 +200,43 @@ def test_a_body_that_motion_capture_lost_is_not_flown(post_world):
     see(np.full(7, np.nan), 1.2)
     why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.BODY_LOST]
     np.testing.assert_array_equal(halves.status()[:2], why)
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
+    """The grid that a policy gets is the vehicle's, by LCM, or, where one is named, that of a
+    stream by UDP, and nothing is flown before it has come; its velocities are the setpoints."""
+    policy = tmp_path / "weights.npz"
+    random = np.random.default_rng(0)
+    shapes = DIFFAERO_NETWORK.weight_shapes().items()
+    weights = {key: random.normal(scale=0.1, size=shape) for key, shape in shapes}
+    PolicyCheckpoint("diffaero_tof", DIFFAERO_NETWORK, weights, {}).save(policy)
+    stream = TimeOfFlightStream(UdpConfig(port=0)) if streamed else None
+    scenario = Scenario(policy=policy_named(str(policy)))
+    halves = Halves(scenario, post_world, config=HardwareConfig(time_of_flight=stream))
+    grid = halves.hardware.GetOutputPort("depth_grid")
+    if streamed:
+        halves.advance_to(0.1)
+        assert halves.status()[0] == lcmt_bridge_status.WAITING
+        receiver = halves.hardware.GetSubsystemByName("depth_grid_receiver")
+        assert isinstance(receiver, TimeOfFlightReceiver)
+        packet = struct.pack("<IIQ144f", 0x544F4632, 1, 1, *[0.25] * 144)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor:
+            sensor.sendto(packet, ("127.0.0.1", receiver.port))
+        halves.advance_to(0.3)
+        np.testing.assert_array_equal(grid.Eval(halves.root), np.full(144, 0.25))
+    else:
+        halves.advance_to(0.3)
+        sent = halves.vehicle.GetSubsystemByName("time_of_flight_grid")
+        expected = sent.get_output_port().Eval(sent.GetMyContextFromRoot(halves.vehicle_root))
+        np.testing.assert_allclose(grid.Eval(halves.root), expected, atol=0.02)
+        assert expected.max() > 0.1
+    assert halves.status()[0] == lcmt_bridge_status.FLYING
+    pilot = halves.hardware.GetSubsystemByName("policy")
+    wanted = pilot.GetOutputPort("velocity").Eval(pilot.GetMyContextFromRoot(halves.root))
+    setpoint = halves.hardware.GetOutputPort("velocity_setpoint").Eval(halves.root)
+    np.testing.assert_allclose(setpoint[:3], wanted, atol=1e-12)
+    assert np.linalg.norm(wanted) > 0.01
 
 
 def test_plans_travel(post_world):
