@@ -72,6 +72,15 @@ class UdpInbox:
         """Gives the port back."""
         self._socket.close()
 
+    def send(self, packet: bytes, address: tuple[str, int]) -> bool:
+        """Sends a packet from this port; returns whether it left, which it does not where there is
+        no way to the host."""
+        try:
+            self._socket.sendto(packet, address)
+        except OSError:
+            return False
+        return True
+
     def receive(self) -> Datagrams:
         """What has come, oldest first."""
         packets, strangers = [], 0
