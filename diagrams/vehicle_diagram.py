@@ -21,7 +21,7 @@ from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
-SILENCE = 0.5
+SILENCE = 0.3
 """[s] without commands after which the vehicle holds where it is."""
 
 
