@@ -76,7 +76,7 @@ def test_contents_are_spoilt_as_they_are_called():
 
 
 def test_kinds_take_turns_and_repeat():
-    """Every kind is tried as often as the others, and a trial's fault is a function of its number."""
+    """Every kind is tried as often as the others, and a trial's fault is that of its number."""
     draw = [Fault.draw(n, np.random.default_rng([0, n])) for n in range(2 * len(KINDS))]
     assert [fault.kind for fault in draw] == [*KINDS, *KINDS]
     assert draw[3] == Fault.draw(3, np.random.default_rng([0, 3])) != draw[3 + len(KINDS)]
@@ -87,17 +87,17 @@ def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
     one that was not, and its summary says how."""
     settings = ["world.length=12.0", "world.width=6.0", "start_radius=0.05"]
     sets = [word for setting in settings for word in ("--set", f"scenario.{setting}")]
-    words = ["faults", "--set", "trials=3", "--set", "worlds=1", *sets]
+    words = ["faults", "--set", "trials=2", "--set", "worlds=1", *sets]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0
     rows = (tmp_path / "whole" / "trials.jsonl").read_text().splitlines(keepends=True)
-    assert len(rows) == 3 and all(json.loads(row)["safe"] for row in rows)
+    assert len(rows) == 2 and all(json.loads(row)["safe"] for row in rows)
     again = tmp_path / "again"
     again.mkdir()
-    (again / "trials.jsonl").write_text("".join(rows[:2]))
+    (again / "trials.jsonl").write_text(rows[0])
     assert main([*words, "--out", str(again)]) == 0
     assert (again / "trials.jsonl").read_text() == "".join(rows)
     summary = json.loads((again / "summary.json").read_text())
-    assert (summary["trials"], summary["safe"]) == (3, 3)
+    assert (summary["trials"], summary["safe"]) == (2, 2)
     assert main([*words, "--set", "seed=1", "--out", str(again)]) == 1
 
 
