@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.open_lcm import DEFAULT_URL
 from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightStream
 

@@ -14,7 +14,8 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.messaging.codecs import Codec, CommandCodec, StateCodec
-from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
+from splatpilot.systems.messaging.failsafe import Failsafe
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.unix_clock import UnixClock

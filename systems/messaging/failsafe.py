@@ -1,12 +1,24 @@
 """Failsafe: what is flown where nobody can be trusted to say."""
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+import weakref
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
 
+from splatpilot.systems.messaging.failsafe_config import (
+    FailsafeConfig,
+    wrong_with_command,
+    wrong_with_state,
+)
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
 from splatpilot.systems.ports import input_port, output_port
@@ -16,7 +28,6 @@ from splatpilot.systems.vehicle.flatness_controller import (
 )
 from splatpilot.systems.vehicle.flight_limits import (
     LEVEL,
-    FlightLimits,
     limit_approach,
     limit_speed,
     limit_to_box,
@@ -27,35 +38,7 @@ from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 _STOPPED = 0.3  # [m/s], below which a place is held instead of braking.
 _HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
 _HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
-_SLACK = 1.01  # [-], by which a command may exceed what its controller is limited to.
-
-
-@dataclass
-class FailsafeConfig:
-    """When a vehicle is taken from its policy, and what happens then."""
-
-    # [s] Nothing is flown by a state, an observation or a sight by motion capture that is older.
-    max_age: float = 0.3
-    # [s] By which a process may be behind the wall clock.
-    max_lag: float = 0.3
-    # [s] That all must be well again until the policy flies on.
-    recovery: float = 0.5
-    # [s] Of hovering after which the vehicle lands.
-    patience: float = 5.0
-    # [m/s] Of landing.
-    descent: float = 0.5
-    limits: FlightLimits = field(default_factory=FlightLimits)
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("max_age", "max_lag", "recovery", "patience", "descent"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(
-                    f"failsafe.{name} is {value}; it must be positive and finite, as "
-                    f"{getattr(type(self), name)}"
-                )
-        self.limits.validate()
+_FAR = np.full(3, math.inf)
 
 
 class _Memory(NamedTuple):
@@ -168,6 +151,16 @@ class Failsafe(LeafSystem):
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
+        failsafe = weakref.proxy(self)  # See `EsdfCollision`.
+        flown = self.DeclareCacheEntry(
+            "velocity setpoint (4), mode and reason",
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make(object()),
+                calc=lambda context, value: value.set_value(failsafe._flown(context)),
+            ),
+            {self.all_sources_ticket()},
+        )
+        self._cache = flown.cache_index()
         self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc_velocity_setpoint)
         self.DeclareVectorOutputPort("command", 4, self._calc_command)
         self.DeclareVectorOutputPort("mode", 2, self._calc_mode)
@@ -202,26 +195,12 @@ class Failsafe(LeafSystem):
         lag = self._read(context, "lag")
         if lag is not None and lag[0] > config.max_lag:
             return status.OVERRUN
-        wanted = self._read(context, "velocity_setpoint")
+        setpoint = self._read(context, "velocity_setpoint")
         command = np.asarray(self._read(context, "command"))
-        heading_ok = wanted is None or not math.isinf(wanted[3])
-        if not (np.isfinite(command).all() and heading_ok) or (
-            wanted is not None and not np.isfinite(wanted[:3]).all()
-        ):
-            return status.NOT_FINITE
-        law = self._controller
-        most = np.array([law.max_tilt_rate, law.max_tilt_rate, law.max_yaw_rate])
-        if (
-            not 0.0 <= command[0] <= _SLACK * law.max_thrust
-            or (np.abs(command[1:]) > _SLACK * most).any()
-        ):
-            return status.OUT_OF_BOUNDS
-        w, x, y, z = state.q_WB
-        if w * w - x * x - y * y + z * z < math.cos(config.limits.max_tilt):
-            return status.TILTED
-        if wanted is not None and ((state.p_WB < self._lower) | (state.p_WB > self._upper)).any():
-            return status.OUTSIDE
-        return status.NONE
+        wrong = wrong_with_command(setpoint, command, self._controller)
+        # Who is told body rates alone is in charge of no place.
+        lower, upper = (self._lower, self._upper) if setpoint is not None else (-_FAR, _FAR)
+        return wrong or wrong_with_state(state, config.limits.max_tilt, lower, upper)
 
     def _mode(self, context: Context) -> tuple[int, int]:
         """Mode and reason at this instant."""
@@ -305,7 +284,7 @@ class Failsafe(LeafSystem):
             (clear, inside, status.LIMITED_GEOFENCE),
             (wanted, clear, status.LIMITED_CLEARANCE),
         ):
-            if not np.allclose(before, after, rtol=0.0, atol=1e-9):
+            if not np.array_equal(before, after):
                 return slow, reason
         return slow, status.NONE
 
@@ -319,11 +298,14 @@ class Failsafe(LeafSystem):
             return away, math.inf
         return away, float(clearance[0]) - self._config.limits.min_clearance
 
+    def _cached(self, context: Context) -> tuple[np.ndarray, int, int]:
+        return cast(Any, self.get_cache_entry(self._cache).Eval(context))
+
     def _calc_velocity_setpoint(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._flown(context)[0])
+        output.SetFromVector(self._cached(context)[0])
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        setpoint, mode, reason = self._flown(context)
+        setpoint, mode, reason = self._cached(context)
         if mode == status.FLYING and reason == status.NONE:
             output.SetFromVector(np.asarray(self._read(context, "command")))
             return
@@ -341,7 +323,7 @@ class Failsafe(LeafSystem):
         if waiting:
             output.SetFromVector(np.array([status.WAITING, status.NONE], dtype=float))
         else:
-            output.SetFromVector(np.array(self._flown(context)[1:], dtype=float))
+            output.SetFromVector(np.array(self._cached(context)[1:], dtype=float))
 
     def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
         output[0] = float(_memory(context).mode != status.WAITING)

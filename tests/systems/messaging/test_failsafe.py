@@ -7,7 +7,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
+from splatpilot.systems.messaging.failsafe import Failsafe
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.flight_limits import FlightLimits
