@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from splatpilot.systems.messaging.open_lcm import DEFAULT_URL
 from splatpilot.systems.messaging.udp_inbox import UdpConfig
+from splatpilot.systems.px4.motion_capture_receiver import MotionCaptureConfig
 from splatpilot.systems.px4.px4_commander import Px4CommanderConfig
 
 
@@ -27,6 +28,8 @@ class Px4Config:
     state_rate: float = 50.0
     # The body in motion capture whose pose is sent on to PX4; none where empty.
     body: str = ""
+    # OptiTrack's stream, which is sent on as that body; LCM's MOTION_CAPTURE_POSE where left out.
+    motion_capture: MotionCaptureConfig | None = None
     commander: Px4CommanderConfig = field(default_factory=Px4CommanderConfig)
 
     def validate(self) -> None:
@@ -43,3 +46,7 @@ class Px4Config:
                     f"{getattr(type(self), name)}"
                 )
         self.commander.validate()
+        if self.motion_capture is not None:
+            self.motion_capture.validate()
+            if not self.body:
+                raise ValueError("px4.motion_capture has no px4.body; name the body for the bridge")

@@ -18,6 +18,7 @@ from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.px4.mavlink import Mavlink
+from splatpilot.systems.px4.motion_capture_receiver import MotionCaptureReceiver
 from splatpilot.systems.px4.px4_commander import Px4Commander
 from splatpilot.systems.px4.px4_telemetry import Px4Telemetry
 from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
@@ -30,7 +31,7 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
 
     Systems, by name: `clock`, `telemetry`, `commander`, `state_publisher`, and the subscribers
     `setpoint_subscriber`, `status_subscriber` and, where there is motion capture,
-    `motion_capture_subscriber`.
+    `motion_capture_subscriber`, or `motion_capture_receiver` and `motion_capture_publisher`.
 
     .. pydrake_system::
 
@@ -91,7 +92,17 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
     ):
         builder.Connect(source, commander.GetInputPort(name))
     if config.body:
-        pose, age = add_subscriber("motion_capture", MotionCaptureCodec(config.body))
+        codec = MotionCaptureCodec(config.body)
+        if config.motion_capture is None:
+            pose, age = add_subscriber("motion_capture", codec)
+        else:
+            eye = MotionCaptureReceiver(config.motion_capture, config.tick)
+            builder.AddNamedSystem("motion_capture_receiver", eye)
+            pose, age = eye.motion_capture_pose_output_port(), eye.age_output_port()
+            sender = MessagePublisher(lcm, codec, 1 / config.state_rate)
+            builder.AddNamedSystem("motion_capture_publisher", sender)
+            builder.Connect(pose, sender.GetInputPort(codec.port))
+            builder.Connect(clock.get_output_port(), sender.unix_time_input_port())
         builder.Connect(pose, commander.motion_capture_pose_input_port())
         builder.Connect(age, commander.motion_capture_age_input_port())
 

@@ -17,12 +17,18 @@ class UdpConfig:
     host: str = "127.0.0.1"
     # Addresses of who may send; packets of others are dropped and counted.
     senders: list[str] = field(default_factory=lambda: ["127.0.0.1"])
+    # Multicast group that packets are sent to, of the network that `host` is in; none where empty.
+    group: str = ""
 
     def validate(self, name: str) -> None:
         """Raises ValueError on a value out of range, naming it as a field of `name`."""
         if not 0 <= self.port <= 65535:
             raise ValueError(f"{name}.port is {self.port}; it must be 0 to 65535")
-        for what, addresses in (("host", [self.host]), ("senders", self.senders)):
+        for what, addresses in (
+            ("host", [self.host]),
+            ("senders", self.senders),
+            ("group", [self.group] if self.group else []),
+        ):
             for address in addresses:
                 try:
                     socket.inet_aton(address)
@@ -30,6 +36,10 @@ class UdpConfig:
                     raise ValueError(
                         f"{name}.{what} is {address!r}; it must be an IPv4 address, as 127.0.0.1"
                     ) from None
+        if self.group and not 224 <= int(self.group.partition(".")[0]) <= 239:
+            raise ValueError(
+                f"{name}.group is {self.group!r}; it must be 224.0.0.0 to 239.255.255.255"
+            )
         if not self.senders:
             raise ValueError(f"{name}.senders is empty; name who may send")
 
@@ -55,7 +65,10 @@ class UdpInbox:
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         try:
-            self._socket.bind((config.host, config.port))
+            self._socket.bind((config.group or config.host, config.port))
+            if config.group:
+                membership = socket.inet_aton(config.group) + socket.inet_aton(config.host)
+                self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
         except OSError as error:
             self._socket.close()
             raise OSError(
