@@ -90,7 +90,8 @@ def AddObservation(
             builder.Connect(images[port], system.get_input_port())
             images[port] = system.get_output_port()
     if sees_grid:
-        grid = builder.AddNamedSystem("time_of_flight_grid", TimeOfFlightGrid(sensor_of(config)))
+        grid = TimeOfFlightGrid(sensor_of(config))
+        builder.AddNamedSystem("time_of_flight_grid", grid)
         builder.Connect(images["depth_image_32f"], grid.depth_image_32f_input_port())
         images["depth_grid"] = grid.depth_grid_output_port()
     return images

@@ -1,7 +1,7 @@
 """One flight in which something goes wrong."""
 
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from lcm import LCM
@@ -20,6 +20,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.messaging.codecs import CommandCodec, StateCodec
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
+from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 TICK = 0.01  # [s]
@@ -100,7 +101,7 @@ def fly_trial(scenario: Scenario, world: World, fault: Fault, seed: int) -> dict
             stalled += TICK
         else:
             simulators["bridge"].AdvanceTo(now - stalled + 2 * PUBLISH_OFFSET)
-            clock = bridge.GetSubsystemByName("clock")
+            clock = cast(UnixClock, bridge.GetSubsystemByName("clock"))
             bridge_root = simulators["bridge"].get_mutable_context()
             clock.set_epoch(clock.GetMyMutableContextFromRoot(bridge_root), stalled)
             mode, reason = np.asarray(bridge.GetOutputPort("status").Eval(bridge_root))[:2]

@@ -49,10 +49,10 @@ class BridgeStatus(LeafSystem):
         self.DeclareVectorInputPort("overruns", 1)
         self.DeclareVectorInputPort("mode", 2)
         self.DeclareVectorOutputPort("status", 7, self._calc_status)
-        images = {self.GetInputPort(f"{signal}_age").ticket() for signal in self._signals[1:]} or {
+        tickets = {self.GetInputPort(f"{signal}_age").ticket() for signal in self._signals[1:]} or {
             self.nothing_ticket()
         }
-        self.DeclareVectorOutputPort("observation_age", 1, self._calc_observation_age, images)
+        self.DeclareVectorOutputPort("observation_age", 1, self._calc_observation_age, tickets)
 
     def _read(self, context: Context, what: str) -> np.ndarray:
         ports = (self.GetInputPort(f"{signal}_{what}") for signal in self._signals)

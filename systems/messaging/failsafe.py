@@ -156,7 +156,7 @@ class Failsafe(LeafSystem):
             "velocity setpoint (4), mode and reason",
             ValueProducer(
                 allocate=lambda: AbstractValue.Make(object()),
-                calc=lambda context, value: value.set_value(failsafe._flown(context)),
+                calc=lambda context, value: failsafe._calc_flown(context, value),
             ),
             {self.all_sources_ticket()},
         )
@@ -297,6 +297,9 @@ class Failsafe(LeafSystem):
         if landing and away[2] > LEVEL:
             return away, math.inf
         return away, float(clearance[0]) - self._config.limits.min_clearance
+
+    def _calc_flown(self, context: Context, value: Any) -> None:
+        value.set_value(self._flown(context))
 
     def _cached(self, context: Context) -> tuple[np.ndarray, int, int]:
         return cast(Any, self.get_cache_entry(self._cache).Eval(context))

@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from pydrake.common.value import Value
@@ -75,7 +75,7 @@ class Px4Telemetry(LeafSystem):
         super().__init__()
         self._inbox, self._mavlink = inbox, mavlink
         self.DeclareAbstractState(Value(_Said()))
-        outputs: dict[str, tuple[int, Callable[[_Said, float], object]]] = {
+        outputs: dict[str, tuple[int, Callable[[_Said, float], Any]]] = {
             "state": (13, lambda said, now: _state(said)),
             "age": (1, lambda said, now: now - min(said.placed, said.turned)),
             "is_fresh": (1, lambda said, now: now - min(said.placed, said.turned) <= max_age),
@@ -109,7 +109,7 @@ class Px4Telemetry(LeafSystem):
         state.get_mutable_abstract_state(0).set_value(said)
 
 
-def _calc(value: Callable[[_Said, float], object]) -> Callable[[Context, BasicVector], None]:
+def _calc(value: Callable[[_Said, float], Any]) -> Callable[[Context, BasicVector], None]:
     def calc(context: Context, output: BasicVector) -> None:
         output.SetFromVector(np.atleast_1d(value(_said(context), context.get_time())).astype(float))
 

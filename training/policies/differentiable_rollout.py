@@ -1,6 +1,5 @@
 """Rollouts of many vehicles whose loss is differentiated through the dynamics of flight."""
 
-import itertools
 import math
 from dataclasses import dataclass, field
 from functools import partial
@@ -137,12 +136,11 @@ class DifferentiableRollout:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """The inverse of `state_dict`."""
-        saved = iter(state["episodes"])
-        groups = (
-            kind(*itertools.islice(saved, len(kind._fields)))
-            for kind in (PointMass, PointMass, Frames)
-        )
-        self.episodes = Episodes(*groups, *saved)
+        saved, count = state["episodes"], len(PointMass._fields)
+        vehicle, past = PointMass(*saved[:count]), PointMass(*saved[count : 2 * count])
+        others = saved[2 * count :]
+        frames = Frames(*others[: len(Frames._fields)])
+        self.episodes = Episodes(vehicle, past, frames, *others[len(Frames._fields) :])
         self.generator.set_state(state["generator"])
 
     def _uniform(self, *size: int) -> Tensor:

@@ -11,6 +11,7 @@ from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.delayed_vehicle import (
+    Frames,
     delayed,
     draw_frames,
     frame_ages,
@@ -150,9 +151,8 @@ def evaluate_agent(
         if ended.any():
             keep = (~ended).nonzero()[:, 0]
             flying, memory = flying[keep], memory[keep]
-            vehicle, past, frames = (
-                type(of)(*(x[keep] for x in of)) for of in (vehicle, past, frames)
-            )
+            vehicle, past = (type(vehicle)(*(x[keep] for x in of)) for of in (vehicle, past))
+            frames = Frames(*(x[keep] for x in frames))
             continue
         past = remember(past, vehicle)
         then = delayed(past, frame_ages(frames, noise, time[flying]), agent.rate)

@@ -14,7 +14,7 @@ PX4 = dialect.MAVLink(None, 1, 1)
 
 def received(packet: bytes):
     """The one message in a packet."""
-    (message,) = dialect.MAVLink(None).parse_buffer(packet)
+    (message,) = dialect.MAVLink(None).parse_buffer(packet) or []
     assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
     return message
 

@@ -1,6 +1,7 @@
 """What PX4 is told, and what it is not asked for."""
 
 import socket
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,13 +36,13 @@ class Told:
     def advance(self, duration: float) -> list:
         """What is sent meanwhile, heartbeats left out."""
         self.simulator.AdvanceTo(self.simulator.get_context().get_time() + duration)
-        messages = []
+        messages: list[Any] = []
         while True:
             try:
                 packet = self.px4.recv(4096)
             except BlockingIOError:
                 break
-            messages += dialect.MAVLink(None).parse_buffer(packet)
+            messages += dialect.MAVLink(None).parse_buffer(packet) or []
         return [message for message in messages if message.get_type() != "HEARTBEAT"]
 
     def close(self) -> None:
