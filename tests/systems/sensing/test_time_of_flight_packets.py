@@ -81,7 +81,7 @@ CHUNK = frame_packets(np.ones((240, 180)), 1, 200, 172800)[0]
         (GOOD, "no newer"),
         (grid_packet(np.full((9, 16), np.nan), 2, 200), "no proximities"),
         (grid_packet(np.full((9, 16), 1.1), 2, 200), "no proximities"),
-        (CHUNK[:30], "more than 32"),
+        (CHUNK[:28], "has 28 bytes; it must have more than 28"),
         (CHUNK[:12] + b"\x05\x00" + CHUNK[14:], "chunk 5 of 1"),
         (CHUNK[:-4], "has 172796 bytes; it must have 172800"),
         (CHUNK + b"1234", "more than its 180x240 pixels"),
