@@ -2,7 +2,7 @@
 
 import math
 import weakref
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -19,6 +19,7 @@ from splatpilot.systems.messaging.failsafe_config import (
     wrong_with_command,
     wrong_with_state,
 )
+from splatpilot.systems.messaging.failsafe_modes import Memory
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
 from splatpilot.systems.ports import input_port, output_port
@@ -35,26 +36,10 @@ from splatpilot.systems.vehicle.flight_limits import (
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
-_STOPPED = 0.3  # [m/s], below which a place is held instead of braking.
+_MOVING = 0.3  # [m/s], from which on a position that stands still is none.
 _HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
 _HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
 _FAR = np.full(3, math.inf)
-
-
-class _Memory(NamedTuple):
-    """The discrete state."""
-
-    mode: float = status.WAITING
-    reason: float = status.NONE
-    since: float = 0.0  # [s], when the mode began.
-    well: float = math.nan  # [s], since when all has been well.
-    x: float = math.nan  # [m], the place that is held, NaN while there is none.
-    y: float = math.nan
-    z: float = math.nan
-    seen_x: float = math.nan  # [m], the position that was measured last,
-    seen_y: float = math.nan
-    seen_z: float = math.nan
-    moved: float = 0.0  # [s], and when it was another.
 
 
 class Failsafe(LeafSystem):
@@ -150,7 +135,7 @@ class Failsafe(LeafSystem):
             *(("clearance", 1), ("gradient", 3)),
         ):
             self.DeclareVectorInputPort(name, size)
-        self.DeclareDiscreteState(np.array(_Memory()))
+        self.DeclareDiscreteState(np.array(Memory()))
         failsafe = weakref.proxy(self)  # See `EsdfCollision`.
         flown = self.DeclareCacheEntry(
             "velocity setpoint (4), mode and reason",
@@ -190,7 +175,7 @@ class Failsafe(LeafSystem):
                 return reason
         state = QuadrotorState.of(np.asarray(self._read(context, "state")))
         frozen = context.get_time() - memory.moved > config.max_age
-        if frozen and np.linalg.norm(state.v_WB) > _STOPPED:
+        if frozen and np.linalg.norm(state.v_WB) > _MOVING:
             return status.STATE_FROZEN
         lag = self._read(context, "lag")
         if lag is not None and lag[0] > config.max_lag:
@@ -214,31 +199,17 @@ class Failsafe(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now, memory = context.get_time(), _memory(context)
         measured = self._read(context, "measured_state")
-        if measured is not None:
-            seen = tuple(measured[:3])
-            if seen != (memory.seen_x, memory.seen_y, memory.seen_z):
-                x, y, z = seen
-                memory = memory._replace(seen_x=x, seen_y=y, seen_z=z, moved=now)
-        else:
+        if measured is None:
             memory = memory._replace(moved=now)
-        mode, waits = memory.mode, any(map(math.isinf, self._ages(context).values()))
-        wrong = status.NONE if waits and mode == status.WAITING else self._wrong(context)
-        well = math.nan if wrong or waits else (now if math.isnan(memory.well) else memory.well)
-        memory = memory._replace(well=well)
-        held_long = now - memory.since > self._config.patience
-        if mode == status.WAITING and not waits:
-            memory = _begun(memory, status.FLYING, status.NONE, now)
-        elif mode == status.FLYING and wrong:
-            memory = _begun(memory, status.HOLDING, wrong, now)
-        elif mode == status.HOLDING and now - well >= self._config.recovery:
-            memory = _begun(memory, status.FLYING, status.NONE, now)
-        elif mode == status.HOLDING and held_long:
-            memory = memory._replace(mode=status.LANDING, since=now)
-        known = self._known(context)
-        if memory.mode != status.FLYING and known and math.isnan(memory.x):
+        else:
+            memory = memory.seeing(measured[:3], now)
+        waits = any(map(math.isinf, self._ages(context).values()))
+        idle = waits and memory.mode == status.WAITING
+        wrong = status.NONE if idle else self._wrong(context)
+        memory = memory.after(wrong, waits, now, self._config)
+        if self._known(context):
             p_WB, v_WB, _, _ = QuadrotorState.of(np.asarray(self._read(context, "state")))
-            if np.linalg.norm(v_WB) < _STOPPED:
-                memory = memory._replace(x=p_WB[0], y=p_WB[1], z=p_WB[2])
+            memory = memory.holding(p_WB, v_WB)
         discrete_state.set_value(np.array(memory))
 
     def _known(self, context: Context) -> bool:
@@ -259,10 +230,8 @@ class Failsafe(LeafSystem):
                 return np.full(4, math.nan), mode, reason
             limited, limit = self._limited(context, setpoint[:3], state, landing=False)
             return np.append(limited, setpoint[3]), mode, limit
-        memory = _memory(context)
-        place = np.array([memory.x, memory.y, memory.z])
-        back = np.zeros(3)
-        if np.isfinite(place).all():
+        back, place = np.zeros(3), _memory(context).place()
+        if place is not None:
             back = limit_speed(_HOLDING_GAIN * (place - state.p_WB), _HOLDING_SPEED)
         if landing:
             back[2] = -self._config.descent
@@ -335,10 +304,5 @@ class Failsafe(LeafSystem):
         output[0] = float(_memory(context).mode != status.WAITING and self._known(context))
 
 
-def _memory(context: Context) -> _Memory:
-    return _Memory(*np.asarray(context.get_discrete_state_vector().value()))
-
-
-def _begun(memory: _Memory, mode: int, reason: int, now: float) -> _Memory:
-    """What is remembered where another mode begins: no place is held yet."""
-    return memory._replace(mode=mode, reason=reason, since=now, x=math.nan, y=math.nan, z=math.nan)
+def _memory(context: Context) -> Memory:
+    return Memory(*np.asarray(context.get_discrete_state_vector().value()))
