@@ -141,6 +141,7 @@ def BuildHardwareDiagram(
         scenario.vehicle,
         world.distance_field.lower_W,
         world.distance_field.upper_W,
+        world.distance_field,
     )
     builder.AddNamedSystem("status", status)
     builder.AddNamedSystem("failsafe", failsafe)

@@ -22,8 +22,8 @@ from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
-SILENCE = 0.3
-"""[s] without commands after which the vehicle holds where it is."""
+SILENCE = 0.1
+"""[s] without commands after which the vehicle holds where it is, until they come again."""
 
 
 def BuildVehicleDiagram(
@@ -72,7 +72,7 @@ def BuildVehicleDiagram(
     clock, plant, pose = UnixClock(), QuadrotorPlant(scenario.vehicle), StateToPose()
     field = world.distance_field
     failsafe = Failsafe(
-        FailsafeConfig(max_age=SILENCE),
+        FailsafeConfig(max_age=SILENCE, recovery=config.tick),
         scenario.controller,
         scenario.vehicle,
         field.lower_W,

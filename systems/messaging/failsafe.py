@@ -14,6 +14,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.messaging.failsafe_config import (
     FailsafeConfig,
     wrong_with_command,
@@ -29,17 +30,19 @@ from splatpilot.systems.vehicle.flatness_controller import (
 )
 from splatpilot.systems.vehicle.flight_limits import (
     LEVEL,
+    limit_ahead,
     limit_approach,
     limit_speed,
     limit_to_box,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 _MOVING = 0.3  # [m/s], from which on a position that stands still is none.
 _HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
 _HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
 _FAR = np.full(3, math.inf)
+_PREDICTABLE = 0.1  # [s], how old states can be brought up to date for body rates.
 
 
 class Failsafe(LeafSystem):
@@ -78,8 +81,9 @@ class Failsafe(LeafSystem):
     - ``clearance`` (1) [m], ``gradient`` (3), optional: from the hull to the nearest obstacle that
       is known, and the direction away from it; NaN and 0 where nothing is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
-    - ``state_is_known`` (1): whether the state can be flown by; body rates need that. Velocity
-      setpoints do not: while the state is unknown they are those to stop, or to descend.
+    - ``state_is_known`` (1): whether body rates can be flown by the state, which must be no older
+      than 0.1 s for that. Velocity setpoints need not: while the state is unknown they are those
+      to stop, or to descend.
     - ``in_charge`` (1): 0 while the mode is WAITING, else 1.
 
     What is wrong is wrong at once, in what goes out; modes change every ``period`` from time 0.
@@ -111,6 +115,7 @@ class Failsafe(LeafSystem):
         vehicle: QuadrotorParams,
         lower_W: np.ndarray,
         upper_W: np.ndarray,
+        field: Distances | None = None,
     ):
         """Constructs the system.
 
@@ -121,11 +126,14 @@ class Failsafe(LeafSystem):
             lower_W, upper_W: (3,) [m] corners of the box in which it stays, unless `config.limits`
                 has one.
 
+            field: what is known of the world, for what lies ahead.
+
         Raises:
             ValueError: on a configuration out of range.
         """
         super().__init__()
         config.validate()
+        self._field = field
         self._config, self._controller, self._vehicle = config, controller, vehicle
         fence = config.limits.geofence or (lower_W, upper_W)
         self._lower, self._upper = (np.asarray(corner, dtype=float) for corner in fence)
@@ -241,21 +249,28 @@ class Failsafe(LeafSystem):
     def _limited(
         self, context: Context, wanted: np.ndarray, state: QuadrotorState, landing: bool
     ) -> tuple[np.ndarray, int]:
-        """The velocity (3,) within limits, and the reason for what was changed last."""
+        """The velocity (3,) within limits, and the reason for what was changed."""
         limits = self._config.limits
+        slow = limit_speed(wanted, limits.max_speed)
         away, room = self._room(context, landing)
-        clear = limit_approach(wanted, away, room, limits.deceleration)
-        lower = self._lower - [0.0, 0.0, math.inf if landing else 0.0]
-        inside = limit_to_box(clear, state.p_WB, lower, self._upper, limits.deceleration)
-        slow = limit_speed(inside, limits.max_speed)
+        clear = limit_approach(slow, away, room, limits.deceleration)
+        lower, upper = self._lower + VEHICLE_RADIUS, self._upper - VEHICLE_RADIUS
+        if landing:
+            lower[2] = -math.inf
+        inside = limit_to_box(clear, state.p_WB, lower, upper, limits.deceleration)
+        flown = inside
+        # Last, because what leads along a fence or an obstacle may lead into another.
+        if self._field is not None and not landing:
+            flown = limit_ahead(inside, state.p_WB, self._field, limits)
         for before, after, reason in (
-            (inside, slow, status.LIMITED_SPEED),
+            (inside, flown, status.LIMITED_CLEARANCE),
             (clear, inside, status.LIMITED_GEOFENCE),
-            (wanted, clear, status.LIMITED_CLEARANCE),
+            (slow, clear, status.LIMITED_CLEARANCE),
+            (wanted, slow, status.LIMITED_SPEED),
         ):
             if not np.array_equal(before, after):
-                return slow, reason
-        return slow, status.NONE
+                return flown, reason
+        return flown, status.NONE
 
     def _room(self, context: Context, landing: bool) -> tuple[np.ndarray, float]:
         """The direction (3,) away from the nearest obstacle, and the room towards it [m]."""
@@ -301,7 +316,9 @@ class Failsafe(LeafSystem):
         output[0] = float(_memory(context).mode != status.WAITING)
 
     def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
-        output[0] = float(_memory(context).mode != status.WAITING and self._known(context))
+        is_recent = self._ages(context)[status.STATE_OLD] <= _PREDICTABLE
+        in_charge = _memory(context).mode != status.WAITING
+        output[0] = float(in_charge and is_recent and self._known(context))
 
 
 def _memory(context: Context) -> Memory:

@@ -5,11 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatpilot.systems.collision.distance_field import Distances
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
 REACTION_TIME = 0.6
 """[s] that passes before a vehicle brakes that was told to: its answer to velocities."""
 
 LEVEL = 0.7
 """[-] z of the normal of surfaces that can be landed on, at least."""
+
+
+_SLOW = 0.1  # [m/s], below which nothing lies ahead.
+_STEP = 0.1  # [m], at least, between places that are looked at.
 
 
 @dataclass
@@ -20,11 +27,11 @@ class FlightLimits:
     max_speed: float = 6.0
     # [rad] Greatest angle between body z and vertical.
     max_tilt: float = 1.0
-    # [m/s^2] With which the vehicle can brake in time.
-    deceleration: float = 5.0
+    # [m/s^2] With which the vehicle can brake in time, along each axis at once.
+    deceleration: float = 3.0
     # [m] Between the vehicle's hull and what is known of the world.
     min_clearance: float = 0.1
-    # [m] Corners of the box in which the vehicle stays, the lower one first; the world's where left
+    # [m] Corners of the box in which the hull stays, the lower one first; the world's where left
     # out.
     geofence: list[list[float]] | None = None
 
@@ -65,6 +72,28 @@ def limit_approach(
     fastest = math.sqrt(reaction**2 + 2.0 * deceleration * max(room, 0.0)) - reaction
     fastest += min(room, 0.0) / REACTION_TIME
     return velocity + away * max(0.0, -float(velocity.dot(away)) - fastest)
+
+
+def limit_ahead(
+    velocity: np.ndarray, p: np.ndarray, field: Distances, limits: FlightLimits
+) -> np.ndarray:
+    """The velocity (3,) [m/s], shortened so that a vehicle at p (3,) [m] can stop before the first
+    place on its way that is too near to what the field knows."""
+    speed = float(np.linalg.norm(velocity))
+    if speed < _SLOW:
+        return velocity
+    way = velocity / speed
+    reach = speed * REACTION_TIME + speed**2 / (2.0 * limits.deceleration)
+    here = float(field.distance(p)) - VEHICLE_RADIUS
+    least = min(limits.min_clearance, here)  # Who is too near may leave.
+    ahead, clearance = 0.0, here
+    # Beyond what is known, where distances are NaN, nothing is known to be in the way.
+    while ahead < reach and clearance >= least:
+        ahead += max(clearance - least, _STEP)
+        clearance = float(field.distance(p + ahead * way)) - VEHICLE_RADIUS
+    if ahead < reach and clearance < least:
+        return limit_approach(velocity, -way, ahead, limits.deceleration)
+    return velocity
 
 
 def limit_to_box(

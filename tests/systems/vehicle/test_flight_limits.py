@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.shapes import Box, Sphere
 from splatpilot.systems.vehicle.flight_limits import (
     REACTION_TIME,
     FlightLimits,
+    limit_ahead,
     limit_approach,
     limit_speed,
     limit_to_box,
 )
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 
 @pytest.mark.parametrize("room", [0.01, 0.3, 1.0, 4.0])
@@ -44,6 +49,26 @@ def test_box_is_not_left():
     for _ in range(400):
         p = p + 0.02 * limit_to_box(np.array([3.0, 0.0, -3.0]), p, lower, upper, 5.0)
     np.testing.assert_allclose(p, [4.0, 0.0, 0.0], atol=0.01)
+
+
+def test_nothing_ahead_is_run_into_that_is_not_the_nearest():
+    """Beside a wall the way along it is limited by the post ahead: to what can stop before it, not
+    by the wall, which is nearer; where the way is free it is as wanted, and who is too near may
+    leave."""
+    wall = Box(RigidTransform([0.0, 2.0, 0.0]), [100.0, 2.0, 9.0])  # from y = 1 on
+    post = Sphere([4.0, 0.0, 0.0], 0.5)
+    field = AnalyticDistanceField([wall, post], np.full(3, -50.0), np.full(3, 50.0))
+    limits, v = FlightLimits(), np.array([5.0, 0.0, 0.0])
+    room = 4.0 - 0.5 - VEHICLE_RADIUS - limits.min_clearance
+    left = limit_ahead(v, np.zeros(3), field, limits)[0]
+    reach = left * REACTION_TIME + left**2 / (2 * limits.deceleration)
+    assert reach == pytest.approx(room, abs=0.11)
+    np.testing.assert_array_equal(limit_ahead(-v, np.zeros(3), field, limits), -v)
+    slow = np.array([1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(limit_ahead(slow, np.zeros(3), field, limits), slow)
+    near = np.array([4.0 - 0.5 - VEHICLE_RADIUS - 0.05, 0.0, 0.0])
+    assert 0.0 <= limit_ahead(v, near, field, limits)[0] < 0.2
+    np.testing.assert_array_equal(limit_ahead(-v, near, field, limits), -v)
 
 
 def test_speed_is_shortened():
