@@ -8,16 +8,18 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 
-from splatpilot.diagrams.flight import flight_outcome
+from splatpilot.diagrams.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.real_time import run_in_real_time
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.message_log import recorded
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.open_lcm import open_lcm
+from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightReceiver
 
 
 def run(
@@ -26,9 +28,10 @@ def run(
     """
     Waits for a vehicle's messages and flies it to the scenario's goal.
 
-    Commands stop at the goal, after the scenario's timeout, where the world's map says that the
-    vehicle has collided or left it, and as long as state or images are older than allowed. It is
-    over when they are so for `config.patience`.
+    It is over at the goal, after the scenario's timeout, where the world's map says that the
+    vehicle has collided or left it, and when it has landed, or state or images were older than
+    allowed for `config.patience` (see `Failsafe` for what happens meanwhile). The vehicle then
+    hears no more, upon which autopilots hold.
 
     Args:
         scenario: who flies, and where to.
@@ -58,7 +61,9 @@ def run(
 
         def over(now: float) -> bool:
             status = np.asarray(diagram.GetOutputPort("status").Eval(root))
-            if status[1:3].max() <= config.max_age:
+            if status[0] == lcmt_bridge_status.LANDING and has_landed(diagram, root):
+                outcome = Outcome.LANDED
+            elif status[2:4].max() <= config.failsafe.max_age:
                 ended["fresh"] = now
                 outcome = flight_outcome(diagram, root, p_WG, scenario.goal_radius)
             else:
@@ -76,7 +81,7 @@ def run(
             over,
             ready=lambda: wait_for_messages(diagram, config.patience),
         )
-    gaps, rejected, overruns = np.asarray(diagram.GetOutputPort("status").Eval(root))[3:]
+    gaps, rejected, overruns = np.asarray(diagram.GetOutputPort("status").Eval(root))[4:]
     summary = {
         "outcome": ended["outcome"],
         "flight_time_s": ended["time"],
@@ -100,7 +105,9 @@ def wait_for_messages(diagram: Diagram, patience: float) -> None:
         TimeoutError: if nothing comes for one; the message names its channel.
     """
     deadline = time.monotonic() + patience
-    subscribers = [s for s in diagram.GetSystems() if isinstance(s, MessageSubscriber)]
+    subscribers = [
+        s for s in diagram.GetSystems() if isinstance(s, MessageSubscriber | TimeOfFlightReceiver)
+    ]
     for subscriber in subscribers:
         while not subscriber.has_message():
             if time.monotonic() > deadline:

@@ -18,8 +18,12 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.vehicle.flight_limits import LEVEL
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+
+_TOUCH = 0.03  # [m], of clearance, from which on the vehicle stands,
+_TOUCHDOWN_SPEED = 0.8  # [m/s], if it is slower than that.
 
 
 class Outcome(enum.StrEnum):
@@ -29,6 +33,7 @@ class Outcome(enum.StrEnum):
     COLLISION = "collision"
     LEFT_VOLUME = "left_volume"
     TIMEOUT = "timeout"
+    LANDED = "landed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +194,16 @@ def flight_outcome(
     if np.linalg.norm(p_WG - p_WB) <= goal_radius:
         return Outcome.GOAL
     return None
+
+
+def has_landed(diagram: Diagram, context: Context) -> bool:
+    """Whether the vehicle touches something level, slowly."""
+    v_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).v_WB
+    return bool(
+        _evaluated(diagram, "clearance", context)[0] < _TOUCH
+        and _evaluated(diagram, "gradient", context)[2] > LEVEL
+        and np.linalg.norm(v_WB) < _TOUCHDOWN_SPEED
+    )
 
 
 def record_flight(

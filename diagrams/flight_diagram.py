@@ -40,7 +40,8 @@ def BuildFlightDiagram(
 
     Systems, by name: `plant`, `pose`, `collision`, `goal`, `policy`, `controller`, and the loggers
     `state_log`, `command_log`; with a camera `camera`; with a policy that sees `policy_camera`,
-    with one that returns hypotheses `selector` and `hypotheses_log`; the sensors under their names;
+    with one that returns hypotheses `selector` and `hypotheses_log`, with one that returns
+    velocities `velocity_tracker`; the sensors under their names;
     with Meshcat also `flight_visualizer` and `camera_visualizer`, with video `video`.
 
     .. pydrake_system::
@@ -54,6 +55,7 @@ def BuildFlightDiagram(
         - depth_image_32f
         - depth_image_16u
         - clearance
+        - gradient
         - in_collision
         - field_state
 
@@ -67,10 +69,10 @@ def BuildFlightDiagram(
         video: records the camera's images at its rate, for `VideoRecorder.save` to write.
         camera: whether the scenario's camera is there; Meshcat and videos need it, flights do not.
         policy: flies instead of the scenario's. Any system with one of the outputs `hypotheses`
-            (see `splatpilot.systems.policies.hypotheses`), `acceleration` (3) and `waypoint` (3),
-            and perhaps `heading` (1), where to look. Its inputs are any of `state` (13), `goal`
-            (3), `depth_image_32f` and `color_image` of a camera of its own (its attribute `camera`,
-            an `OnboardCamera`), and the outputs of sensors.
+            (see `splatpilot.systems.policies.hypotheses`), `acceleration`, `velocity` and
+            `waypoint` (3 each), and perhaps `heading` (1), where to look. Its inputs are any of
+            `state` (13), `goal` (3), `depth_image_32f`, `color_image` and `depth_grid` of a camera
+            of its own (its attribute `camera`, an `OnboardCamera`), and the outputs of sensors.
         plant: flies instead of `QuadrotorPlant`: any system with the input `command` (4), the
             output `state` (13), and that state as its continuous state.
         controller: flies instead of `FlatnessController`: any system with the input `state`, that

@@ -1,9 +1,11 @@
 """How vehicle and policy talk."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.open_lcm import DEFAULT_URL
+from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightStream
 
 
 @dataclass
@@ -18,16 +20,25 @@ class HardwareConfig:
     state_rate: float = 50.0
     # [Hz] Of the bridge's status.
     status_rate: float = 5.0
-    # [s] Nothing is commanded by a state or an image that is older.
-    max_age: float = 0.3
     # [s] Without a message after which bridge and vehicle give up.
     patience: float = 10.0
+    # The body that motion capture must see; none where empty.
+    body: str = ""
+    # The stream of the sensor of a policy that sees by time of flight; LCM's DEPTH_GRID where left
+    # out.
+    time_of_flight: TimeOfFlightStream | None = None
+    # When the vehicle is taken from its policy, and what nobody may exceed.
+    failsafe: FailsafeConfig = field(default_factory=FailsafeConfig)
 
     def validate(self) -> None:
-        """Raises ValueError on a value that is not positive and finite, naming it."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "url" and not 0.0 < value < math.inf:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("tick", "state_rate", "status_rate", "patience"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
                 raise ValueError(
-                    f"{field.name} is {value}; it must be positive and finite, as {field.default}"
+                    f"{name} is {value}; it must be positive and finite, as "
+                    f"{getattr(type(self), name)}"
                 )
+        self.failsafe.validate()
+        if self.time_of_flight is not None:
+            self.time_of_flight.validate()

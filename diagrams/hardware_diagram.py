@@ -1,5 +1,6 @@
 """The pilot of the flight diagram behind messages: the vehicle is somewhere else."""
 
+import numpy as np
 from lcm import LCM
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
@@ -13,17 +14,23 @@ from splatpilot.systems.messaging.bridge_status import BridgeStatus
 from splatpilot.systems.messaging.codecs import (
     Codec,
     CommandCodec,
+    DepthGridCodec,
     HypothesesCodec,
+    MotionCaptureCodec,
     StateCodec,
     StatusCodec,
     VelocitySetpointCodec,
 )
-from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec, ImageCodec
+from splatpilot.systems.messaging.failsafe import Failsafe
+from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
+from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightReceiver
 from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity_setpoint import VelocitySetpoint
+from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.state_prediction import StatePredictor
 
 
@@ -42,15 +49,19 @@ def BuildHardwareDiagram(
     `run_in_real_time`.
 
     Systems, by name: those of `AddPilot`; `clock`; the subscribers `state_subscriber` and one
-    `{image}_subscriber` for each image that the policy sees; `state_predictor`, which brings the
-    state up to date; `velocity_setpoint`, `status`; and one `{port}_publisher` for each of
-    `command`, `velocity_setpoint`, `status`, and `hypotheses` where the policy has them.
+    `{image}_subscriber` for each image that the policy sees, or `depth_grid_receiver` for the
+    stream of a time-of-flight sensor; `state_predictor`, which brings the state up to date;
+    `velocity_setpoint`, `failsafe`, through which all goes that is sent to the vehicle, `status`;
+    where motion capture must see a body `motion_capture_pose_subscriber`; and one
+    `{port}_publisher` for each of `command`, `velocity_setpoint`, `status`, and `hypotheses` where
+    the policy has them. Until messages have come, states and images are arbitrary but finite.
 
     .. pydrake_system::
 
         name: hardware
         input_ports:
         - overruns
+        - lag
         output_ports:
         - state
         - command
@@ -58,19 +69,21 @@ def BuildHardwareDiagram(
         - color_image
         - depth_image_32f
         - clearance
+        - gradient
         - in_collision
         - field_state
         - velocity_setpoint
         - status
 
     The ports are those of `BuildFlightDiagram`, the images those that the policy sees; `status` and
-    `overruns` are those of `BridgeStatus`, `velocity_setpoint` that of `VelocitySetpoint`.
+    `overruns` are those of `BridgeStatus`, `command`, `velocity_setpoint` and `lag` those of
+    `Failsafe`.
 
     Args:
         scenario: who flies, and where to. Its vehicle is what is known of the one that flies.
         world: what is flown in, as far as that is known.
         lcm: where messages travel.
-        config: how often, and how old they may be.
+        config: how often, how old they may be, and within what limits.
         policy, controller: see `BuildFlightDiagram`.
 
     Raises:
@@ -85,7 +98,8 @@ def BuildHardwareDiagram(
     builder.AddNamedSystem("clock", clock)
 
     def add_subscriber(codec: Codec) -> MessageSubscriber:
-        subscriber = MessageSubscriber(lcm, codec, config.tick)
+        initial = {"state": hover_state(np.zeros(3)), "depth_grid": np.zeros(codec.size)}
+        subscriber = MessageSubscriber(lcm, codec, config.tick, initial.get(codec.port))
         builder.AddNamedSystem(f"{codec.port}_subscriber", subscriber)
         builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
         return subscriber
@@ -100,32 +114,65 @@ def BuildHardwareDiagram(
         if enabled is not None:
             builder.Connect(enabled, publisher.enabled_input_port())
 
-    received = {"state": add_subscriber(StateCodec())}
+    received: dict[str, MessageSubscriber | TimeOfFlightReceiver] = {
+        "state": add_subscriber(StateCodec())
+    }
     predictor = StatePredictor()
     builder.AddNamedSystem("state_predictor", predictor)
     builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
     builder.Connect(received["state"].age_output_port(), predictor.age_input_port())
     state = predictor.state_output_port()
-    pilot = AddPilot(builder, scenario, world, state, policy, controller)
+    pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
     for codec in image_codecs(scenario, pilot.policy):
-        received[codec.port] = add_subscriber(codec)
+        if codec.port == "depth_grid" and config.time_of_flight is not None:
+            receiver = TimeOfFlightReceiver(config.time_of_flight, config.tick)
+            builder.AddNamedSystem("depth_grid_receiver", receiver)
+            received[codec.port] = receiver
+        else:
+            received[codec.port] = add_subscriber(codec)
     observed = {"state": state}
     observed |= {name: received[name].GetOutputPort(name) for name in list(received)[1:]}
     ConnectObservation(builder, observed, pilot.policy)
 
-    status = BridgeStatus(list(received)[1:], config.max_age)
+    status = BridgeStatus(list(received)[1:])
+    failsafe = Failsafe(
+        config.failsafe,
+        scenario.controller,
+        scenario.vehicle,
+        world.distance_field.lower_W,
+        world.distance_field.upper_W,
+        world.distance_field,
+    )
     builder.AddNamedSystem("status", status)
+    builder.AddNamedSystem("failsafe", failsafe)
     for signal, subscriber in received.items():
         for what in ("age", "gaps", "rejected"):
             port = status.GetInputPort(f"{signal}_{what}")
             builder.Connect(subscriber.GetOutputPort(what), port)
     builder.ExportInput(status.overruns_input_port(), "overruns")
+    builder.ExportInput(failsafe.lag_input_port(), "lag")
 
-    setpoint = _AddVelocitySetpoint(builder, scenario, state, pilot).velocity_setpoint_output_port()
-    command, enabled = pilot.controller.GetOutputPort("command"), status.enabled_output_port()
-    period = decision_period(scenario, pilot.controller)
-    add_publisher(CommandCodec(), command, period, enabled)
-    add_publisher(VelocitySetpointCodec(), setpoint, period, enabled)
+    wanted = _AddVelocitySetpoint(builder, scenario, state, pilot).velocity_setpoint_output_port()
+    collision = builder.GetSubsystemByName("collision")
+    for source, name in (
+        (state, "state"),
+        (received["state"].GetOutputPort("state"), "measured_state"),
+        (received["state"].age_output_port(), "state_age"),
+        (status.observation_age_output_port(), "observation_age"),
+        (wanted, "velocity_setpoint"),
+        (pilot.controller.GetOutputPort("command"), "command"),
+        (collision.GetOutputPort("clearance"), "clearance"),
+        (collision.GetOutputPort("gradient"), "gradient"),
+    ):
+        builder.Connect(source, failsafe.GetInputPort(name))
+    if config.body:
+        body = add_subscriber(MotionCaptureCodec(config.body))
+        builder.Connect(body.age_output_port(), failsafe.body_age_input_port())
+    builder.Connect(failsafe.mode_output_port(), status.mode_input_port())
+    command, setpoint = failsafe.command_output_port(), failsafe.velocity_setpoint_output_port()
+    known, period = failsafe.state_is_known_output_port(), scenario.controller.period
+    add_publisher(CommandCodec(), command, period, known)
+    add_publisher(VelocitySetpointCodec(), setpoint, period, failsafe.in_charge_output_port())
     add_publisher(StatusCodec(), status.status_output_port(), 1 / config.status_rate)
     if pilot.policy.HasOutputPort("hypotheses"):
         plans = pilot.policy.GetOutputPort("hypotheses")
@@ -134,6 +181,7 @@ def BuildHardwareDiagram(
 
     for name, port in observed.items():
         builder.ExportOutput(port, name)
+    builder.ExportOutput(command, "command")
     builder.ExportOutput(setpoint, "velocity_setpoint")
     builder.ExportOutput(status.status_output_port(), "status")
     diagram = builder.Build()
@@ -141,13 +189,16 @@ def BuildHardwareDiagram(
     return diagram
 
 
-def image_codecs(scenario: Scenario, policy: System) -> list[ImageCodec]:
+def image_codecs(scenario: Scenario, policy: System) -> list[Codec]:
     """How the images travel that a policy sees."""
     camera = camera_of(scenario, policy)
-    size = camera.width, camera.height
+    size, sensor = (camera.width, camera.height), sensor_of(camera)
     codecs = {
         "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), "policy_camera"),
         "color_image": ColorImageCodec(ImageRgba8U(*size), "policy_camera"),
+        "depth_grid": DepthGridCodec(
+            sensor.columns, sensor.rows, sensor.max_range, "policy_camera"
+        ),
     }
     return [codecs[name] for name in images_of(policy)]
 

@@ -8,11 +8,15 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.sensing.color_noise import ColorNoise
 from splatpilot.systems.sensing.delayed_pose import DelayedPose
 from splatpilot.systems.sensing.depth_noise import DepthNoise
+from splatpilot.systems.sensing.frame_times import FrameTimes
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.sensing.time_of_flight_grid import TimeOfFlightGrid
 
 _TAKEN = {
-    *("plant", "pose", "collision", "goal", "policy", "controller", "selector", "camera", "video"),
-    *("policy_camera", "delayed_pose", "depth_noise", "color_noise"),
+    *("plant", "pose", "collision", "goal", "policy", "controller", "camera", "video"),
+    *("selector", "velocity_tracker"),
+    *("policy_camera", "delayed_pose", "depth_noise", "color_noise", "time_of_flight_grid"),
     *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
     *("state_log", "command_log", "hypotheses_log"),
 }
@@ -34,7 +38,8 @@ def sensors_of(scenario: Scenario, policy: System | None = None) -> dict[str, Se
 
 def images_of(policy: System) -> list[str]:
     """The names of the images that a policy has inputs for."""
-    return [name for name in ("depth_image_32f", "color_image") if policy.HasInputPort(name)]
+    names = ("depth_image_32f", "color_image", "depth_grid")
+    return [name for name in names if policy.HasInputPort(name)]
 
 
 def camera_of(scenario: Scenario, policy: System) -> OnboardCamera:
@@ -55,7 +60,8 @@ def AddObservation(
     Adds the camera of a policy that sees, as `policy_camera`.
 
     It renders when the policy looks. Where the scenario asks for them, `delayed_pose` makes its
-    images late, and `depth_noise` or `color_noise` noisy.
+    images late, and `depth_noise` or `color_noise` noisy; `time_of_flight_grid` makes grids of
+    them.
 
     Returns:
         The images that the policy has inputs for, by their names.
@@ -65,12 +71,15 @@ def AddObservation(
         return {}
     config, noise = camera_of(scenario, policy), scenario.observation
     camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, noise.latency))
-    if noise.latency > 0.0:
-        delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(noise.latency))
+    if noise.is_late:
+        frames = FrameTimes.draw(noise, scenario.seed)
+        delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(frames))
         builder.Connect(state, delayed.GetInputPort("state"))
         pose = delayed.GetOutputPort("pose")
     builder.Connect(pose, camera.GetInputPort("body_pose"))
-    images = {name: camera.GetOutputPort(name) for name in names}
+    sees_grid = "depth_grid" in names
+    taken = {"depth_image_32f" if name == "depth_grid" else name for name in names}
+    images = {name: camera.GetOutputPort(name) for name in sorted(taken)}
     for port, name, kind, active in (
         ("depth_image_32f", "depth_noise", DepthNoise, noise.changes_depth),
         ("color_image", "color_noise", ColorNoise, noise.changes_color),
@@ -80,6 +89,11 @@ def AddObservation(
             builder.AddNamedSystem(name, system)
             builder.Connect(images[port], system.get_input_port())
             images[port] = system.get_output_port()
+    if sees_grid:
+        grid = TimeOfFlightGrid(sensor_of(config))
+        builder.AddNamedSystem("time_of_flight_grid", grid)
+        builder.Connect(images["depth_image_32f"], grid.depth_image_32f_input_port())
+        images["depth_grid"] = grid.depth_grid_output_port()
     return images
 
 

@@ -10,8 +10,10 @@ from splatpilot.diagrams.policies import POLICIES
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
+from splatpilot.systems.messaging.finite_vector import FiniteVector
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
+from splatpilot.systems.policies.velocity_tracker import VelocityTracker
 from splatpilot.systems.vehicle.flatness_controller import FlatnessController
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
@@ -24,7 +26,7 @@ class Pilot(NamedTuple):
     pose: OutputPort
     """X_WB."""
     decision: OutputPort
-    """What the controller does: the port `waypoint` or `acceleration`."""
+    """What is flown: the port `waypoint`, `acceleration` or `velocity`."""
 
 
 def make_policy(scenario: Scenario, world: World) -> System:
@@ -43,15 +45,21 @@ def AddPilot(
     state: OutputPort,
     policy: System | None = None,
     controller: System | None = None,
+    *,
+    guarded: bool = False,
 ) -> Pilot:
     """
     Adds the systems `pose`, `collision`, `goal`, `policy`, `controller` and, of a policy that
-    returns hypotheses, `selector`; exports `command`, `hypotheses` where there are any,
-    `clearance`, `in_collision` and `field_state`. `ConnectObservation` is left to do.
+    returns hypotheses, `selector`, or of one that returns velocities, `velocity_tracker`; exports
+    `command`, `hypotheses` where there are any, `clearance`, `gradient`, `in_collision` and
+    `field_state`.
+    `ConnectObservation` is left to do.
 
     Args:
         state: (13) of the vehicle.
         policy, controller: see `BuildFlightDiagram`.
+        guarded: whether a failsafe follows: the controller is given zeros, by `finite_decision`,
+            instead of decisions that are no numbers, and its command is not exported.
 
     Raises:
         ValueError: for a configuration that no policy has, and a system without the ports it needs.
@@ -69,12 +77,12 @@ def AddPilot(
 
     builder.Connect(state, pose.state_input_port())
     builder.Connect(state, collision.state_input_port())
-    decision = _ConnectDecision(builder, scenario, state, policy, controller)
+    decision = _ConnectDecision(builder, scenario, state, policy, controller, guarded)
     builder.Connect(state, controller.GetInputPort("state"))
 
     exported = {
-        controller: ["command"],
-        collision: ["clearance", "in_collision", "field_state"],
+        controller: [] if guarded else ["command"],
+        collision: ["clearance", "gradient", "in_collision", "field_state"],
         policy: ["hypotheses"] if policy.HasOutputPort("hypotheses") else [],
     }
     for system, names in exported.items():
@@ -121,8 +129,9 @@ def _ConnectDecision(
     state: OutputPort,
     policy: System,
     controller: System,
+    guarded: bool,
 ) -> OutputPort:
-    """Leads what the policy decides to the controller's port of that kind, and returns it."""
+    """Leads what the policy decides to the controller, and returns it."""
     if policy.HasOutputPort("hypotheses"):
         hypotheses = policy.GetOutputPort("hypotheses")
         count = num_hypotheses_in(hypotheses.size())
@@ -132,16 +141,31 @@ def _ConnectDecision(
         builder.Connect(state, selector.state_input_port())
         decision = selector.waypoint_output_port()
     else:
-        kind = "acceleration" if policy.HasOutputPort("acceleration") else "waypoint"
-        if not policy.HasOutputPort(kind):
+        kinds = [
+            kind for kind in ("acceleration", "velocity", "waypoint") if policy.HasOutputPort(kind)
+        ]
+        if not kinds:
             raise ValueError(
                 f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
-                "acceleration and waypoint; give it one"
+                "acceleration, velocity and waypoint; give it one"
             )
-        decision = policy.GetOutputPort(kind)
+        decision = policy.GetOutputPort(kinds[0])
+    flown = decision
+    if guarded:
+        finite = FiniteVector(decision.size())
+        builder.AddNamedSystem("finite_decision", finite)
+        builder.Connect(decision, finite.signal_input_port())
+        flown = finite.finite_output_port()
     kind = decision.get_name()
+    if decision.get_name() == "velocity":
+        tracker = VelocityTracker()
+        builder.AddNamedSystem("velocity_tracker", tracker)
+        builder.Connect(state, tracker.state_input_port())
+        builder.Connect(flown, tracker.velocity_input_port())
+        flown = tracker.acceleration_output_port()
+        kind = "acceleration"
     require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
-    builder.Connect(decision, controller.GetInputPort(kind))
+    builder.Connect(flown, controller.GetInputPort(kind))
     if policy.HasOutputPort("heading"):
         builder.Connect(policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
     return decision

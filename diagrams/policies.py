@@ -10,6 +10,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from splatpilot.systems.policies.diffaero_tof import DiffAeroTof, DiffAeroTofConfig
 from splatpilot.systems.policies.policy_checkpoint import policy_of
 from splatpilot.systems.policies.privileged_planner import (
     PrivilegedPlanner,
@@ -103,7 +104,13 @@ register_policy(
 )
 
 BENCHMARK_POLICIES = tuple(POLICIES.registered())
-"""Those that a study flies when nobody says which: our own, whatever else is installed."""
+"""Those that a study flies when nobody says which: our own, whatever else is installed, but for
+those that see by a sensor of their own."""
+
+
+register_policy(
+    DiffAeroTofConfig, lambda config, world, vehicle: DiffAeroTof(config), name="diffaero_tof"
+)
 
 
 def policy_named(name: str, speed: float = 2.0) -> Any:

@@ -27,9 +27,10 @@ def run_in_real_time(
     time on the wall clock.
 
     A tick that ends after the next should have begun is an overrun; the input `overruns` of the
-    diagram, where it has one, counts them. The next tick is then as long as it takes to catch up,
-    and nothing that happens in it is left out. What it is behind by more than `MAX_LAG` is never
-    caught up with: the diagram's time passes more slowly for once, and its `UnixClock` says so.
+    diagram, where it has one, counts them, and the input `lag` is by how much [s]. The next tick is
+    then as long as it takes to catch up, and nothing that happens in it is left out. What it is
+    behind by more than `MAX_LAG` is never caught up with: the diagram's time passes more slowly for
+    once, and its `UnixClock` says so.
 
     The first tick, at time 0, may take as long as it likes.
 
@@ -51,7 +52,7 @@ def run_in_real_time(
     simulator.AdvanceTo(2 * PUBLISH_OFFSET)
     ready()
     # The wall clock is not read again: when it is set, messages do not seem to be older.
-    epoch, started, number, overruns = time.time(), time.monotonic(), 0, 0
+    epoch, started, number, overruns, told = time.time(), time.monotonic(), 0, 0, 0.0
     clock.set_epoch(clock_context, epoch)
     while True:
         # What happens at a tick is sent just after it.
@@ -60,12 +61,15 @@ def run_in_real_time(
             return overruns
         number += 1
         late = time.monotonic() - (started + number * tick)
+        overruns += late > 0.0
+        lag = max(late, 0.0)
+        for name, value in (("overruns", float(overruns)), ("lag", lag)):
+            if lag != told and diagram.HasInputPort(name):
+                diagram.GetInputPort(name).FixValue(root, np.array([value]))
+        told = lag
         if late <= 0.0:
             time.sleep(-late)
             continue
-        overruns += 1
-        if diagram.HasInputPort("overruns"):
-            diagram.GetInputPort("overruns").FixValue(root, np.array([float(overruns)]))
         if late > MAX_LAG:
             started += late - MAX_LAG
             epoch += late - MAX_LAG

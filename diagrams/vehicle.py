@@ -13,6 +13,7 @@ from splatpilot.diagrams.flight import (
     Flight,
     Outcome,
     flight_outcome,
+    has_landed,
     record_flight,
     sample_initial_state,
 )
@@ -29,7 +30,8 @@ from splatpilot.systems.messaging.open_lcm import open_lcm
 
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
     """
-    Hovers at the scenario's start until commands come, flies by them until the flight ends, and
+    Hovers at the scenario's start until commands come, flies by them until the flight ends, hovers
+    and then lands where they cease, and
     leaves in `out` what `splatpilot fly` does, but for page and video: `trajectory.npz`,
     `summary.json`, `scenario.yaml`. Time is counted from the first command.
 
@@ -60,6 +62,11 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     p_WG = goal_of(scenario, world)
     took_off = math.inf
 
+    def how_it_ended() -> Outcome | None:
+        if has_landed(diagram, root):
+            return Outcome.LANDED
+        return flight_outcome(diagram, root, p_WG, scenario.goal_radius)
+
     def over(now: float) -> bool:
         nonlocal took_off
         if math.isinf(np.asarray(diagram.GetOutputPort("command_age").Eval(root))[0]):
@@ -70,15 +77,14 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
                 )
             return False
         took_off = min(took_off, now)
-        ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius)
-        return ended is not None or now - took_off >= scenario.timeout
+        return how_it_ended() is not None or now - took_off >= scenario.timeout
 
     print(f"Hovering at {config.url} until commands come...", flush=True)
     started = time.monotonic()
     overruns = run_in_real_time(simulator, diagram, config.tick, over)
     wall_time = time.monotonic() - started
     diagram.ForcedPublish(root)  # Who flies is to know the last state too.
-    outcome = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
+    outcome = how_it_ended() or Outcome.TIMEOUT
     flight = _since(took_off, record_flight(diagram, root, world, outcome, wall_time))
     summary = flight.summary() | {"overruns": overruns}
     with written_atomically(out / "trajectory.npz") as path:

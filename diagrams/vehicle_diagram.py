@@ -3,7 +3,7 @@
 import numpy as np
 from lcm import LCM
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import LogVectorOutput
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, ZeroOrderHold
 
 from splatpilot.diagrams.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.hardware_config import HardwareConfig
@@ -14,11 +14,16 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.messaging.codecs import Codec, CommandCodec, StateCodec
+from splatpilot.systems.messaging.failsafe import Failsafe
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
+
+SILENCE = 0.1
+"""[s] without commands after which the vehicle holds where it is, until they come again."""
 
 
 def BuildVehicleDiagram(
@@ -29,8 +34,9 @@ def BuildVehicleDiagram(
     says its state and, to policies that see, what its camera sees.
 
     Systems, by name: `clock`, `plant`, `pose`, `collision`, those of `AddObservation`,
-    `command_subscriber`, `state_publisher` and one `{image}_publisher` for each image that the
-    scenario's policy sees, and the loggers `state_log`, `command_log`.
+    `command_subscriber`, `failsafe`, which hovers and then lands where commands cease, as
+    autopilots do, `held_command`, `state_publisher` and one `{image}_publisher` for each image that
+    the scenario's policy sees, and the loggers `state_log`, `command_log`.
 
     .. pydrake_system::
 
@@ -40,11 +46,12 @@ def BuildVehicleDiagram(
         - command
         - command_age
         - clearance
+        - gradient
         - in_collision
         - field_state
 
-    The ports are those of `BuildFlightDiagram`; `command` is the thrust that carries the weight
-    until one has come, and `command_age` [s] is infinite until then.
+    The ports are those of `BuildFlightDiagram`; `command_age` [s] is infinite until a command has
+    come.
 
     Args:
         scenario: the vehicle, what its policy sees, and how well.
@@ -63,18 +70,35 @@ def BuildVehicleDiagram(
     hover = np.array([scenario.vehicle.gravity, 0.0, 0.0, 0.0])
     subscriber = MessageSubscriber(lcm, CommandCodec(), config.tick, initial=hover)
     clock, plant, pose = UnixClock(), QuadrotorPlant(scenario.vehicle), StateToPose()
-    collision = EsdfCollision(world.distance_field)
+    field = world.distance_field
+    failsafe = Failsafe(
+        FailsafeConfig(max_age=SILENCE, recovery=config.tick),
+        scenario.controller,
+        scenario.vehicle,
+        field.lower_W,
+        field.upper_W,
+    )
+    held, no_age = ZeroOrderHold(config.tick, 4), ConstantVectorSource(np.zeros(1))
+    collision = EsdfCollision(field)
     for name, system in (
         ("clock", clock),
         ("plant", plant),
         ("pose", pose),
         ("collision", collision),
         ("command_subscriber", subscriber),
+        ("failsafe", failsafe),
+        ("held_command", held),
+        ("no_age", no_age),
     ):
         builder.AddNamedSystem(name, system)
 
-    state, command = plant.GetOutputPort("state"), subscriber.GetOutputPort("command")
+    state, command = plant.GetOutputPort("state"), held.get_output_port()
     builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
+    builder.Connect(subscriber.GetOutputPort("command"), failsafe.command_input_port())
+    builder.Connect(subscriber.age_output_port(), failsafe.observation_age_input_port())
+    builder.Connect(state, failsafe.state_input_port())
+    builder.Connect(no_age.get_output_port(), failsafe.state_age_input_port())
+    builder.Connect(failsafe.command_output_port(), held.get_input_port())
     builder.Connect(command, plant.GetInputPort("command"))
     builder.Connect(state, pose.state_input_port())
     builder.Connect(state, collision.state_input_port())
@@ -95,7 +119,7 @@ def BuildVehicleDiagram(
         LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
     builder.ExportOutput(subscriber.age_output_port(), "command_age")
-    for name in ("clearance", "in_collision", "field_state"):
+    for name in ("clearance", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
     diagram = builder.Build()
     diagram.set_name("vehicle")

@@ -11,6 +11,7 @@ from splatpilot.analysis.commands import (
     capture,
     corpus,
     difficulty,
+    faults,
     fidelity,
     fly,
     hardware,
@@ -26,6 +27,7 @@ from splatpilot.analysis.commands import (
 COMMANDS = (
     fly,
     hardware,
+    faults,
     benchmark,
     merge,
     replay,

@@ -221,22 +221,22 @@ class DepthGridCodec(Codec):
 
 
 class StatusCodec(Codec):
-    """The status (6): mode, ages of state and observation [s], gaps, rejected, overruns."""
+    """The status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
 
-    channel, port, message, size = "BRIDGE_STATUS", "status", lcmt_bridge_status, 6
+    channel, port, message, size = "BRIDGE_STATUS", "status", lcmt_bridge_status, 7
     frame = ""
 
     def pack(self, value, header, epoch):
         message = self.stamped(header)
-        message.mode = int(value[0])
-        message.state_age, message.observation_age = value[1:3]
-        message.num_gaps, message.num_rejected, message.num_overruns = map(int, value[3:])
+        message.mode, message.reason = map(int, value[:2])
+        message.state_age, message.observation_age = value[2:4]
+        message.num_gaps, message.num_rejected, message.num_overruns = map(int, value[4:])
         return message
 
     def unpack(self, message, epoch):
         ages = message.state_age, message.observation_age
         counts = message.num_gaps, message.num_rejected, message.num_overruns
-        return np.array([message.mode, *ages, *counts], dtype=float)
+        return np.array([message.mode, message.reason, *ages, *counts], dtype=float)
 
 
 def finite(values: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.policies.observation import (
-    limit_acceleration,
+    limit_smoothly,
     pool_depth,
     target_velocity,
 )
@@ -82,7 +82,7 @@ def decide(
     v_target = target_velocity(X_WB.translation(), p_WG, speed)
     state = np.concatenate([v_WB @ R_WS, q_SB, v_target @ R_WS, [speed]])
     output, memory = network.step(image, state, memory)
-    a_WB = R_WS @ limit_acceleration(output[:3], ACCELERATION_LIMITS)
+    a_WB = R_WS @ limit_smoothly(output[:3], ACCELERATION_LIMITS)
     to_goal = atan2(v_target[1], v_target[0])
     heading = to_goal + np.pi * np.tanh(float(output[3]) / np.pi)
     return Decision(a_WB, heading, memory)

@@ -7,7 +7,7 @@ from splatpilot.systems.policies.observation import (
     heading_frame,
     heading_observation,
     inverse_depth,
-    limit_acceleration,
+    limit_smoothly,
     pool_depth,
 )
 from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
@@ -55,4 +55,4 @@ def decide(
     image = inverse_depth(nearest, NEAREST, FARTHEST)
     state = heading_observation(R_WB, X_WB.translation(), v_WB, p_WG, speed)
     output, memory = network.step(image, state, memory)
-    return heading_frame(R_WB) @ limit_acceleration(output, ACCELERATION_LIMITS), memory
+    return heading_frame(R_WB) @ limit_smoothly(output, ACCELERATION_LIMITS), memory

@@ -62,6 +62,6 @@ def heading_observation(
     return (rows @ R_WH).ravel()
 
 
-def limit_acceleration(output: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """A network's output (3,) as an acceleration [m/s^2] within +-limits (3,), smoothly."""
+def limit_smoothly(output: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """A network's output (N,) within +-limits (N,), smoothly."""
     return limits * np.tanh(output / limits)

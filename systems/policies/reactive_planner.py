@@ -142,8 +142,8 @@ def is_seen(p_CQ: np.ndarray, depth: np.ndarray, camera: OnboardCamera) -> np.nd
     So it does inside the image and before its depth (H, W) [m].
     """
     z = np.maximum(p_CQ[..., 2], 1e-6)
-    u = camera.focal_length * p_CQ[..., 0] / z + 0.5 * camera.width
-    v = camera.focal_length * p_CQ[..., 1] / z + 0.5 * camera.height
+    u = camera.focal_x * p_CQ[..., 0] / z + 0.5 * camera.width
+    v = camera.focal_y * p_CQ[..., 1] / z + 0.5 * camera.height
     inside = (p_CQ[..., 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     row = np.where(inside, v, 0).astype(np.intp)
     column = np.where(inside, u, 0).astype(np.intp)

@@ -20,22 +20,26 @@ class VelocitySetpoint(LeafSystem):
         - state
         - waypoint
         - acceleration
+        - velocity
         - heading
         output_ports:
         - velocity_setpoint
 
     - ``state`` (13), ``waypoint`` (3), ``acceleration`` (3), ``heading`` (1): those of
-      :class:`~splatpilot.systems.vehicle.flatness_controller.FlatnessController`; connect exactly
-      one of ``waypoint`` and ``acceleration``.
+      :class:`~splatpilot.systems.vehicle.flatness_controller.FlatnessController`.
+    - ``velocity`` (3): v [m/s], W frame. Connect exactly one of ``waypoint``, ``acceleration`` and
+      ``velocity``.
     - ``velocity_setpoint`` (4): v [m/s], W frame, and the heading [rad], NaN where it is free.
 
-    Stateless. With T the time in which an autopilot takes a velocity up, and that to the waypoint::
+    Stateless. Of the others, with T the time in which an autopilot takes a velocity up, and that to
+    the waypoint::
 
         v = v_WB + T a_WB,  T = RESPONSE_TIME
         v = (p_WR - p_WB) / lookahead
     """
 
     state_input_port = input_port("state")
+    velocity_input_port = input_port("velocity")
     waypoint_input_port = input_port("waypoint")
     acceleration_input_port = input_port("acceleration")
     heading_input_port = input_port("heading")
@@ -48,13 +52,17 @@ class VelocitySetpoint(LeafSystem):
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorInputPort("waypoint", 3)
         self.DeclareVectorInputPort("acceleration", 3)
+        self.DeclareVectorInputPort("velocity", 3)
         self.DeclareVectorInputPort("heading", 1)
         self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
         waypoint, heading = self.GetInputPort("waypoint"), self.GetInputPort("heading")
-        if waypoint.HasValue(context):
+        wanted = self.GetInputPort("velocity")
+        if wanted.HasValue(context):
+            velocity = np.asarray(wanted.Eval(context))
+        elif waypoint.HasValue(context):
             velocity = (np.asarray(waypoint.Eval(context)) - state.p_WB) / self._lookahead
         else:
             a_WB = np.asarray(self.GetInputPort("acceleration").Eval(context))

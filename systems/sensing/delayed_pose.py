@@ -8,12 +8,13 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.sensing.frame_times import FrameTimes
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.systems.weakly import weakly
 
 
 class DelayedPose(LeafSystem):
-    """The pose within a quadrotor's state, a fixed time ago.
+    """The pose within a quadrotor's state when the last frame was taken that has come.
 
     .. pydrake_system::
 
@@ -24,8 +25,8 @@ class DelayedPose(LeafSystem):
         - pose
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``pose`` (abstract, RigidTransform): X_WB at ``now - latency``; before there is anything that
-      old, the earliest known.
+    - ``pose`` (abstract, RigidTransform): X_WB at ``now - age``, the age that of the last frame;
+      before there is anything that old, the earliest known.
 
     The discrete state holds samples of time and state every ``period`` (0.02 s); between them
     the state is interpolated linearly, and its quaternion normalised.
@@ -34,24 +35,24 @@ class DelayedPose(LeafSystem):
     state_input_port = input_port("state")
     pose_output_port = output_port("pose")
 
-    def __init__(self, latency: float, period: float = 0.02) -> None:
+    def __init__(self, frames: FrameTimes, period: float = 0.02) -> None:
         """Constructs the system.
 
         Args:
-            latency: age of the pose [s].
+            frames: when they are taken, and when they come.
             period: time between samples [s].
 
         Raises:
-            ValueError: if `latency` is negative or not finite, or `period` not positive.
+            ValueError: if a delay of frames is negative, or `period` not positive.
         """
         super().__init__()
-        if not (0.0 <= latency < math.inf and period > 0.0):
+        if not (frames.delays.min() >= 0.0 and math.isfinite(frames.oldest) and period > 0.0):
             raise ValueError(
-                f"DelayedPose: latency is {latency} s and period {period} s; they must be at least "
-                "0 and more than 0"
+                f"DelayedPose: frames come {frames.delays.min()} s late and the period is "
+                f"{period} s; they must be at least 0 and finite, and more than 0"
             )
-        self._latency = latency
-        samples = math.ceil(latency / period) + 1
+        self._frames = frames
+        samples = math.ceil(frames.oldest / period) + 1
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self.DeclareDiscreteState(np.full(samples * 14, np.nan))
         calc = weakly(self._calc_pose)
@@ -70,6 +71,6 @@ class DelayedPose(LeafSystem):
     def _calc_pose(self, context, output) -> None:
         rows = self._samples(context)
         rows = rows[np.isfinite(rows[:, 0])]
-        then = context.get_time() - self._latency
+        then = context.get_time() - self._frames.age(context.get_time())
         state = np.array([np.interp(then, rows[:, 0], column) for column in rows[:, 1:].T])
         output.set_value(pose_from_state(state))

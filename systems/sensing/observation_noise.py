@@ -6,7 +6,7 @@ noise; training repeats the formula for depth in torch (`training/policies/obser
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -29,23 +29,53 @@ class ObservationNoise:
     color_noise: float = 0.0
     # [-] Largest change in brightness of a whole image; uniform up to it, up and down.
     brightness_jitter: float = 0.0
-    # [s] Age of the images that the policy sees; its state is up to date.
+    # [s] How old images are when they come; the policy's state is up to date.
     latency: float = 0.0
+    # [Hz] Range that a flight's rate of images is drawn from; where left out, an image is taken
+    # whenever the policy looks. What follows is of images with a rate, see `frame_times.py`.
+    frame_rate: list[float] = field(default_factory=list)
+    # [s] How much later than the latency an image may come; uniform up to it.
+    jitter: float = 0.0
+    # [-] Probability of an image never to come.
+    frame_dropout: float = 0.0
 
     def validate(self, name: str = "observation") -> None:
         """Raises ValueError on a value out of range, naming it as a field of `name`, its limit and
         the remedy."""
-        limits = {"depth_additive": math.inf, "latency": _LARGEST_LATENCY}
-        for field in fields(self):
-            value, limit = getattr(self, field.name), limits.get(field.name, 1.0)
+        limits = {
+            "depth_additive": math.inf,
+            "latency": _LARGEST_LATENCY,
+            "jitter": _LARGEST_LATENCY,
+        }
+        for number in fields(self):
+            if number.name == "frame_rate":
+                continue
+            value, limit = getattr(self, number.name), limits.get(number.name, 1.0)
             if not (0.0 <= value <= limit and value < math.inf):
                 most = f" and at most {limit:g}" if limit < math.inf else " and finite"
-                raise ValueError(f"{name}.{field.name} is {value}; it must be at least 0{most}")
+                raise ValueError(f"{name}.{number.name} is {value}; it must be at least 0{most}")
+        rates = self.frame_rate
+        if rates and not (len(rates) == 2 and 0.1 <= rates[0] <= rates[1] <= 1000.0):
+            raise ValueError(
+                f"{name}.frame_rate is {rates}; it must be two numbers of 0.1 to 1000 Hz, the "
+                "lesser first, or nothing"
+            )
+        for of_frames in ("jitter", "frame_dropout"):
+            if not rates and getattr(self, of_frames) > 0.0:
+                raise ValueError(
+                    f"{name}.{of_frames} is {getattr(self, of_frames)}, but images without a rate "
+                    f"have none; give {name}.frame_rate too, as [10, 30]"
+                )
 
     @property
     def changes_depth(self) -> bool:
         """Whether depth images are touched."""
         return max(self.depth_multiplicative, self.depth_additive, self.depth_dropout) > 0.0
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the policy sees other images than those of the moment."""
+        return self.latency > 0.0 or bool(self.frame_rate)
 
     @property
     def changes_color(self) -> bool:

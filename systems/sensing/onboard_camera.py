@@ -15,13 +15,15 @@ _R_BC_LEVEL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 
 
 @dataclass
 class OnboardCamera:
-    """A pinhole camera with square pixels and its mount; it takes images when its policy looks."""
+    """A pinhole camera and its mount; it takes images when its policy looks."""
 
     # [px]
     width: int = 64
     height: int = 36
     # [deg] Horizontal field of view.
     fov_x: float = 90.0
+    # [deg] Vertical field of view; that of square pixels where left out.
+    fov_y: float | None = None
     # [m] Range of its depth images.
     min_depth: float = 0.1
     max_depth: float = 20.0
@@ -35,7 +37,9 @@ class OnboardCamera:
         for name in ("width", "height"):
             value = getattr(self, name)
             _check(name, value, 1 <= value <= _LARGEST, f"1 to {_LARGEST} pixels")
-        _check("fov_x", self.fov_x, 1.0 <= self.fov_x <= 170.0, "1 to 170 deg")
+        for name in ("fov_x", "fov_y"):
+            value = getattr(self, name)
+            _check(name, value, value is None or 1.0 <= value <= 170.0, "1 to 170 deg")
         _check("min_depth", self.min_depth, self.min_depth >= 0.0, "at least 0 m")
         farther = self.min_depth < self.max_depth < math.inf
         _check("max_depth", self.max_depth, farther, "more than min_depth, and finite")
@@ -44,17 +48,22 @@ class OnboardCamera:
         _check("pitch", self.pitch, -90.0 <= self.pitch <= 90.0, "-90 to 90 deg")
 
     @property
-    def focal_length(self) -> float:
-        """[px], of both axes."""
-        return 0.5 * self.width / math.tan(math.radians(0.5 * self.fov_x))
+    def focal_x(self) -> float:
+        """[px]"""
+        return focal_length(self.width, self.fov_x)
+
+    @property
+    def focal_y(self) -> float:
+        """[px]"""
+        return self.focal_x if self.fov_y is None else focal_length(self.height, self.fov_y)
 
     def camera_info(self) -> CameraInfo:
         """The intrinsics, the principal point in the middle."""
         return CameraInfo(
             width=self.width,
             height=self.height,
-            focal_x=self.focal_length,
-            focal_y=self.focal_length,
+            focal_x=self.focal_x,
+            focal_y=self.focal_y,
             center_x=0.5 * self.width,
             center_y=0.5 * self.height,
         )
@@ -66,9 +75,14 @@ class OnboardCamera:
 
     def ray_slopes(self) -> np.ndarray:
         """(height, width, 3) The points p_CQ at planar depth 1 that the pixels look at."""
-        x = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_length
-        y = (np.arange(self.height) + 0.5 - 0.5 * self.height) / self.focal_length
+        x = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_x
+        y = (np.arange(self.height) + 0.5 - 0.5 * self.height) / self.focal_y
         return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1)
+
+
+def focal_length(size: int, fov: float) -> float:
+    """[px], of an axis with `size` pixels and a field of view [deg]."""
+    return 0.5 * size / math.tan(math.radians(0.5 * fov))
 
 
 def _check(name: str, value: object, valid: bool, limit: str) -> None:

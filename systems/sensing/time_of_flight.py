@@ -10,17 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_LEAST_DEPTH = 1e-3  # [m], up to which the sensor has measured nothing
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
+
+LEAST_DEPTH = 1e-3
+"""[m], up to which the sensor has measured nothing."""
 
 
 @dataclass
 class TimeOfFlight:
     """The sensor, and what part of its frame the policy sees; defaults are those of the drone."""
 
-    # [px] Of a frame that stands upright.
+    # [px] Of its frames; one that lies on its side is stood up.
     width: int = 180
     height: int = 240
-    # [deg] Field of view of a frame that stands upright.
+    # [deg] Fields of view.
     fov_x: float = 86.0
     fov_y: float = 106.0
     # [deg] Field of view, both ways, that is left by the crop.
@@ -45,7 +48,6 @@ class TimeOfFlight:
         for name in ("width", "height", "columns", "rows"):
             value = getattr(self, name)
             _check(name, value, value >= 1, "at least 1")
-        _check("width", self.width, self.width <= self.height, "at most the height: stand upright")
         crop = self.crop(self.height, self.width, self.fov_x, self.fov_y)
         for count, part, name in zip(
             (self.rows, self.columns), crop, ("rows", "columns"), strict=True
@@ -72,6 +74,20 @@ class TimeOfFlight:
         return slice(top, bottom), slice(max(0, left), min(width, right))
 
 
+def sensor_of(camera: OnboardCamera) -> TimeOfFlight:
+    """The sensor that a policy's camera is: all of its image is left."""
+    fov_y = math.degrees(2.0 * math.atan(0.5 * camera.height / camera.focal_y))
+    return TimeOfFlight(
+        width=camera.width,
+        height=camera.height,
+        fov_x=camera.fov_x,
+        fov_y=fov_y,
+        fov=max(camera.fov_x, fov_y),
+        anchor="center",
+        shift=0,
+    )
+
+
 _ANCHORS = ("top", "center", "bottom")
 
 
@@ -83,38 +99,38 @@ def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
 
     Args:
         depth: (H, W) [m] along the optical axis; what is not finite, or at most 1 mm, was not
-            measured. A frame that is wider than high is turned by 90 degrees, counterclockwise.
+            measured. A frame that lies on its side is turned by 90 degrees, counterclockwise.
         sensor: a valid configuration.
 
     Raises:
         ValueError: for a frame of another size.
     """
-    lying = depth.shape[1] > depth.shape[0]
-    upright = np.rot90(depth) if lying else depth
-    H, W = upright.shape
-    if (H, W) != (sensor.height, sensor.width):
+    H, W = sensor.height, sensor.width
+    if depth.shape not in ((H, W), (W, H)):
         raise ValueError(
-            f"the frame has {depth.shape[1]}x{depth.shape[0]} pixels; it must have "
-            f"{sensor.width}x{sensor.height}, or lie on its side"
+            f"the frame has {depth.shape[1]}x{depth.shape[0]} pixels; it must have {W}x{H}, or lie "
+            "on its side"
         )
+    lying = depth.shape != (H, W)
+    upright = np.rot90(depth) if lying else depth
     # The streamer takes the fields of view of a frame that lay with it as they were.
     fov_x, fov_y = (sensor.fov_y, sensor.fov_x) if lying else (sensor.fov_x, sensor.fov_y)
     rows, columns = sensor.crop(H, W, fov_x, fov_y)
     cropped = upright[rows, columns]
-    measured = np.isfinite(cropped) & (cropped > _LEAST_DEPTH)
+    measured = np.isfinite(cropped) & (cropped > LEAST_DEPTH)
     cropped = np.where(measured, cropped, sensor.max_range)
-    x = (np.arange(W)[columns] - 0.5 * W) / focal_length(W, fov_x)
-    y = (np.arange(H)[rows] - 0.5 * H) / focal_length(H, fov_y)
-    ranges = cropped * np.sqrt(1.0 + x**2 + y[:, None] ** 2)
+    ranges = cropped * range_of_depth(H, W, fov_x, fov_y)[rows, columns]
     for axis, count in ((0, sensor.rows), (1, sensor.columns)):
         edges = np.linspace(0, ranges.shape[axis], count + 1).astype(int)
         ranges = np.minimum.reduceat(ranges, edges[:-1], axis=axis)
     return (1.0 - np.clip(ranges, 0.0, sensor.max_range) / sensor.max_range)[::-1]
 
 
-def focal_length(size: int, fov: float) -> float:
-    """[px], of an axis with `size` pixels and a field of view [deg]."""
-    return 0.5 * size / math.tan(math.radians(0.5 * fov))
+def range_of_depth(height: int, width: int, fov_x: float, fov_y: float) -> np.ndarray:
+    """(height, width) [-] How far what pixels see is, by its depth along the optical axis."""
+    x = (np.arange(width) - 0.5 * width) / focal_length(width, fov_x)
+    y = (np.arange(height) - 0.5 * height) / focal_length(height, fov_y)
+    return np.sqrt(1.0 + x**2 + y[:, None] ** 2)
 
 
 def _check(name: str, value: object, valid: bool, limit: str) -> None:

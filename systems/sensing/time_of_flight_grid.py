@@ -22,7 +22,7 @@ class TimeOfFlightGrid(LeafSystem):
         output_ports:
         - depth_grid
 
-    - ``depth_image_32f``: planar depth [m], upright, of the sensor's size.
+    - ``depth_image_32f``: planar depth [m], of the sensor's size.
     - ``depth_grid`` (rows * columns): 1 - range / max_range, row by row from the lowest.
 
     Stateless.

@@ -91,6 +91,39 @@ class FlatnessControllerConfig:
             )
 
 
+def flatness_command(
+    state: np.ndarray,
+    a_WB: np.ndarray,
+    motion_W: np.ndarray,
+    heading: float,
+    config: FlatnessControllerConfig,
+    params: QuadrotorParams,
+) -> np.ndarray:
+    """Thrust over mass and body rates (4,) that fly an acceleration, see `FlatnessController`.
+
+    Args:
+        state: (13,).
+        a_WB: (3,) [m/s^2], gravity excluded.
+        motion_W: (3,) [m/s], along which the vehicle looks where the heading is NaN.
+        heading: [rad], or NaN.
+    """
+    R_WB = pose_from_state(state).rotation().matrix()
+    f_W = thrust_for_acceleration(a_WB, QuadrotorState.of(state).v_WB, params.drag, params.gravity)
+    f_W = limit_thrust(f_W, config.min_thrust, config.max_thrust, config.max_tilt)
+    pull = 1.0
+    if math.isnan(heading):
+        heading = math.atan2(motion_W[1], motion_W[0])
+        pull = min(1.0, math.hypot(motion_W[0], motion_W[1]) / config.yaw_speed) ** 2
+    tilt_B, yaw = attitude_error(R_WB, attitude_from_thrust(f_W, heading))
+    yaw *= pull
+
+    command = np.empty(4)
+    command[0] = min(max(f_W.dot(R_WB[:, 2]), config.min_thrust), config.max_thrust)
+    command[1:3] = limit_norm(config.tilt_gain * tilt_B, config.max_tilt_rate)
+    command[3] = min(max(config.yaw_gain * yaw, -config.max_yaw_rate), config.max_yaw_rate)
+    return command
+
+
 class FlatnessController(LeafSystem):
     """Flies a quadrotor to a moving waypoint, or with an acceleration, by thrust and body rates.
 
@@ -155,10 +188,9 @@ class FlatnessController(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(self._config.period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        config, params = self._config, self._params
+        config = self._config
         state = self._eval_finite("state", context)
         p_WB, v_WB, _, _ = QuadrotorState.of(state)
-        R_WB = pose_from_state(state).rotation().matrix()
 
         use_waypoint = self.GetInputPort("waypoint").HasValue(context)
         if use_waypoint == self.GetInputPort("acceleration").HasValue(context):
@@ -175,21 +207,10 @@ class FlatnessController(LeafSystem):
             a_WB = self._eval_finite("acceleration", context)
             motion_W = v_WB
 
-        f_W = thrust_for_acceleration(a_WB, v_WB, params.drag, params.gravity)
-        f_W = limit_thrust(f_W, config.min_thrust, config.max_thrust, config.max_tilt)
         heading = self._heading(context)
-        pull = 1.0
-        if math.isnan(heading):
-            heading = math.atan2(motion_W[1], motion_W[0])
-            pull = min(1.0, math.hypot(motion_W[0], motion_W[1]) / config.yaw_speed) ** 2
-        tilt_B, yaw = attitude_error(R_WB, attitude_from_thrust(f_W, heading))
-        yaw *= pull
-
-        command = np.empty(4)
-        command[0] = min(max(f_W.dot(R_WB[:, 2]), config.min_thrust), config.max_thrust)
-        command[1:3] = limit_norm(config.tilt_gain * tilt_B, config.max_tilt_rate)
-        command[3] = min(max(config.yaw_gain * yaw, -config.max_yaw_rate), config.max_yaw_rate)
-        discrete_state.set_value(command)
+        discrete_state.set_value(
+            flatness_command(state, a_WB, motion_W, heading, config, self._params)
+        )
 
     def _heading(self, context: Context) -> float:
         """The heading asked for [rad], or NaN."""

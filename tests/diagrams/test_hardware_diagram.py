@@ -2,12 +2,15 @@
 
 import dataclasses
 import gc
+import socket
+import struct
 import weakref
 
 import lcm
 import numpy as np
 import pytest
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from splatpilot.diagrams.flight import fly, sample_initial_state
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
@@ -16,9 +19,17 @@ from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
+from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_trajectory_hypotheses
-from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
+from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET, MessagePublisher
+from splatpilot.systems.messaging.time_of_flight_receiver import (
+    TimeOfFlightReceiver,
+    TimeOfFlightStream,
+)
+from splatpilot.systems.messaging.udp_inbox import UdpConfig
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 TICK = HardwareConfig().tick
@@ -27,10 +38,10 @@ TICK = HardwareConfig().tick
 class Halves:
     """Vehicle and pilot, each a diagram, the pilot's time 4 ms behind; the test advances both."""
 
-    def __init__(self, scenario: Scenario, world, vehicle: Scenario | None = None):
+    def __init__(self, scenario: Scenario, world, vehicle: Scenario | None = None, **pilot):
         self.lcm = lcm.LCM("memq://")
         self.vehicle = BuildVehicleDiagram(vehicle or scenario, world, self.lcm)
-        self.hardware = BuildHardwareDiagram(scenario, world, self.lcm)
+        self.hardware = BuildHardwareDiagram(scenario, world, self.lcm, **pilot)
         self.simulators = [Simulator(self.vehicle), Simulator(self.hardware)]
         ApplySimulatorConfig(scenario.simulator, self.simulators[0])
         self.vehicle_root, self.root = (s.get_mutable_context() for s in self.simulators)
@@ -68,7 +79,7 @@ def test_the_two_halves_fly_as_the_whole(post_world, name):
     halves.advance_to(3.0)
     np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.15)
     assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 2.0
-    mode, state_age, _, gaps, rejected, overruns = halves.status()
+    mode, _, state_age, _, gaps, rejected, overruns = halves.status()
     assert mode == lcmt_bridge_status.FLYING
     assert 0.0 <= state_age <= 0.02
     assert (gaps, rejected, overruns) == (0, 0, 0)
@@ -86,20 +97,23 @@ def test_ports_are_those_of_the_flight_diagram(post_world):
 
 
 def test_commands_stop_where_the_vehicle_falls_silent(post_world):
-    """Without states for longer than allowed nothing is commanded and the status says why; with
-    states again it flies on."""
+    """Without states for longer than allowed no body rates are commanded, setpoints are those to
+    stop, and the status says why; with states again it flies on."""
     halves = Halves(Scenario(policy=policy_named("straight")), post_world)
     heard = []
     halves.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
     halves.advance_to(0.5)
     assert halves.status()[0] == lcmt_bridge_status.FLYING
     halves.advance_to(0.9, vehicle=False)
-    assert halves.status()[0] == lcmt_bridge_status.STALE
+    halted = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.STATE_OLD]
+    np.testing.assert_array_equal(halves.status()[:2], halted)
+    setpoint = halves.hardware.GetOutputPort("velocity_setpoint").Eval(halves.root)
+    np.testing.assert_array_equal(setpoint[:3], np.zeros(3))
     before = len(heard)
     halves.advance_to(2.0, vehicle=False)
     assert len(heard) == before > 25
-    assert halves.status()[1] == pytest.approx(1.5, abs=0.03)
-    halves.advance_to(2.2)
+    assert halves.status()[2] == pytest.approx(1.5, abs=0.03)
+    halves.advance_to(2.8)
     assert halves.status()[0] == lcmt_bridge_status.FLYING
     assert len(heard) > before
 
@@ -108,7 +122,121 @@ def test_before_the_first_state_nothing_is_commanded(post_world):
     """A pilot whose vehicle has said nothing waits."""
     hardware = BuildHardwareDiagram(Scenario(), post_world, lcm.LCM("memq://"))
     status = hardware.GetOutputPort("status").Eval(hardware.CreateDefaultContext())
-    np.testing.assert_array_equal(status, [lcmt_bridge_status.WAITING, np.inf, 0, 0, 0, 0])
+    np.testing.assert_array_equal(status, [lcmt_bridge_status.WAITING, 0, np.inf, 0, 0, 0, 0])
+
+
+def test_a_vehicle_that_hears_no_more_holds_and_then_lands(post_world):
+    """A tenth of a second after the last command a vehicle in flight brakes by itself, hovers, and
+    after five seconds descends; before the first command it hovers for as long as it takes."""
+    halves = Halves(Scenario(policy=policy_named("straight")), post_world)
+    halves.simulators[0].AdvanceTo(0.3)
+    np.testing.assert_allclose(halves.state()[3:6], np.zeros(3), atol=1e-6)
+    halves.tick = round(0.3 / TICK)
+    halves.advance_to(1.5)
+    assert halves.state()[3] > 1.0
+    halves.simulators[0].AdvanceTo(5.5)
+    p = halves.state()[:3].copy()
+    assert np.linalg.norm(halves.state()[3:6]) < 0.05
+    assert p[2] == pytest.approx(2.0, abs=0.1)
+    halves.simulators[0].AdvanceTo(9.0)
+    assert halves.state()[2] == pytest.approx(p[2] - 0.5 * (2.4 - 0.4), abs=0.1)
+    np.testing.assert_allclose(halves.state()[:2], p[:2], atol=0.1)
+
+
+class Mad(LeafSystem):
+    """A policy that wants what the test says, whatever that is."""
+
+    def __init__(self, port: str):
+        super().__init__()
+        self.wants = np.zeros(3)
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorOutputPort(port, 3, self._calc)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, lambda context, state: None)
+
+    def _calc(self, context, output) -> None:
+        output.set_value(self.wants)
+
+
+@pytest.mark.parametrize("port", ["acceleration", "velocity", "waypoint"])
+def test_a_policy_that_says_nonsense_ends_no_flight(post_world, port):
+    """What is no number stops the vehicle, whatever kind of decision it is, and no exception ends
+    the bridge; when the policy comes to its senses it flies on."""
+    policy = Mad(port)
+    halves = Halves(Scenario(policy=policy_named("straight")), post_world, policy=policy)
+    halves.advance_to(0.1)
+    policy.wants = np.array([np.nan, 0.0, np.inf])
+    halves.advance_to(1.0)
+    why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.NOT_FINITE]
+    np.testing.assert_array_equal(halves.status()[:2], why)
+    assert np.linalg.norm(halves.state()[3:6]) < 0.3
+    policy.wants = np.array([0.3, 0.0, 0.0]) + (halves.state()[:3] if port == "waypoint" else 0.0)
+    halves.advance_to(1.8)
+    assert halves.status()[0] == lcmt_bridge_status.FLYING
+
+
+def test_a_body_that_motion_capture_lost_is_not_flown(post_world):
+    """Where motion capture must see the vehicle, flight waits for that, and ends with it."""
+    config = HardwareConfig(body="starling")
+    halves = Halves(Scenario(policy=policy_named("straight")), post_world, config=config)
+    halves.advance_to(0.2)
+    assert halves.status()[0] == lcmt_bridge_status.WAITING
+    codec = MotionCaptureCodec("starling")
+    builder = DiagramBuilder()
+    publisher = builder.AddSystem(MessagePublisher(halves.lcm, codec, 1.0))
+    eye = builder.Build()
+    context = eye.CreateDefaultContext()
+    inner = publisher.GetMyMutableContextFromRoot(context)
+
+    def see(pose, until: float) -> None:
+        while halves.tick * TICK < until:
+            publisher.GetInputPort(codec.port).FixValue(inner, pose)
+            publisher.unix_time_input_port().FixValue(inner, [halves.tick * TICK])
+            eye.ForcedPublish(context)
+            halves.advance_to((halves.tick + 10) * TICK)
+
+    there = np.array([1.0, 0, 2, 1, 0, 0, 0])
+    see(there, 0.6)
+    assert halves.status()[0] == lcmt_bridge_status.FLYING
+    see(np.full(7, np.nan), 1.2)
+    why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.BODY_LOST]
+    np.testing.assert_array_equal(halves.status()[:2], why)
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
+    """The grid that a policy gets is the vehicle's, by LCM, or, where one is named, that of a
+    stream by UDP, and nothing is flown before it has come; its velocities are the setpoints."""
+    policy = tmp_path / "weights.npz"
+    random = np.random.default_rng(0)
+    shapes = DIFFAERO_NETWORK.weight_shapes().items()
+    weights = {key: random.normal(scale=0.1, size=shape) for key, shape in shapes}
+    PolicyCheckpoint("diffaero_tof", DIFFAERO_NETWORK, weights, {}).save(policy)
+    stream = TimeOfFlightStream(UdpConfig(port=0)) if streamed else None
+    scenario = Scenario(policy=policy_named(str(policy)))
+    halves = Halves(scenario, post_world, config=HardwareConfig(time_of_flight=stream))
+    grid = halves.hardware.GetOutputPort("depth_grid")
+    if streamed:
+        halves.advance_to(0.1)
+        assert halves.status()[0] == lcmt_bridge_status.WAITING
+        receiver = halves.hardware.GetSubsystemByName("depth_grid_receiver")
+        assert isinstance(receiver, TimeOfFlightReceiver)
+        packet = struct.pack("<IIQ144f", 0x544F4632, 1, 1, *[0.25] * 144)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor:
+            sensor.sendto(packet, ("127.0.0.1", receiver.port))
+        halves.advance_to(0.3)
+        np.testing.assert_array_equal(grid.Eval(halves.root), np.full(144, 0.25))
+    else:
+        halves.advance_to(0.3)
+        sent = halves.vehicle.GetSubsystemByName("time_of_flight_grid")
+        expected = sent.get_output_port().Eval(sent.GetMyContextFromRoot(halves.vehicle_root))
+        np.testing.assert_allclose(grid.Eval(halves.root), expected, atol=0.02)
+        assert expected.max() > 0.1
+    assert halves.status()[0] == lcmt_bridge_status.FLYING
+    pilot = halves.hardware.GetSubsystemByName("policy")
+    wanted = pilot.GetOutputPort("velocity").Eval(pilot.GetMyContextFromRoot(halves.root))
+    setpoint = halves.hardware.GetOutputPort("velocity_setpoint").Eval(halves.root)
+    np.testing.assert_allclose(setpoint[:3], wanted, atol=1e-12)
+    assert np.linalg.norm(wanted) > 0.01
 
 
 def test_plans_travel(post_world):
@@ -129,9 +257,19 @@ def test_velocity_setpoint_leads_where_the_policy_wants(post_world):
     """An autopilot that is told velocities is told that of the straight policy's way."""
     scenario = Scenario(policy=policy_named("straight", speed=1.5))
     halves = Halves(scenario, post_world)
-    halves.advance_to(2.0)
+    halves.advance_to(1.0)
     setpoint = halves.hardware.GetOutputPort("velocity_setpoint").Eval(halves.root)
     np.testing.assert_allclose(setpoint[:3], [1.5, 0, 0], atol=0.05)
+
+
+def test_a_known_obstacle_is_not_flown_into(post_world):
+    """The straight policy, which flies into the post where it is let, is stopped before it."""
+    halves = Halves(Scenario(policy=policy_named("straight")), post_world)
+    halves.advance_to(5.0)
+    limited = [lcmt_bridge_status.FLYING, lcmt_bridge_status.LIMITED_CLEARANCE]
+    np.testing.assert_array_equal(halves.status()[:2], limited)
+    clearance = halves.vehicle.GetOutputPort("clearance").Eval(halves.vehicle_root)[0]
+    assert clearance == pytest.approx(0.1, abs=0.03)
 
 
 def test_what_no_message_carries_is_refused(post_world):
@@ -157,7 +295,7 @@ def test_images_of_another_size_are_refused_by_the_other_half(post_world):
     heard = []
     halves.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
     halves.advance_to(0.3)
-    mode, state_age, image_age, _, rejected, _ = halves.status()
+    mode, _, state_age, image_age, _, rejected, _ = halves.status()
     assert (mode, image_age, rejected) == (lcmt_bridge_status.WAITING, np.inf, 5)
     assert state_age < 0.03
     assert not heard

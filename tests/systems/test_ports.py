@@ -16,9 +16,11 @@ from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
 from splatpilot.systems.policies.privileged_planner import PrivilegedPlanner
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.straight import Straight
+from splatpilot.systems.policies.velocity_tracker import VelocityTracker
 from splatpilot.systems.sensing.color_noise import ColorNoise
 from splatpilot.systems.sensing.delayed_pose import DelayedPose
 from splatpilot.systems.sensing.depth_noise import DepthNoise
+from splatpilot.systems.sensing.frame_times import FrameTimes
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.flatness_controller import FlatnessController
@@ -45,7 +47,8 @@ def systems() -> list[System]:
         DiffAero(),
         DepthNav(),
         AgileAutonomy(),
-        DelayedPose(0.1),
+        DelayedPose(FrameTimes.late(0.1)),
+        VelocityTracker(),
         DepthNoise(*noise),
         ColorNoise(*noise),
         FlightVisualizer(Meshcat(), 3),

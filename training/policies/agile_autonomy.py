@@ -38,7 +38,13 @@ from splatpilot.training.policies.agile_autonomy_agent import (
     LOOKAHEAD,
     AgileAutonomyAgent,
 )
-from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
+from splatpilot.training.policies.delayed_vehicle import (
+    delayed,
+    draw_frames,
+    frame_ages,
+    remember,
+    remembered,
+)
 from splatpilot.training.policies.evaluation import (
     FlightConditions,
     evaluate_agent,
@@ -195,8 +201,8 @@ class AgileAutonomyTrainer:
         speed = torch.tensor(config.speeds, device=device)[which]
         control = FlatnessControllerConfig()
         vehicle, by_student = self._start(worlds, world, student)
-        latency = config.noise.latency * RATE
-        past = remembered(vehicle, latency)
+        past = remembered(vehicle, config.noise, RATE)
+        frames = draw_frames(config.noise, N, self._generator)
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
         for step in range(config.steps):
@@ -207,11 +213,13 @@ class AgileAutonomyTrainer:
             if ended.any():
                 fresh, flown = self._start(worlds, world, student)
                 vehicle = choose_rows(ended, fresh, vehicle)
-                past = choose_rows(ended, remembered(fresh, latency), past)
+                past = choose_rows(ended, remembered(fresh, config.noise, RATE), past)
                 by_student = torch.where(ended, flown, by_student)
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
             past, R_WB = remember(past, vehicle), vehicle.attitude()
-            depth = render_depth(delayed(past, latency), worlds.geometry, self._agent.rays, world)
+            now = torch.full((N,), step / RATE, device=device)
+            then = delayed(past, frame_ages(frames, config.noise, now), RATE)
+            depth = render_depth(then, worlds.geometry, self._agent.rays, world)
             seen = Observation(depth, vehicle, p_WG, speed)
             asked = step % config.ask_every == 0
             if asked:

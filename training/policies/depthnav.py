@@ -103,7 +103,7 @@ class DepthNavLearner:
         output, hidden = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
         )
-        a_S = observation.limit_acceleration(output[:, :3], self._limits)
+        a_S = observation.limit_smoothly(output[:, :3], self._limits)
         to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
         heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
         return (

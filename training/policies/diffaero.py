@@ -87,7 +87,7 @@ class DiffAeroLearner:
         output, memory = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory
         )
-        a_H = observation.limit_acceleration(output, self._limits)
+        a_H = observation.limit_smoothly(output, self._limits)
         return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -10,7 +11,14 @@ from torch import Tensor
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
+from splatpilot.training.policies.delayed_vehicle import (
+    Frames,
+    delayed,
+    draw_frames,
+    frame_ages,
+    remember,
+    remembered,
+)
 from splatpilot.training.policies.evaluation import Agent, render_depth
 from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.observation import (
@@ -97,6 +105,7 @@ class Episodes(NamedTuple):
 
     vehicle: PointMass
     past: PointMass  # (N, K, ...), see `remembered`
+    frames: Frames
     world: Tensor  # (N,), numbers of the worlds flown in
     v_mean: Tensor  # (N, 3) [m/s]
     memory: Tensor  # (N, H)
@@ -117,20 +126,21 @@ class DifferentiableRollout:
         self.learner, self.worlds, self.config = learner, worlds, config
         self.generator = generator
         self._control = FlatnessControllerConfig()
-        self._latency = config.noise.latency * learner.rate
         self.episodes = self._new_episodes()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next losses depend on but the learner."""
-        vehicle, past, *others = self.episodes
-        episodes = [*vehicle, *past, *others]
+        vehicle, past, frames, *others = self.episodes
+        episodes = [*vehicle, *past, *frames, *others]
         return {"episodes": episodes, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """The inverse of `state_dict`."""
         saved, count = state["episodes"], len(PointMass._fields)
         vehicle, past = PointMass(*saved[:count]), PointMass(*saved[count : 2 * count])
-        self.episodes = Episodes(vehicle, past, *saved[2 * count :])
+        others = saved[2 * count :]
+        frames = Frames(*others[: len(Frames._fields)])
+        self.episodes = Episodes(vehicle, past, frames, *others[len(Frames._fields) :])
         self.generator.set_state(state["generator"])
 
     def _uniform(self, *size: int) -> Tensor:
@@ -155,7 +165,8 @@ class DifferentiableRollout:
         vehicle = PointMass(p, v, torch.zeros_like(p), yaw, between(config.lag, N, 1))
         return Episodes(
             vehicle,
-            remembered(vehicle, self._latency),
+            remembered(vehicle, config.noise, self.learner.rate),
+            draw_frames(config.noise, N, self.generator),
             world,
             v,
             self.learner.initial_memory(N),
@@ -179,8 +190,9 @@ class DifferentiableRollout:
 
         vehicle = choose_rows(ended, fresh.vehicle, episodes.vehicle)
         past = choose_rows(ended, fresh.past, episodes.past)
-        others = zip(fresh[2:], episodes[2:], strict=True)
-        return Episodes(vehicle, past, *(where_rows(ended, a, b) for a, b in others))
+        frames = Frames(*map(partial(where_rows, ended), fresh.frames, episodes.frames))
+        others = zip(fresh[3:], episodes[3:], strict=True)
+        return Episodes(vehicle, past, frames, *(where_rows(ended, a, b) for a, b in others))
 
     def losses(self) -> dict[str, Tensor]:
         """Flies on for `steps` and returns the terms of the loss, differentiable."""
@@ -190,12 +202,14 @@ class DifferentiableRollout:
         forget = 1.0 - math.exp(-dt / config.averaging)
         with torch.no_grad():
             episodes = self._restart_ended(self.episodes)
-        vehicle, past, world, v_mean, memory, speed, age = episodes
+        vehicle, past, frames, world, v_mean, memory, speed, age = episodes
         p_WG = worlds.p_WG[world]
         vehicles, v_means, headings = [vehicle], [], []
-        for _ in range(config.steps):
+        for step in range(config.steps):
             past = remember(past, vehicle)
-            depth = render_depth(delayed(past, self._latency), worlds.geometry, learner.rays, world)
+            ages = frame_ages(frames, config.noise, age + step * dt)
+            then = delayed(past, ages, learner.rate)
+            depth = render_depth(then, worlds.geometry, learner.rays, world)
             depth = noisy_depth(depth, config.noise, self.generator)
             a_cmd, heading, memory = learner.decide(
                 Observation(depth, vehicle, p_WG, speed), memory
@@ -209,6 +223,7 @@ class DifferentiableRollout:
         self.episodes = Episodes(
             vehicle.detach(),
             past,
+            frames,
             world,
             v_mean.detach(),
             memory.detach(),

@@ -10,7 +10,14 @@ from torch import Tensor
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
+from splatpilot.training.policies.delayed_vehicle import (
+    Frames,
+    delayed,
+    draw_frames,
+    frame_ages,
+    remember,
+    remembered,
+)
 from splatpilot.training.policies.observation import Observation, noisy_depth
 from splatpilot.training.policies.ray_casting import Geometry, PixelRays
 from splatpilot.training.policies.vehicles import BodyRate, PointMass, Vehicle
@@ -122,8 +129,8 @@ def evaluate_agent(
     memory, control = agent.initial_memory(count), FlatnessControllerConfig()
     shuffled = torch.randperm(count, generator=generator, device=device)
     speed = torch.tensor(conditions.speeds, device=device)[shuffled % len(conditions.speeds)]
-    latency = noise.latency * agent.rate
-    past = remembered(vehicle, latency)
+    past = remembered(vehicle, noise, agent.rate)
+    frames = draw_frames(noise, count, generator)
 
     reached, collided, left = (torch.zeros(count, dtype=torch.bool, device=device) for _ in "rcl")
     clearance = torch.full((count,), torch.inf, device=device)
@@ -145,9 +152,11 @@ def evaluate_agent(
             keep = (~ended).nonzero()[:, 0]
             flying, memory = flying[keep], memory[keep]
             vehicle, past = (type(vehicle)(*(x[keep] for x in of)) for of in (vehicle, past))
+            frames = Frames(*(x[keep] for x in frames))
             continue
         past = remember(past, vehicle)
-        depth = render_depth(delayed(past, latency), worlds.geometry, agent.rays, flying)
+        then = delayed(past, frame_ages(frames, noise, time[flying]), agent.rate)
+        depth = render_depth(then, worlds.geometry, agent.rays, flying)
         depth = noisy_depth(depth, noise, generator)
         seen = Observation(depth, vehicle, p_WG[flying], speed[flying])
         a_cmd, heading, memory = agent.decide(seen, memory)

@@ -5,7 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from splatpilot.systems.policies.velocity_tracking import MAX_ACCELERATION, RESPONSE_TIME
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH
 from splatpilot.training.policies.vehicles import Vehicle
 
 
@@ -57,6 +59,20 @@ def inverse_depth(depth: Tensor, nearest: float, farthest: float) -> Tensor:
     return 3.0 / depth.clamp(nearest, farthest) - 0.6
 
 
+def proximity_grid(
+    depth: Tensor, range_of_depth: Tensor, max_range: float, height: int, width: int
+) -> Tensor:
+    """The proximities (N, height, width) in images of depth (N, R) [m], the lowest row first.
+
+    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W); H and W must
+    be multiples of height and width.
+    """
+    H, W = range_of_depth.shape
+    measured = torch.where(depth > LEAST_DEPTH, depth, max_range).reshape(-1, H, W)
+    blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
+    return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
+
+
 def target_velocity(p: Tensor, p_WG: Tensor, speed: Tensor, slowing_time: float = 1.0) -> Tensor:
     """The velocities (N, 3) [m/s] from p (N, 3) straight to p_WG (N, 3) [m], at `speed` (N,) [m/s]
     until `slowing_time` [s] before it."""
@@ -79,6 +95,14 @@ def heading_observation(seen: Observation, R_WH: Tensor) -> Tensor:
     return (rows @ R_WH).flatten(1)
 
 
-def limit_acceleration(output: Tensor, limits: Tensor) -> Tensor:
-    """Outputs (N, 3) of a network as accelerations [m/s^2] within +-limits (3,), smoothly."""
+def tracking_acceleration(v: Tensor, v_wanted: Tensor) -> Tensor:
+    """The accelerations (N, 3) [m/s^2] with which velocities (N, 3) [m/s] approach those wanted;
+    see `splatpilot.systems.policies.velocity_tracking`."""
+    a = (v_wanted - v) / RESPONSE_TIME
+    size = a.square().sum(1, keepdim=True).clamp(min=1e-12).sqrt()
+    return a * (MAX_ACCELERATION / size).clamp(max=1.0)
+
+
+def limit_smoothly(output: Tensor, limits: Tensor) -> Tensor:
+    """Outputs (N, D) of a network within +-limits (D,), smoothly."""
     return limits * torch.tanh(output / limits)

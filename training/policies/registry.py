@@ -8,6 +8,7 @@ from splatpilot.systems.registry import Registry
 from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
 from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
+from splatpilot.training.policies.diffaero_tof import DiffAeroTofLearner, DiffAeroTofTraining
 from splatpilot.training.policies.rollout_trainer import RolloutTrainer
 from splatpilot.training.policies.trainer import Trainer
 
@@ -50,5 +51,12 @@ register_trainer(
     "depthnav",
     DepthNavTraining,
     lambda config: RolloutTrainer("depthnav", DepthNavLearner(config.loss, config.device), config),
+)
+register_trainer(
+    "diffaero_tof",
+    DiffAeroTofTraining,
+    lambda config: RolloutTrainer(
+        "diffaero_tof", DiffAeroTofLearner(config.loss, config.device), config
+    ),
 )
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)

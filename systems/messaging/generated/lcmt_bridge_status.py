@@ -12,17 +12,43 @@ import drake
 class lcmt_bridge_status(object):
     """ How the process is that flies a vehicle by messages. """
 
-    __slots__ = ["header", "mode", "state_age", "observation_age", "num_gaps", "num_rejected", "num_overruns"]
+    __slots__ = ["header", "mode", "reason", "state_age", "observation_age", "num_gaps", "num_rejected", "num_overruns"]
 
-    __typenames__ = ["drake.lcmt_header", "int8_t", "double", "double", "int64_t", "int64_t", "int64_t"]
+    __typenames__ = ["drake.lcmt_header", "int8_t", "int8_t", "double", "double", "int64_t", "int64_t", "int64_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None]
 
     WAITING = 0
     """ For the first state or observation. """
     FLYING = 1
-    STALE = 2
-    """ The state or the observation is older than allowed: nothing is commanded. """
+    """ As the policy decides, within limits. """
+    HOLDING = 2
+    """ Brakes and hovers. """
+    LANDING = 3
+    """ Descends, whatever comes. """
+    NONE = 0
+    STATE_OLD = 1
+    """ The state is older than allowed, or does not change though the vehicle moves. """
+    STATE_FROZEN = 2
+    OBSERVATION_OLD = 3
+    """ The observation is older than allowed. """
+    BODY_LOST = 4
+    """ Motion capture has not seen the vehicle for longer than allowed. """
+    NOT_FINITE = 5
+    """ What the policy or the controller decided is no number, or more than the vehicle may do. """
+    OUT_OF_BOUNDS = 6
+    OVERRUN = 7
+    """ The process was behind the wall clock by more than allowed. """
+    TILTED = 8
+    """ The vehicle tilts more than allowed, or has left where it may fly. """
+    OUTSIDE = 9
+    LIMITED_SPEED = 10
+    """
+    The policy would fly too fast, out of where it may, or too near to what is known of the world; it is flown as near to
+    what it decided as is allowed.
+    """
+    LIMITED_GEOFENCE = 11
+    LIMITED_CLEARANCE = 12
 
     def __init__(self):
         self.header = drake.lcmt_header()
@@ -33,7 +59,13 @@ class lcmt_bridge_status(object):
 
         self.mode = 0
         """
-        One of the constants below.
+        What it does: one of the modes below.
+        LCM Type: int8_t
+        """
+
+        self.reason = 0
+        """
+        Why it does not fly as the policy decides: one of the reasons below.
         LCM Type: int8_t
         """
 
@@ -77,7 +109,7 @@ class lcmt_bridge_status(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
-        buf.write(struct.pack(">bddqqq", self.mode, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns))
+        buf.write(struct.pack(">bbddqqq", self.mode, self.reason, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns))
 
     @staticmethod
     def decode(data: bytes):
@@ -93,14 +125,14 @@ class lcmt_bridge_status(object):
     def _decode_one(buf):
         self = lcmt_bridge_status()
         self.header = drake.lcmt_header._decode_one(buf)
-        self.mode, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns = struct.unpack(">bddqqq", buf.read(41))
+        self.mode, self.reason, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns = struct.unpack(">bbddqqq", buf.read(42))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_bridge_status in parents: return 0
         newparents = parents + [lcmt_bridge_status]
-        tmphash = (0x3b612de31ea433c+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x8368d8f9c2a49e10+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -26,7 +26,7 @@ SIGNALS = [
     (HypothesesCodec(2), PLAN),
     (MotionCaptureCodec("drone"), [1.0, 2, 3, *UNIT]),
     (DepthGridCodec(2, 3, 5.0, "tof"), [0.0, 0.25, 0.5, 0.75, 1.0, 0.125]),
-    (StatusCodec(), [1.0, 0.01, np.inf, 2, 3, 4]),
+    (StatusCodec(), [1.0, 0.0, 0.01, np.inf, 2, 3, 4]),
 ]
 
 

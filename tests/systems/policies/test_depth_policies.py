@@ -11,9 +11,11 @@ from pydrake.systems.sensors import ImageDepth32F
 from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
 from splatpilot.systems.policies import depthnav_inference as depthnav_policy
 from splatpilot.systems.policies import diffaero_inference as diffaero_policy
+from splatpilot.systems.policies import diffaero_tof_inference as tof_policy
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from splatpilot.systems.policies.diffaero_tof import DiffAeroTof, DiffAeroTofConfig
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.policies.observation import pool_depth
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
@@ -103,6 +105,31 @@ def test_recurrent_policy_decides_and_remembers_at_its_rate(name, files):
         if name == "depthnav":
             found = system.GetOutputPort("heading").Eval(context)
             assert float(found[0]) == pytest.approx(heading, abs=1e-9)
+
+
+def test_policy_of_time_of_flight_decides_and_remembers_at_its_rate(tmp_path):
+    """After three periods the output is that of three steps of the pure policy, and a fresh Context
+    begins anew."""
+    file = tmp_path / "mine.npz"
+    spec = tof_policy.DIFFAERO_NETWORK
+    PolicyCheckpoint("diffaero_tof", spec, weights("diffaero"), {}).save(file)
+    config = DiffAeroTofConfig(weights=str(file), speed=1.7)
+    system, network = DiffAeroTof(config), RecurrentNetwork(spec, weights("diffaero"))
+    grid = np.random.default_rng(1).uniform(size=(9, 16))
+    velocity, memory = np.zeros(3), network.initial_hidden()
+    for _ in range(3):
+        velocity, memory = tof_policy.decide(
+            network, grid, pose_from_state(state()), state()[3:6], P_WG, 1.7, memory
+        )
+    for _ in range(2):
+        simulator = Simulator(system)
+        context = simulator.get_mutable_context()
+        for name, value in (("state", state()), ("goal", P_WG), ("depth_grid", grid.ravel())):
+            system.GetInputPort(name).FixValue(context, value)
+        simulator.Initialize()
+        simulator.AdvanceTo(2.5 / config.rate)
+        found = system.velocity_output_port().Eval(context)
+        np.testing.assert_allclose(found, velocity, rtol=0, atol=1e-9)
 
 
 def test_trajectory_policy_plans_at_its_rate(files):

@@ -24,6 +24,11 @@ def test_acceleration_leads_to_the_velocity_that_was_wanted():
     np.testing.assert_allclose(setpoint(acceleration=acceleration)[:3], wanted)
 
 
+def test_velocity_is_told_as_it_is():
+    """A policy's velocity is the setpoint."""
+    np.testing.assert_array_equal(setpoint(velocity=np.array([1.0, -2, 3]))[:3], [1, -2, 3])
+
+
 def test_waypoint_is_reached_in_time():
     """At the velocity to a waypoint the vehicle is there when it is due; the heading goes along."""
     told = setpoint(waypoint=np.array([2.0, 2, 2]), heading=np.array([0.7]))

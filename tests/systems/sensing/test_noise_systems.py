@@ -11,6 +11,7 @@ from splatpilot.systems.policies.observation import pool_depth
 from splatpilot.systems.sensing.color_noise import ColorNoise
 from splatpilot.systems.sensing.delayed_pose import DelayedPose
 from splatpilot.systems.sensing.depth_noise import DepthNoise
+from splatpilot.systems.sensing.frame_times import FrameTimes
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
@@ -117,7 +118,7 @@ def test_delayed_pose_is_the_pose_then(latency):
     first; samples 0.02 s apart leave an error of a tenth of a millimetre."""
     builder = DiagramBuilder()
     source = builder.AddSystem(Falling())
-    delayed = builder.AddSystem(DelayedPose(latency, period=0.02))
+    delayed = builder.AddSystem(DelayedPose(FrameTimes.late(latency), period=0.02))
     builder.Connect(source.get_output_port(), delayed.GetInputPort("state"))
     simulator = Simulator(builder.Build())
     context = delayed.GetMyContextFromRoot(simulator.get_mutable_context())
@@ -132,5 +133,5 @@ def test_delayed_pose_is_the_pose_then(latency):
 
 def test_bad_latency_is_named():
     """A negative latency is refused."""
-    with pytest.raises(ValueError, match=r"latency is -0.1"):
-        DelayedPose(-0.1)
+    with pytest.raises(ValueError, match=r"come -0.1 s late"):
+        DelayedPose(FrameTimes.late(-0.1))

@@ -87,3 +87,13 @@ def test_bad_noise_is_named(field, value):
     """A value out of range names the field."""
     with pytest.raises(ValueError, match=rf"observation.{field} is {value}"):
         ObservationNoise(**{field: value}).validate()
+
+
+@pytest.mark.parametrize("rates", [[10.0], [30.0, 10.0], [0.0, 10.0]])
+def test_rates_of_frames_are_a_range(rates):
+    """Rates are two, positive and in order; jitter and losses are of frames with a rate."""
+    with pytest.raises(ValueError, match=r"observation\.frame_rate is \["):
+        ObservationNoise(frame_rate=rates).validate()
+    with pytest.raises(ValueError, match=r"noise\.jitter is 0\.1, but images without a rate"):
+        ObservationNoise(jitter=0.1).validate("noise")
+    ObservationNoise(frame_rate=[10.0, 10.0], jitter=0.1, frame_dropout=0.5).validate()

@@ -6,14 +6,17 @@ import pytest
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 
-def test_rays_agree_with_drakes_intrinsics():
+@pytest.mark.parametrize("fov_y", [None, 60.0])
+def test_rays_agree_with_drakes_intrinsics(fov_y):
     """A ray's point, projected with the intrinsics that Drake is given, falls on its pixel."""
-    camera = OnboardCamera(width=6, height=4, fov_x=70.0)
+    camera = OnboardCamera(width=6, height=4, fov_x=70.0, fov_y=fov_y)
     pixels = camera.ray_slopes() @ camera.camera_info().intrinsic_matrix().T  # (4, 6, 3)
     columns, rows = np.meshgrid(np.arange(6) + 0.5, np.arange(4) + 0.5)
     np.testing.assert_allclose(pixels[..., 0], columns)
     np.testing.assert_allclose(pixels[..., 1], rows)
     assert np.rad2deg(camera.camera_info().fov_x()) == pytest.approx(70.0)
+    square = 2 * np.rad2deg(np.arctan(np.tan(np.deg2rad(35.0)) * 4 / 6))
+    assert np.rad2deg(camera.camera_info().fov_y()) == pytest.approx(fov_y or square)
 
 
 def test_mount_looks_ahead_and_up():
@@ -25,7 +28,14 @@ def test_mount_looks_ahead_and_up():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("width", 0), ("fov_x", 180.0), ("max_depth", 0.05), ("p_BC", [1.0, 2.0]), ("pitch", 91.0)],
+    [
+        ("width", 0),
+        ("fov_x", 180.0),
+        ("fov_y", 0.0),
+        ("max_depth", 0.05),
+        ("p_BC", [1.0, 2.0]),
+        ("pitch", 91.0),
+    ],
 )
 def test_bad_config_is_named(field, value):
     """A value out of range names the field."""

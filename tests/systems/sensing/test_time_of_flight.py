@@ -120,7 +120,6 @@ def test_system_gives_the_same_grid():
         ("max_range", 0.0),
         ("rows", 0),
         ("rows", 200),
-        ("width", 300),
         ("columns", 181),
     ],
 )

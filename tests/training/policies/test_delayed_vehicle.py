@@ -8,9 +8,17 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from splatpilot.systems.policies.agile_autonomy_inference import FOV_X
 from splatpilot.systems.sensing.delayed_pose import DelayedPose
+from splatpilot.systems.sensing.frame_times import FrameTimes
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
-from splatpilot.training.policies.delayed_vehicle import delayed, remember, remembered
+from splatpilot.training.policies.delayed_vehicle import (
+    Frames,
+    delayed,
+    draw_frames,
+    frame_ages,
+    remember,
+    remembered,
+)
 from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
 from splatpilot.training.policies.evaluation import (
     CAMERA_AHEAD,
@@ -39,28 +47,69 @@ class Wandering(LeafSystem):
         output.set_value(self._states[round(context.get_time() / PERIOD)])
 
 
-@pytest.mark.parametrize("latency", [0.0, 0.05, PERIOD, 3 * PERIOD, 0.18])
-def test_past_is_what_delayed_pose_gives(latency):
+STREAM = ObservationNoise(latency=0.05, frame_rate=[10.0, 30.0], jitter=0.04, frame_dropout=0.2)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [*(ObservationNoise(latency=x) for x in (0.0, 0.05, PERIOD, 3 * PERIOD, 0.18)), STREAM],
+)
+def test_past_is_what_delayed_pose_gives(noise):
     """At every step of a flight the delayed vehicle has the pose that `DelayedPose` gives of the
     same samples, also before there is anything that old."""
+    times = FrameTimes.draw(noise, seed=3)
     states = np.cumsum(np.random.default_rng(0).normal(scale=0.1, size=(8, 13)), axis=0)
     states[:, 6] += 1.0
     builder = DiagramBuilder()
     source = builder.AddSystem(Wandering(states))
-    system = builder.AddSystem(DelayedPose(latency, PERIOD))
+    system = builder.AddSystem(DelayedPose(times, PERIOD))
     builder.Connect(source.get_output_port(), system.GetInputPort("state"))
     simulator = Simulator(builder.Build())
     context = system.GetMyContextFromRoot(simulator.get_mutable_context())
 
     vehicles = [BodyRate(torch.tensor(state)[None], torch.zeros(1, 3)) for state in states]
-    past = remembered(vehicles[0], latency / PERIOD)
+    past = remembered(vehicles[0], noise, 1.0 / PERIOD)
+    frames = same_frames(times)
     for step, vehicle in enumerate(vehicles):
         simulator.AdvanceTo(step * PERIOD)
         X_WB = system.GetOutputPort("pose").Eval(context)
         past = remember(past, vehicle)
-        then = delayed(past, latency / PERIOD)
+        now = torch.tensor([step * PERIOD], dtype=torch.float64)
+        then = delayed(past, frame_ages(frames, noise, now), 1.0 / PERIOD)
         np.testing.assert_allclose(then.p[0], X_WB.translation(), atol=1e-9)
         np.testing.assert_allclose(then.attitude()[0], X_WB.rotation().matrix(), atol=1e-9)
+
+
+def same_frames(times: FrameTimes) -> Frames:
+    numbers = times.delays, times.rate or 0.0, times.phase
+    return Frames(*(torch.tensor(np.array(x), dtype=torch.float64)[None] for x in numbers))
+
+
+def test_frames_are_as_old_in_training_as_in_flight():
+    """At any time the last image that has come is of the same age in torch as in `FrameTimes`."""
+    now = torch.tensor([0.371], dtype=torch.float64)
+    for seed in range(20):
+        times = FrameTimes.draw(STREAM, seed)
+        for step in range(40):
+            age = frame_ages(same_frames(times), STREAM, step * now)
+            assert age.item() == pytest.approx(times.age(step * now.item()), abs=1e-9)
+
+
+def test_frames_are_drawn_as_asked_for():
+    """Rates, delays and losses have their ranges and parts, and no age exceeds what vehicles
+    remember."""
+    generator = torch.Generator().manual_seed(0)
+    frames = draw_frames(STREAM, 2000, generator)
+    assert frames.rate.min() >= 10.0 and frames.rate.max() <= 30.0
+    assert float(frames.rate.mean()) == pytest.approx(20.0, abs=0.5)
+    came = frames.delays.isfinite()
+    assert float((~came).float().mean()) == pytest.approx(0.2, abs=0.005)
+    assert frames.delays.min() >= 0.05 and frames.delays[came].max() <= 0.0901
+    assert float(frames.delays[came].mean()) == pytest.approx(0.07, abs=0.001)
+    ages = torch.stack([frame_ages(frames, STREAM, torch.full((2000,), t / 7)) for t in range(99)])
+    assert ages.min() >= 0.05
+    some = BodyRate.hovering(torch.zeros(1, 3), torch.zeros(1))
+    assert (ages.max() * 15).ceil() < remembered(some, STREAM, 15.0).state.shape[1]
 
 
 class Watcher:

@@ -8,8 +8,13 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
 from splatpilot.systems.policies import depthnav_inference as depthnav_policy
 from splatpilot.systems.policies import diffaero_inference as diffaero_policy
+from splatpilot.systems.policies import diffaero_tof_inference as tof_policy
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.diffaero_tof import DiffAeroTofConfig
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
+from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
+from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
 from splatpilot.training.policies.agile_autonomy_agent import AgileAutonomyAgent
 from splatpilot.training.policies.depthnav import (
     DepthNavLearner,
@@ -17,6 +22,7 @@ from splatpilot.training.policies.depthnav import (
     quaternion_from_rotation,
 )
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
+from splatpilot.training.policies.diffaero_tof import DiffAeroTofLearner
 from splatpilot.training.policies.network import TrajectoryModule
 from splatpilot.training.policies.observation import Observation
 from splatpilot.training.policies.vehicles import BodyRate
@@ -46,6 +52,32 @@ def observed(depth: np.ndarray, body: BodyRate) -> Observation:
 
 def pose(state: np.ndarray) -> RigidTransform:
     return RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), state[:3])
+
+
+def test_policy_of_time_of_flight_flies_as_it_was_trained():
+    """From three raw images in a row, by the grid that a sensor's frames become and the law that
+    takes up velocities, the numpy policy accelerates as torch does."""
+    torch.manual_seed(1)
+    learner = DiffAeroTofLearner(DiffAeroLoss())
+    with torch.no_grad():
+        learner.network.head.weight.mul_(10.0)
+    network = RecurrentNetwork(DIFFAERO_NETWORK, weights_of(learner.network))
+    body, sensor = vehicle(), sensor_of(DiffAeroTofConfig().camera)
+    state = body.state[0].double().numpy()
+    memory, hidden = learner.initial_memory(1), network.initial_hidden()
+    for seed in range(3):
+        depth = np.random.default_rng(seed).uniform(0.0, 50.0, (36, 64)).astype(np.float32)
+        depth[0, 0], depth[1, 1] = 0.0, np.inf
+        with torch.no_grad():
+            a_cmd, _, memory = learner.decide(observed(depth, body), memory)
+        grid = time_of_flight_grid(depth, sensor)
+        v_wanted, hidden = tof_policy.decide(
+            network, grid, pose(state), state[3:6], P_WG, 2.0, hidden
+        )
+        a_WB = tracking_acceleration(state[3:6], v_wanted)
+        np.testing.assert_allclose(a_WB, a_cmd[0].numpy(), atol=2e-4)
+        np.testing.assert_allclose(hidden, memory[0].numpy(), atol=1e-5)
+        assert np.abs(a_WB).max() > 0.01 and 0.1 < grid.mean() < 0.9
 
 
 @pytest.mark.parametrize("name", ["diffaero", "depthnav"])

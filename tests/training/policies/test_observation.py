@@ -6,12 +6,22 @@ import torch
 
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies import velocity_tracking
+from splatpilot.systems.policies.diffaero_tof import DiffAeroTofConfig
 from splatpilot.systems.sensing import observation_noise
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.sensing.time_of_flight import (
+    range_of_depth,
+    sensor_of,
+    time_of_flight_grid,
+)
 from splatpilot.training.policies.diffaero import DiffAeroTraining
 from splatpilot.training.policies.observation import (
     disturb_depth,
     noisy_depth,
+    proximity_grid,
+    tracking_acceleration,
     training_noise,
     validate_training_noise,
 )
@@ -42,6 +52,33 @@ def test_noise_is_drawn_as_asked_for():
     assert float(noisy[seen].mean()) == pytest.approx(4.0, abs=0.003)
 
 
+@pytest.mark.parametrize("camera", [DiffAeroTofConfig().camera, OnboardCamera(32, 18, 100.0)])
+def test_training_has_the_grid_of_the_sensor(camera):
+    """In images of any depth, not measured and infinite too, torch finds the proximities that
+    frames of that sensor become."""
+    sensor = sensor_of(camera)
+    depth = np.random.default_rng(0).uniform(0.0, 9.0, (5, camera.height, camera.width))
+    depth[depth < 1.0], depth[depth > 8.0] = 0.0, np.inf
+    depth[0] = np.inf
+    to_range = range_of_depth(sensor.height, sensor.width, sensor.fov_x, sensor.fov_y)
+    trained = proximity_grid(
+        torch.tensor(depth).flatten(1), torch.tensor(to_range), sensor.max_range, 9, 16
+    )
+    flown = np.stack([time_of_flight_grid(image, sensor) for image in depth])
+    np.testing.assert_allclose(trained, flown, atol=1e-12)
+    assert flown[1:].max() > 0.7 and not flown[0].any()
+
+
+def test_training_takes_up_velocities_as_flight_does():
+    """Accelerations towards wanted velocities are those of flight, beyond the greatest too, and
+    none is asked for by the velocity that there is."""
+    v, wanted = np.random.default_rng(0).normal(scale=2.0, size=(2, 50, 3))
+    wanted[0] = v[0]
+    trained = tracking_acceleration(torch.tensor(v), torch.tensor(wanted))
+    flown = [velocity_tracking.tracking_acceleration(*row) for row in zip(v, wanted, strict=True)]
+    np.testing.assert_allclose(trained, flown, atol=1e-12)
+
+
 def test_noise_that_training_cannot_have_is_named():
     """Noise of colours, which training does not see, and noise out of range are refused."""
     with pytest.raises(ValueError, match=r"noise\.brightness_jitter is 0\.2, but training"):
@@ -54,6 +91,6 @@ def test_noise_that_does_not_exist_is_named():
     """A field that there is not, in a scenario and in training, is an error that lists those that
     there are."""
     for config, field in (Scenario(), "observation"), (DiffAeroTraining(), "rollout.noise"):
-        known = rf"there is no field {field}\.jitter; the fields are .*{field}\.depth_dropout"
+        known = rf"there is no field {field}\.blur; the fields are .*{field}\.depth_dropout"
         with pytest.raises(ValueError, match=known):
-            load_config(config, overrides=[f"{field}.jitter=0.1"])
+            load_config(config, overrides=[f"{field}.blur=0.1"])

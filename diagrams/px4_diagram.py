@@ -1,0 +1,121 @@
+"""A vehicle that PX4 flies, behind the messages of the simulated one."""
+
+from lcm import LCM
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Demultiplexer
+
+from splatpilot.diagrams.px4_config import Px4Config
+from splatpilot.systems.messaging.codecs import (
+    Codec,
+    CommandCodec,
+    MotionCaptureCodec,
+    StateCodec,
+    StatusCodec,
+    VelocitySetpointCodec,
+)
+from splatpilot.systems.messaging.message_publisher import MessagePublisher
+from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
+from splatpilot.systems.messaging.udp_inbox import UdpInbox
+from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.px4.mavlink import Mavlink
+from splatpilot.systems.px4.motion_capture_receiver import MotionCaptureReceiver
+from splatpilot.systems.px4.px4_commander import Px4Commander
+from splatpilot.systems.px4.px4_telemetry import Px4Telemetry
+from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
+
+
+def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
+    """
+    Builds the diagram that stands between the bridge's messages and PX4: in the place of
+    `BuildVehicleDiagram`, but for images, which sensors send themselves.
+
+    Systems, by name: `clock`, `telemetry`, `commander`, `state_publisher`, and the subscribers
+    `setpoint_subscriber`, `status_subscriber` and, where there is motion capture,
+    `motion_capture_subscriber`, or `motion_capture_receiver` and `motion_capture_publisher`.
+
+    .. pydrake_system::
+
+        name: px4
+        output_ports:
+        - state
+        - state_age
+        - armed
+        - mode
+
+    The ports are those of `Px4Telemetry`.
+
+    Args:
+        config: how.
+        lcm: where the bridge is.
+        inbox: where PX4 is.
+
+    Raises:
+        ValueError: for a configuration out of range.
+        ModuleNotFoundError: where pymavlink is not installed.
+    """
+    config.validate()
+    builder = DiagramBuilder()
+    mavlink, clock = Mavlink(config.system), UnixClock()
+    telemetry = Px4Telemetry(inbox, mavlink, config.tick)
+    address = config.vehicle_host, config.vehicle_port
+    commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY)
+    publisher = MessagePublisher(lcm, StateCodec(), 1 / config.state_rate)
+    for name, system in (
+        ("clock", clock),
+        ("telemetry", telemetry),
+        ("commander", commander),
+        ("state_publisher", publisher),
+    ):
+        builder.AddNamedSystem(name, system)
+
+    def add_subscriber(name: str, codec: Codec) -> tuple[OutputPort, OutputPort]:
+        subscriber = MessageSubscriber(lcm, codec, config.tick)
+        builder.AddNamedSystem(f"{name}_subscriber", subscriber)
+        builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
+        return subscriber.GetOutputPort(codec.port), subscriber.age_output_port()
+
+    velocity = config.commander.setpoints == "velocity"
+    setpoint, age = add_subscriber(
+        "setpoint", VelocitySetpointCodec() if velocity else CommandCodec()
+    )
+    status, _ = add_subscriber("status", StatusCodec())
+    first = Demultiplexer([1, StatusCodec.size - 1])
+    builder.AddNamedSystem("status_mode", first)
+    builder.Connect(status, first.get_input_port())
+    for source, name in (
+        (setpoint, "setpoint"),
+        (age, "setpoint_age"),
+        (first.get_output_port(0), "bridge_mode"),
+        (telemetry.armed_output_port(), "armed"),
+        (telemetry.mode_output_port(), "mode"),
+        (clock.get_output_port(), "unix_time"),
+    ):
+        builder.Connect(source, commander.GetInputPort(name))
+    if config.body:
+        codec = MotionCaptureCodec(config.body)
+        if config.motion_capture is None:
+            pose, age = add_subscriber("motion_capture", codec)
+        else:
+            eye = MotionCaptureReceiver(config.motion_capture, config.tick)
+            builder.AddNamedSystem("motion_capture_receiver", eye)
+            pose, age = eye.motion_capture_pose_output_port(), eye.age_output_port()
+            sender = MessagePublisher(lcm, codec, 1 / config.state_rate)
+            builder.AddNamedSystem("motion_capture_publisher", sender)
+            builder.Connect(pose, sender.GetInputPort(codec.port))
+            builder.Connect(clock.get_output_port(), sender.unix_time_input_port())
+        builder.Connect(pose, commander.motion_capture_pose_input_port())
+        builder.Connect(age, commander.motion_capture_age_input_port())
+
+    builder.Connect(telemetry.state_output_port(), publisher.GetInputPort("state"))
+    builder.Connect(telemetry.is_fresh_output_port(), publisher.enabled_input_port())
+    builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+    for port, name in (
+        ("state", "state"),
+        ("age", "state_age"),
+        ("armed", "armed"),
+        ("mode", "mode"),
+    ):
+        builder.ExportOutput(telemetry.GetOutputPort(port), name)
+    diagram = builder.Build()
+    diagram.set_name("px4")
+    return diagram

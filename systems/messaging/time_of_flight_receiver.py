@@ -1,0 +1,163 @@
+"""TimeOfFlightReceiver: the grid that a time-of-flight sensor streams by UDP."""
+
+import logging
+import math
+import weakref
+from dataclasses import dataclass, field, replace
+from typing import cast
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from splatpilot.systems.messaging.udp_inbox import Datagrams, UdpConfig, UdpInbox
+from splatpilot.systems.ports import output_port
+from splatpilot.systems.sensing.time_of_flight import TimeOfFlight
+from splatpilot.systems.sensing.time_of_flight_packets import Stream, after_packet
+
+_RESTART = 1.0  # [s], after which a stream that fell silent may be another.
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class TimeOfFlightStream:
+    """Where a sensor streams to, and how."""
+
+    udp: UdpConfig = field(default_factory=UdpConfig)
+    sensor: TimeOfFlight = field(default_factory=TimeOfFlight)
+    # [s] How old images are when they come: their own clock is another.
+    latency: float = 0.03
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        self.udp.validate("time_of_flight.udp")
+        self.sensor.validate()
+        if not 0.0 <= self.latency <= 1.0:
+            raise ValueError(f"time_of_flight.latency is {self.latency} s; it must be 0 to 1")
+
+
+@dataclass(frozen=True, eq=False)
+class _Received:
+    """What has come. Nothing in it changes: Contexts may share it."""
+
+    stream: Stream = field(default_factory=Stream)
+    time: float = -math.inf  # [s], of the Context, when the newest grid came.
+    rejected: int = 0
+
+    def __deepcopy__(self, memo: dict) -> "_Received":
+        return self
+
+
+class TimeOfFlightReceiver(LeafSystem):
+    """Gives the last grid of a stream, its age, and how much of the stream was lost or of no use.
+
+    .. pydrake_system::
+
+        name: TimeOfFlightReceiver
+        output_ports:
+        - depth_grid
+        - age
+        - gaps
+        - rejected
+
+    - ``depth_grid`` (rows * columns): see
+      :class:`~splatpilot.systems.sensing.time_of_flight_grid.TimeOfFlightGrid`; zeros before
+      the first.
+    - ``age`` (1): [s] since the last was seen; infinity before the first.
+    - ``gaps`` (1): how many images were sent between those that came.
+    - ``rejected`` (1): how many packets were of another length, kind or size, no newer than the one
+      before, or of others than the senders that are named. The reason is logged at the first,
+      second, fourth, eighth... rejection.
+
+    Takes what has come every ``period`` seconds from time 0, in an unrestricted update. All of that
+    is in the Context; outside of it is the socket.
+    """
+
+    depth_grid_output_port = output_port("depth_grid")
+    age_output_port = output_port("age")
+    gaps_output_port = output_port("gaps")
+    rejected_output_port = output_port("rejected")
+
+    def __init__(self, config: TimeOfFlightStream, period: float):
+        """Constructs the system.
+
+        Args:
+            config: where the sensor streams to.
+            period: [s] between looks at what has come.
+
+        Raises:
+            ValueError: on a configuration out of range.
+            OSError: if the port is in use.
+        """
+        super().__init__()
+        config.validate()
+        self._config = config
+        self._inbox = inbox = UdpInbox(config.udp)
+        weakref.finalize(self, inbox.close)
+        self._waiting: list[Datagrams] = []
+        state = self.DeclareAbstractState(Value(_Received()))
+        ticket = {self.abstract_state_ticket(state)}
+        size = config.sensor.rows * config.sensor.columns
+        self.DeclareVectorOutputPort("depth_grid", size, self._calc_grid, ticket)
+        self.DeclareVectorOutputPort("age", 1, self._calc_age)
+        self.DeclareVectorOutputPort("gaps", 1, self._calc_gaps, ticket)
+        self.DeclareVectorOutputPort("rejected", 1, self._calc_rejected, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._take)
+
+    @property
+    def channel(self) -> str:
+        """Where the stream comes to."""
+        return f"UDP port {self._inbox.port}"
+
+    @property
+    def port(self) -> int:
+        """The UDP port that the stream comes to."""
+        return self._inbox.port
+
+    def has_message(self) -> bool:
+        """Whether anything has come that the next update will look at."""
+        self._waiting.append(self._inbox.receive())
+        return any(datagrams.packets for datagrams in self._waiting)
+
+    def _take(self, context: Context, state: State) -> None:
+        received, now = _received(context), context.get_time()
+        for packets, strangers in (*self._waiting, self._inbox.receive()):
+            if strangers:
+                received = _rejected(received, strangers, self.channel, "its sender is not named")
+            for packet in packets:
+                if now - received.time > _RESTART:  # Its clock may begin anew.
+                    received = replace(received, stream=received.stream.restarted())
+                try:
+                    stream = after_packet(received.stream, packet, self._config.sensor)
+                except ValueError as error:
+                    received = _rejected(received, 1, self.channel, str(error))
+                    continue
+                time = now if stream.time_ns > received.stream.time_ns else received.time
+                received = replace(received, stream=stream, time=time)
+        self._waiting.clear()
+        state.get_mutable_abstract_state(0).set_value(received)
+
+    def _calc_grid(self, context: Context, output: BasicVector) -> None:
+        grid = _received(context).stream.grid
+        output.SetFromVector(np.zeros(output.size()) if grid is None else grid.ravel())
+
+    def _calc_age(self, context: Context, output: BasicVector) -> None:
+        output[0] = context.get_time() - _received(context).time + self._config.latency
+
+    def _calc_gaps(self, context: Context, output: BasicVector) -> None:
+        output[0] = _received(context).stream.gaps
+
+    def _calc_rejected(self, context: Context, output: BasicVector) -> None:
+        output[0] = _received(context).rejected
+
+
+def _rejected(received: _Received, count: int, channel: str, why: str) -> _Received:
+    total = received.rejected + count
+    if total.bit_length() != received.rejected.bit_length():
+        _log.warning("%s: a packet is refused, %d so far: %s", channel, total, why)
+    return replace(received, rejected=total)
+
+
+def _received(context: Context) -> _Received:
+    return cast(_Received, context.get_abstract_state(0).get_value())

@@ -1,0 +1,40 @@
+"""`splatpilot px4`, before anything flies."""
+
+import pytest
+
+from splatpilot.analysis.cli import main
+from splatpilot.diagrams import px4
+from splatpilot.diagrams.px4_config import Px4Config
+from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
+
+
+def test_it_says_what_it_will_not_do(udp_url, capsys):
+    """Where nothing else is asked for, offboard mode and arming are the pilot's."""
+    px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=0)), duration=0.1)
+    said = capsys.readouterr().out
+    assert "Offboard mode is left to the pilot." in said
+    assert "Arming is left to the pilot." in said
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--arm"], "px4.arm is asked for without px4.engage; give both"),
+        (["--set", "motion_capture={}"], "px4.motion_capture has no px4.body"),
+        (["--set", "udp.senders=[drone]"], "px4.udp.senders is 'drone'"),
+        (["--set", "system=0"], "px4.system is 0"),
+        (["--lcm-url", "tcp://there"], "must begin with udpm://"),
+    ],
+)
+def test_bad_input_is_an_error_before_anything_is_sent(words, why, capsys):
+    """Each is one sentence on standard error."""
+    assert main(["px4", *words]) == 1
+    assert why in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_an_error(udp_url):
+    """Who else listens for PX4 there is noticed at once."""
+    inbox = UdpInbox(UdpConfig(port=0))
+    with pytest.raises(OSError, match="Address already in use"):
+        px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=inbox.port)))
+    inbox.close()

@@ -1,0 +1,161 @@
+"""A STAND-IN for PX4, which is in no package registry: real MAVLink over UDP, a quadrotor that
+takes velocities up, and what PX4's documentation of v1.16 and v1.18 says of offboard mode.
+
+It is no proof of what PX4 does.
+"""
+
+import socket
+
+import numpy as np
+from pymavlink.dialects.v20 import common as dialect
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
+from splatpilot.systems.vehicle.flatness_controller import (
+    FlatnessControllerConfig,
+    flatness_command,
+)
+from splatpilot.systems.vehicle.quadrotor_dynamics import (
+    GRAVITY,
+    QuadrotorParams,
+    hover_state,
+    rk4_step,
+)
+
+OFFBOARD, LOITER, LAND, POSITION = (6, 0), (4, 3), (4, 6), (3, 0)
+HALF_TURN = Rotation.from_euler("x", 180, degrees=True)
+STEP = 0.01  # [s]
+
+
+class Px4StandIn:
+    """
+    Args:
+        version: "1.16" or "1.18", whose rules of offboard mode are enforced.
+        p_WB: (3,) [m] where the vehicle is, in flight.
+        loss_timeout: [s] COM_OF_LOSS_T.
+    """
+
+    def __init__(self, version: str, p_WB, loss_timeout: float = 1.0):
+        self.streamed_before = {"1.16": 1.0, "1.18": 0.0}[version]
+        self.loss_timeout = loss_timeout
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.setblocking(False)
+        self.port = self.socket.getsockname()[1]
+        self.peer = None
+        self.link = dialect.MAVLink(None, 1, 1)
+        self.parser = dialect.MAVLink(None)
+        self.state = hover_state(p_WB)
+        self.armed, self.mode = False, POSITION
+        self.velocity, self.rates = np.zeros(3), None
+        self.stream_began = self.last_setpoint = -np.inf
+        self.odometry, self.refused, self.answers, self.heard = None, [], [], []
+        self.tick = 0
+
+    def step(self, now: float) -> None:
+        """What happens until `now` [s]."""
+        while self.tick * STEP <= now:
+            self._receive(self.tick * STEP)
+            self._fly(self.tick * STEP)
+            self._tell(self.tick * STEP)
+            self.tick += 1
+
+    def _receive(self, now: float) -> None:
+        while True:
+            try:
+                packet, self.peer = self.socket.recvfrom(65536)
+            except BlockingIOError:
+                return
+            for message in self.parser.parse_buffer(packet) or []:
+                self.heard.append(message.get_type())
+                self._obey(message, now)
+
+    def _obey(self, message, now: float) -> None:
+        kind = message.get_type()
+        if kind == "SET_POSITION_TARGET_LOCAL_NED":
+            frames = dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_NED
+            if message.coordinate_frame not in frames or message.type_mask not in (1479, 2503):
+                self.refused.append(message)
+                return
+            self._streamed(now)
+            ned = np.array([message.vx, message.vy, message.vz])
+            self.velocity, self.rates = HALF_TURN.apply(ned), None
+        elif kind == "SET_ATTITUDE_TARGET":
+            if message.type_mask != 128 or not 0.0 <= message.thrust <= 1.0:
+                self.refused.append(message)
+                return
+            self._streamed(now)
+            frd = [message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate]
+            self.rates = np.append(message.thrust / 0.5 * GRAVITY, HALF_TURN.apply(frd))
+        elif kind == "ODOMETRY":
+            self.odometry = message
+        elif kind == "COMMAND_LONG":
+            accepted = self._command(message, now)
+            result = dialect.MAV_RESULT_ACCEPTED if accepted else dialect.MAV_RESULT_DENIED
+            self.answers.append((message.command, accepted))
+            self._send(dialect.MAVLink_command_ack_message(message.command, result))
+
+    def _streamed(self, now: float) -> None:
+        if now - self.last_setpoint > 0.5:
+            self.stream_began = now
+        self.last_setpoint = now
+
+    def _may_fly_offboard(self, now: float) -> bool:
+        flows = now - self.last_setpoint <= 0.5
+        return flows and now - self.stream_began >= self.streamed_before
+
+    def _command(self, message, now: float) -> bool:
+        if message.command == dialect.MAV_CMD_COMPONENT_ARM_DISARM:
+            if message.param1 and self.mode == OFFBOARD and not self._may_fly_offboard(now):
+                return False
+            self.armed = bool(message.param1)
+            return True
+        if message.command == dialect.MAV_CMD_DO_SET_MODE:
+            mode = int(message.param2), int(message.param3)
+            if mode == OFFBOARD and not self._may_fly_offboard(now):
+                return False
+            self.mode = mode
+            return True
+        return False
+
+    def _fly(self, now: float) -> None:
+        if self.mode == OFFBOARD and now - self.last_setpoint > self.loss_timeout:
+            self.mode = LOITER  # COM_OBL_RC_ACT
+        if not self.armed:
+            return
+        wanted = {OFFBOARD: self.velocity, LAND: np.array([0.0, 0.0, -0.5])}.get(
+            self.mode, np.zeros(3)
+        )
+        command = self.rates if self.mode == OFFBOARD else None
+        if command is None:
+            acceleration = tracking_acceleration(self.state[3:6], wanted)
+            law, vehicle = FlatnessControllerConfig(), QuadrotorParams()
+            command = flatness_command(self.state, acceleration, np.zeros(3), np.nan, law, vehicle)
+        self.state = rk4_step(self.state, command, QuadrotorParams(), STEP)
+
+    def _tell(self, now: float) -> None:
+        milliseconds = round(now * 1e3)
+        if self.tick % 2 == 0:
+            p, v = HALF_TURN.apply(self.state[:3]), HALF_TURN.apply(self.state[3:6])
+            self._send(dialect.MAVLink_local_position_ned_message(milliseconds, *p, *v))
+            R_WB = Rotation.from_quat(np.roll(self.state[6:10], -1))
+            x, y, z, w = (HALF_TURN * R_WB * HALF_TURN.inv()).as_quat()
+            rates = HALF_TURN.apply(self.state[10:13])
+            self._send(
+                dialect.MAVLink_attitude_quaternion_message(milliseconds, w, x, y, z, *rates)
+            )
+        if self.tick % 50 == 0:
+            base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+            base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
+            custom = (self.mode[0] << 16) | (self.mode[1] << 24)
+            self._send(
+                dialect.MAVLink_heartbeat_message(
+                    dialect.MAV_TYPE_QUADROTOR,
+                    dialect.MAV_AUTOPILOT_PX4,
+                    *(base, custom, dialect.MAV_STATE_ACTIVE, 3),
+                )
+            )
+
+    def _send(self, message) -> None:
+        if self.peer is not None:
+            self.socket.sendto(bytes(message.pack(self.link)), self.peer)

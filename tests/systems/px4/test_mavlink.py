@@ -1,0 +1,116 @@
+"""Messages to and from PX4, read and written by pymavlink's own end."""
+
+import math
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from splatpilot.systems.px4.mavlink import HOLD, OFFBOARD, Attitude, Heartbeat, Mavlink, Position
+
+OURS = Mavlink()
+PX4 = dialect.MAVLink(None, 1, 1)
+
+
+def received(packet: bytes):
+    """The one message in a packet."""
+    (message,) = dialect.MAVLink(None).parse_buffer(packet) or []
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
+    return message
+
+
+def sent(*messages) -> bytes:
+    return b"".join(bytes(message.pack(PX4)) for message in messages)
+
+
+def test_velocity_setpoint_is_in_the_local_frame():
+    """North, east and down of a velocity, and only that, or that and a yaw, are to be flown."""
+    message = received(OURS.velocity_setpoint(np.array([1.0, 2.0, 3.0, math.nan]), 2.5))
+    assert (message.vx, message.vy, message.vz, message.yaw_rate) == (1.0, -2.0, -3.0, 0.0)
+    assert message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
+    ignored = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
+    ignored |= dialect.POSITION_TARGET_TYPEMASK_Y_IGNORE | dialect.POSITION_TARGET_TYPEMASK_Z_IGNORE
+    ignored |= dialect.POSITION_TARGET_TYPEMASK_AX_IGNORE
+    ignored |= dialect.POSITION_TARGET_TYPEMASK_AY_IGNORE
+    ignored |= dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
+    assert message.type_mask == ignored | dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE == 1479
+    assert message.time_boot_ms == 2500
+    message = received(OURS.velocity_setpoint(np.array([0.0, 0.0, 0.0, 0.5]), 2.5))
+    assert message.type_mask == ignored | dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE == 2503
+    assert message.yaw == -0.5
+
+
+def test_body_rates_have_thrust_from_0_to_1():
+    """Rates are forward, right, down, attitudes ignored; the weight takes the hover thrust."""
+    message = received(OURS.body_rates(np.array([9.81, 0.5, 0.25, -0.125]), 0.375, 9.81, 0.0))
+    rates = message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate
+    assert rates == (0.5, -0.25, 0.125)
+    assert message.thrust == 0.375
+    assert message.type_mask == dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE == 128
+
+
+def test_odometry_is_what_ekf2_takes():
+    """Pose in the local frame, forward right down; velocities unknown."""
+    q_WB = np.array([0.5, 0.5, 0.5, -0.5])
+    message = received(OURS.odometry(np.array([1.0, 2.0, 3.0, *q_WB]), 1_800_000_000_000_000))
+    assert message.frame_id == dialect.MAV_FRAME_LOCAL_FRD
+    assert message.child_frame_id == dialect.MAV_FRAME_BODY_FRD
+    assert (message.x, message.y, message.z) == (1.0, -2.0, -3.0)
+    assert message.q == [0.5, 0.5, -0.5, 0.5]
+    assert math.isnan(message.vx) and math.isnan(message.pose_covariance[0])
+    assert message.time_usec == 1_800_000_000_000_000
+
+
+def test_requests_are_those_of_px4():
+    """Offboard is main mode 6, hold is 3 of the automatic ones, and to arm is a request of its
+    own."""
+    message = received(OURS.set_mode(OFFBOARD))
+    assert message.command == dialect.MAV_CMD_DO_SET_MODE
+    assert (message.param1, message.param2, message.param3) == (1.0, 6.0, 0.0)
+    message = received(OURS.set_mode(HOLD))
+    assert (message.param2, message.param3) == (4.0, 3.0)
+    message = received(OURS.arm())
+    assert (message.command, message.param1) == (dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    assert message.param2 == 0.0  # Not by force.
+    assert received(OURS.heartbeat()).type == dialect.MAV_TYPE_ONBOARD_CONTROLLER
+
+
+def test_what_px4_says_is_in_our_frames():
+    """Position, velocity, attitude, rates, mode and arming are read, several in a packet; what is
+    of no interest, and what others say, is left out."""
+    d = dialect
+    custom = (6 << 16) | (0 << 24)
+    packet = sent(
+        d.MAVLink_heartbeat_message(2, 12, 128 | 1, custom, 4, 3),
+        d.MAVLink_local_position_ned_message(0, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125),
+        d.MAVLink_attitude_quaternion_message(0, 0.5, 0.5, -0.5, 0.5, 0.1, 0.2, 0.3),
+        d.MAVLink_system_time_message(0, 0),
+    )
+    others = bytes(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(d.MAVLink(None, 255, 190)))
+    heartbeat, position, attitude = OURS.read(packet + others)
+    assert heartbeat == Heartbeat(True, OFFBOARD)
+    assert isinstance(position, Position) and isinstance(attitude, Attitude)
+    np.testing.assert_array_equal(position.p_WB, [1, -2, 3])
+    np.testing.assert_array_equal(position.v_WB, [0.5, -0.25, 0.125])
+    np.testing.assert_array_equal(attitude.q_WB, [0.5, 0.5, 0.5, -0.5])
+    np.testing.assert_allclose(attitude.w_WB_B, [0.1, -0.2, -0.3], rtol=1e-6)
+
+
+GOOD = sent(dialect.MAVLink_local_position_ned_message(0, 1.0, 2.0, 3.0, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b"LC02",
+        GOOD[:-1],
+        GOOD[:20] + b"!" + GOOD[21:],
+        sent(dialect.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0)),
+        sent(dialect.MAVLink_attitude_quaternion_message(0, 2.0, 0, 0, 0, 0, 0, 0)),
+        np.random.default_rng(0).bytes(300),
+    ],
+)
+def test_what_is_no_message_is_refused(packet):
+    """Packets that are cut, changed or of something else, and numbers that are none, are errors."""
+    with pytest.raises(ValueError, match=r"the packet|values are|no unit quaternion"):
+        OURS.read(packet)
