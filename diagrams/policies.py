@@ -18,6 +18,7 @@ from splatpilot.systems.policies.privileged_planner import (
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.reactive_planner import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
+from splatpilot.systems.policies.student import Student, StudentDepthConfig, StudentRgbConfig
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
 from splatpilot.systems.registry import Registry
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
@@ -104,6 +105,15 @@ register_policy(
 
 BENCHMARK_POLICIES = tuple(POLICIES.registered())
 """Those that a study flies when nobody says which: our own, whatever else is installed."""
+
+# Of these no weights ship.
+for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
+    register_policy(
+        _config,
+        lambda config, world, vehicle: Student(config),
+        name=_name,
+        at_speed=lambda speed, config=_config: config(),
+    )
 
 
 def policy_named(name: str, speed: float = 2.0) -> Any:
