@@ -9,6 +9,8 @@ from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, Ag
 from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.rollout_trainer import RolloutTrainer
+from splatpilot.training.policies.student import StudentTrainer
+from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
 from splatpilot.training.policies.trainer import Trainer
 
 
@@ -52,3 +54,5 @@ register_trainer(
     lambda config: RolloutTrainer("depthnav", DepthNavLearner(config.loss, config.device), config),
 )
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
+register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
+register_trainer("student_depth", StudentDepthTraining, StudentTrainer)

@@ -32,6 +32,8 @@ from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_s
 from splatpilot.training.policies.train import run
 from splatpilot.training.policies.trainer import Schedule
 
+CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
+
 SMALL = [
     "worlds.kinds=[P10]",
     "worlds.count=1",
@@ -146,13 +148,12 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
     assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
 
 
-@pytest.mark.parametrize("policy", TRAINERS.registered())
-def test_model_cards_hold_configurations_that_train(policy, tmp_path):
+@pytest.mark.parametrize("card", CARDS, ids=[card.stem for card in CARDS])
+def test_model_cards_hold_configurations_that_train(card, tmp_path):
     """What a shipped card says the weights were made with is a configuration of `train`."""
-    card = (Path(policy_checkpoint.__file__).parent / "weights" / f"{policy}.md").read_text()
     config = tmp_path / "config.yaml"
-    config.write_text(re.search("```yaml\n(.*?)```", card, re.DOTALL)[1])
-    load_config(TRAINERS.find(policy).config(), config).validate()
+    config.write_text(re.search("```yaml\n(.*?)```", card.read_text(), re.DOTALL)[1])
+    load_config(TRAINERS.find(card.stem).config(), config).validate()
 
 
 def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
