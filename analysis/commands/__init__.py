@@ -18,6 +18,7 @@ from splatpilot.analysis.commands import (
     merge,
     places,
     reconstruct,
+    recover,
     replay,
     tour,
     train,
@@ -39,4 +40,5 @@ COMMANDS = (
     tour,
     corpus,
     train,
+    recover,
 )
