@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus import library, make
+from splatpilot.training.corpus import make
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.library import LibraryConfig
@@ -31,17 +30,16 @@ TINY = [
 @pytest.fixture(scope="module")
 def expert(tmp_path_factory) -> Path:
     """The folder of a corpus of one short flight in each of two small forests."""
-    small = ForestConfig(length=10.0, width=8.0, height=4.0)
+    folder = tmp_path_factory.mktemp("expert")
+    grove = folder / "grove.yaml"
+    grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
     config = CorpusConfig(
-        worlds=LibraryConfig(kinds=["P02"]),
-        expert=ExpertConfig(period=0.8, plans=4),
+        worlds=LibraryConfig(kinds=[str(grove)]),
+        expert=ExpertConfig(period=0.8),
         flights=1,
         camera=OnboardCamera(width=32, height=24),
     )
-    folder = tmp_path_factory.mktemp("expert")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(library, "world_of", lambda kind: small)
-        make.run(config=config, out=folder, worlds=2, jobs=1)
+    make.run(config=config, out=folder, worlds=2, jobs=1)
     return folder
 
 
