@@ -85,7 +85,7 @@ def mobilenet_shapes() -> dict[str, tuple[int, ...]]:
 
 
 class MobileNet:
-    """The encoder with its weights, run by OpenCV on one thread of the caller's.
+    """The encoder with its weights, run by OpenCV: the same bits on any number of its threads.
 
     Args:
         height, width: of the images [px].

@@ -3,7 +3,12 @@
 import cv2
 import numpy as np
 
-from splatpilot.systems.policies.mobilenet import adds_input, mobilenet_blocks
+from splatpilot.systems.policies.mobilenet import (
+    MobileNet,
+    adds_input,
+    mobilenet_blocks,
+    mobilenet_shapes,
+)
 from splatpilot.systems.policies.onnx_model import OnnxModel
 
 
@@ -54,3 +59,23 @@ def test_encoder_has_the_published_shape():
     # The encoder's part of the published 3.5 million, less a scale of batch norm a channel.
     assert sum(int(np.prod(shape)) for shape in shapes) == 2_223_872 - 17_056
     assert np.prod([layer.stride for block in blocks for layer in block]) == 32
+
+
+def test_threads_change_no_bit():
+    """What the encoder makes of an image does not depend on how many threads OpenCV may use."""
+    rng = np.random.default_rng(0)
+    weights = {
+        name: rng.normal(scale=0.2, size=shape).astype(np.float32)
+        for name, shape in mobilenet_shapes().items()
+    }
+    encoder, image = MobileNet(96, 128, weights), rng.uniform(-1, 1, (3, 96, 128))
+    threads = cv2.getNumThreads()
+    try:
+        features = []
+        for count in (1, 2, 3):
+            cv2.setNumThreads(count)
+            features.append(encoder(image).copy())
+    finally:
+        cv2.setNumThreads(threads)
+    assert features[0].std() > 0.01
+    assert all(np.array_equal(features[0], other) for other in features[1:])
