@@ -35,7 +35,7 @@ def expert(tmp_path_factory) -> Path:
     grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
     config = CorpusConfig(
         worlds=LibraryConfig(kinds=[str(grove)]),
-        expert=ExpertConfig(period=0.8),
+        expert=ExpertConfig(period=0.5),
         flights=1,
         camera=OnboardCamera(width=32, height=24),
     )
