@@ -19,6 +19,7 @@ from splatpilot.systems.policies.privileged_planner import (
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.reactive_planner import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
+from splatpilot.systems.policies.student import Student, StudentDepthConfig, StudentRgbConfig
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
 from splatpilot.systems.registry import Registry
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
@@ -111,6 +112,15 @@ those that see by a sensor of their own."""
 register_policy(
     DiffAeroTofConfig, lambda config, world, vehicle: DiffAeroTof(config), name="diffaero_tof"
 )
+
+# Of these no weights ship.
+for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
+    register_policy(
+        _config,
+        lambda config, world, vehicle: Student(config),
+        name=_name,
+        at_speed=lambda speed, config=_config: config(),
+    )
 
 
 def policy_named(name: str, speed: float = 2.0) -> Any:

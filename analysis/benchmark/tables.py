@@ -34,6 +34,8 @@ PAPER = {
     "diffaero": PaperRow("DiffAero", 16, 0.37, 2.12),
     "depthnav": PaperRow("DepthNav", 14, 0.30, 2.31),
     "agile_autonomy": PaperRow("Agile Autonomy", 5, -0.01, 2.50),
+    "student_depth": PaperRow("Depth", 10, 0.33, 2.28),
+    "student_rgb": PaperRow("RGB", 5, -0.09, 2.51),
 }
 """The paper's Table I, by the names of our policies."""
 

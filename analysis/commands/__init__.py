@@ -19,6 +19,7 @@ from splatpilot.analysis.commands import (
     merge,
     places,
     reconstruct,
+    recover,
     replay,
     tour,
     train,
@@ -41,4 +42,5 @@ COMMANDS = (
     tour,
     corpus,
     train,
+    recover,
 )

@@ -45,7 +45,7 @@ class PolicyCheckpoint:
         """Reads the weights of `policy` from a file, those that ship if `path` is None or empty.
 
         Args:
-            spec: the architecture that the file must be of.
+            spec: the architecture that the file must be of, or the type of those it may be of.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -61,6 +61,13 @@ class PolicyCheckpoint:
                 f"{path} holds weights of the policy {found_policy!r} in format {found_format}, "
                 f"but needed is {policy!r} in format {FORMAT}; {remedy}"
             )
+        if isinstance(spec, type):
+            try:
+                return cls(policy, spec(**found_spec), weights, provenance)
+            except TypeError as error:
+                raise ValueError(
+                    f"{path} holds weights of another architecture ({error}); {remedy}"
+                ) from None
         expected = json.loads(json.dumps(asdict(spec)))
         if found_spec != expected:
             differing = [

@@ -129,13 +129,27 @@ def disturb_depth(
 def noisy_color(
     color: np.ndarray, noise: ObservationNoise, generator: np.random.Generator
 ) -> np.ndarray:
-    """The colour image (H, W, 3) uint8, brighter or darker as a whole, with noise at each pixel.
-
-    c' = c (1 + brightness_jitter u) + 255 color_noise n,   u ~ U(-1, 1), n ~ N(0, 1)
-    """
-    gain = 1.0 + noise.brightness_jitter * generator.uniform(-1.0, 1.0)
+    """The colour image (H, W, 3) uint8, brighter or darker as a whole, with noise at each pixel;
+    see `disturb_color`."""
+    brighter = generator.uniform(-1.0, 1.0)
     grain = generator.standard_normal(color.shape, dtype=np.float32)
-    noisy = np.float32(gain) * color + np.float32(255.0 * noise.color_noise) * grain
+    return disturb_color(color, noise, brighter, grain)
+
+
+def disturb_color(
+    color: np.ndarray, noise: ObservationNoise, brighter: float, grain: np.ndarray
+) -> np.ndarray:
+    """
+    Colours (..., 3), 0 to 255, as a worse camera measures them, uint8.
+
+        c' = c (1 + brightness_jitter u) + 255 color_noise n
+
+    Args:
+        brighter: u, drawn from U(-1, 1) for each image.
+        grain: n, of the colours' shape, drawn from N(0, 1).
+    """
+    gain = np.float32(1.0 + noise.brightness_jitter * brighter)
+    noisy = gain * color + np.float32(255.0 * noise.color_noise) * grain
     return np.clip(noisy + np.float32(0.5), 0.0, 255.0).astype(np.uint8)
 
 

@@ -54,6 +54,22 @@ def disturb_depth(
     return torch.where(drop < noise.depth_dropout, torch.inf, z)
 
 
+def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
+    """Colours (N, H, W, 3), 0 to 255, as a worse camera measures them, each image anew."""
+    brighter = torch.empty_like(color[:, 0, 0, 0]).uniform_(-1.0, 1.0, generator=generator)
+    grain = torch.empty_like(color).normal_(generator=generator)
+    return disturb_color(color, noise, brighter, grain)
+
+
+def disturb_color(
+    color: Tensor, noise: ObservationNoise, brighter: Tensor, grain: Tensor
+) -> Tensor:
+    """See `splatpilot.systems.sensing.observation_noise`; `brighter` is one number (N,) an image,
+    and what is returned is not rounded."""
+    gain = 1.0 + noise.brightness_jitter * brighter[:, None, None, None]
+    return (gain * color + 255.0 * noise.color_noise * grain).clamp(0.0, 255.0)
+
+
 def inverse_depth(depth: Tensor, nearest: float, farthest: float) -> Tensor:
     """Planar depth (...,) [m] as 3 / z - 0.6, z within [nearest, farthest]."""
     return 3.0 / depth.clamp(nearest, farthest) - 0.6

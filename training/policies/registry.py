@@ -10,6 +10,8 @@ from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTrain
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.diffaero_tof import DiffAeroTofLearner, DiffAeroTofTraining
 from splatpilot.training.policies.rollout_trainer import RolloutTrainer
+from splatpilot.training.policies.student import StudentTrainer
+from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
 from splatpilot.training.policies.trainer import Trainer
 
 
@@ -60,3 +62,5 @@ register_trainer(
     ),
 )
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
+register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
+register_trainer("student_depth", StudentDepthTraining, StudentTrainer)

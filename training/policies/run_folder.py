@@ -58,15 +58,16 @@ class RunFolder:
         table.writerows(rows)
         self._write("curves.csv", text.getvalue())
 
-    def write_summary(self, summary: dict[str, Any]) -> None:
-        """Writes `summary.json` and the model card `POLICY.md`."""
+    def write_summary(self, summary: dict[str, Any], measures: str) -> None:
+        """Writes `summary.json` and the model card `POLICY.md`; `measures` says what was measured
+        on held-out worlds."""
         self._write("summary.json", json.dumps(summary, indent=2) + "\n")
-        self._write(f"{summary['policy']}.md", self._model_card(summary))
+        self._write(f"{summary['policy']}.md", self._model_card(summary, measures))
 
-    def _model_card(self, summary: dict[str, Any]) -> str:
+    def _model_card(self, summary: dict[str, Any], measures: str) -> str:
         """What there is to know of trained weights, as Markdown."""
         policy, best, minutes = summary["policy"], summary["best"], summary["cpu_minutes"]
-        measures = "\n".join(
+        rows = "\n".join(
             f"| {name} | {value:.2f} |" for name, value in best.items() if name != "update"
         )
         return f"""# {policy}
@@ -75,12 +76,11 @@ Made by `splatpilot train {policy} --out DIR --config CONFIG` with the configura
 revision {self.revision} of the source, in {minutes:.1f} minutes of one core; {summary["updates"]}
 updates, of which the weights after {best["update"]} did best on held-out worlds.
 
-| on held-out worlds, simulated as in training | |
+| on held-out worlds | |
 |---|---|
-{measures}
+{rows}
 
-`success` is the part that reached the goal; `collisions` and `left` (the volume) are the failures
-that are not for lack of time; a scenario's name stands before the success in worlds of its kind.
+{measures}
 
 ```yaml
 {self.config}```

@@ -13,7 +13,7 @@ from splatpilot.systems.files import written_atomically
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
-from splatpilot.training.policies.trainer import Trainer, TrainingConfig
+from splatpilot.training.policies.trainer import FLIGHTS, Trainer, TrainingConfig
 
 
 @dataclass
@@ -128,7 +128,7 @@ def run[Config: TrainingConfig](
         "cpu_minutes": round(progress.cpu_seconds / 60.0, 2),
         "best": progress.best,
     }
-    folder.write_summary(summary)
+    folder.write_summary(summary, getattr(trainer, "measures", FLIGHTS))
     print(
         f"{trainer.policy}: success {progress.best['success']:.0%} on held-out worlds after "
         f"{progress.best['update']} of {progress.update} updates, "
@@ -139,7 +139,7 @@ def run[Config: TrainingConfig](
 
 def _shown(progress: _Progress) -> dict[str, str]:
     """What the progress bar says: the loss, and the success measured last and best."""
-    shown = {"loss": f"{sum(progress.means.values()):.3f}"}
+    shown = {"loss": f"{progress.means['loss']:.3f}"}
     measured = (row["success"] for row in reversed(progress.curves) if "success" in row)
     if progress.best:
         shown |= {"success": f"{next(measured):.0%}", "best": f"{progress.best['success']:.0%}"}
@@ -152,7 +152,8 @@ def step_optimizer(
     optimizer: torch.optim.Optimizer,
     clip: float,
 ) -> dict[str, float]:
-    """One step down the sum of the terms that `losses` returns; their values.
+    """One step down the sum of the terms that `losses` returns; their values and that of the sum,
+    `loss`. What has no gradient is no part of it.
 
     Raises:
         NotFiniteError: naming the term, or the gradient; the weights are then as before.
@@ -162,12 +163,13 @@ def step_optimizer(
         if not torch.isfinite(term):
             raise NotFiniteError(f"the term {name!r} of the loss became {term.item()}")
     optimizer.zero_grad(set_to_none=True)
-    torch.stack(list(terms.values())).sum().backward()
+    loss = torch.stack([term for term in terms.values() if term.requires_grad]).sum()
+    loss.backward()
     norm = torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     if not torch.isfinite(norm):
         raise NotFiniteError(f"the gradient of the loss became {norm.item()}")
     optimizer.step()
-    return {name: float(term.detach()) for name, term in terms.items()}
+    return {name: float(term.detach()) for name, term in (terms | {"loss": loss}).items()}
 
 
 def _resume(path: Path, trainer: Trainer, optimizer: torch.optim.Optimizer) -> _Progress:

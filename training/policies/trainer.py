@@ -63,8 +63,16 @@ class TrainingConfig(Protocol):
         ...
 
 
+FLIGHTS = """\
+Flown in simulation as in training. `success` is the part that reached the goal; `collisions` and
+`left` (the volume) are the failures that are not for lack of time; a scenario's name stands before
+the success in worlds of its kind."""
+"""What `evaluate` measures, where a trainer's own `measures` does not say that it is other."""
+
+
 class Trainer(Protocol):
-    """What trains one policy, whatever it learns from."""
+    """What trains one policy, whatever it learns from. It may have `measures`, a text for the model
+    card on what `evaluate` measures, see `FLIGHTS`."""
 
     policy: str
     """Name of the policy, and of its file of weights."""
@@ -82,7 +90,8 @@ class Trainer(Protocol):
         ...
 
     def losses(self) -> dict[str, torch.Tensor]:
-        """The terms of the loss, differentiable by the network's weights."""
+        """The terms of the loss, differentiable by the network's weights, and what else the curves
+        are to show, which has no gradient."""
         ...
 
     def evaluate(self) -> dict[str, float]:

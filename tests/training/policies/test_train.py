@@ -32,6 +32,8 @@ from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_s
 from splatpilot.training.policies.train import run
 from splatpilot.training.policies.trainer import Schedule
 
+CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
+
 SMALL = [
     "worlds.kinds=[P10]",
     "worlds.count=1",
@@ -144,9 +146,6 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
     run(config=config, out=tmp_path / "again", make=trainer_kind.make)
     assert_same(tmp_path / "again", tmp_path / "whole")
     assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
-
-
-CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
 
 
 @pytest.mark.parametrize("card", CARDS, ids=lambda card: card.stem)

@@ -1,0 +1,45 @@
+"""`splatpilot recover`."""
+
+import argparse
+from pathlib import Path
+
+from splatpilot.analysis.commands.overrides import add_overrides
+
+
+def add_to(verbs: argparse._SubParsersAction) -> None:
+    recover = verbs.add_parser(
+        "recover",
+        help="train a student, have it fly, and train it anew with what it should have done",
+    )
+    recover.set_defaults(verb=_recover)
+    recover.add_argument("policy", choices=["student_rgb", "student_depth"])
+    recover.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        help="folder to write; an interrupted run of the same configuration goes on there",
+    )
+    recover.add_argument(
+        "--flights", type=int, default=6, metavar="N", help="in each world, at most (%(default)s)"
+    )
+    recover.add_argument("--jobs", type=int, metavar="N", help="processes that fly; default: cores")
+    recover.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
+    add_overrides(recover, "schedule.updates=2000")
+
+
+def _recover(options: argparse.Namespace) -> None:
+    from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.cores import available_cores
+    from splatpilot.training.policies import recovery
+    from splatpilot.training.policies.registry import TRAINERS
+
+    defaults = TRAINERS.find(options.policy).config()
+    config = load_config(defaults, options.config, options.overrides)
+    jobs = available_cores() if options.jobs is None else options.jobs
+    ledger = recovery.run(config=config, out=options.out, flights=options.flights, jobs=jobs)
+    flown = ", ".join(f"{count} {outcome}" for outcome, count in ledger["flights"].items())
+    print(
+        f"{flown}; {ledger['near_misses']} near-misses; {ledger['recovery_samples']} samples of "
+        f"recovery beside {ledger['expert_samples']} of the expert; weights in "
+        f"{options.out / 'stage_2' / options.policy}.npz"
+    )

@@ -1,0 +1,75 @@
+"""How fast the student learns and decides, on one core.
+
+    OMP_NUM_THREADS=1 python benchmarks/student.py [CORPUS]
+
+Samples a second, with and without frozen modules, need a corpus; ticks of flight do not. Times are
+processor time, the least of a few repeats.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import torch
+
+from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.training.policies.student import StudentTrainer
+from splatpilot.training.policies.student_config import StudentDepthTraining
+from splatpilot.training.policies.student_network import StudentModule
+from splatpilot.training.policies.train import step_optimizer
+
+
+def seconds(run: Callable[[], object], repeats: int) -> float:
+    """The least processor time of `repeats` runs [s]."""
+    times = []
+    for _ in range(repeats):
+        started = time.process_time()
+        run()
+        times.append(time.process_time() - started)
+    return min(times)
+
+
+def tick_time(observation: str, width: int, height: int) -> float:
+    """Of a decision [s], from the camera's image to the hypotheses."""
+    spec, rng = StudentSpec(observation, width, height), np.random.default_rng(0)
+    weights = {name: w.numpy() for name, w in StudentModule(spec).state_dict().items()}
+    network = StudentNetwork(spec, weights)
+    color = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    image = color if observation == "rgb" else rng.uniform(0.5, 15.0, (height, width))
+    X_WB, p_WG = pose_from_state(hover_state([0, 0, 2])), np.array([9.0, 0.0, 2.0])
+    return seconds(lambda: plan(network, 0.0, image, X_WB, np.zeros(3), p_WG), 30)
+
+
+def samples_per_second(corpus: str, frozen: int, features: str) -> float:
+    """Of training from depth, optimiser and all; features of frozen modules are there already."""
+    config = StudentDepthTraining(corpora=[corpus], frozen=frozen, features=features)
+    trainer = StudentTrainer(config)
+    optimizer = torch.optim.AdamW(trainer.network.parameters())
+
+    def learn() -> None:
+        step_optimizer(trainer.losses, trainer.network, optimizer, 1.0)
+
+    return config.batch / seconds(learn, 10)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    for width, height in ((160, 120), (320, 240)):
+        for observation in ("rgb", "depth"):
+            spent = tick_time(observation, width, height)
+            print(f"one tick at {width}x{height}, {observation}: {1e3 * spent:.1f} ms")
+    for corpus in sys.argv[1:]:
+        with tempfile.TemporaryDirectory() as features:
+            for frozen in (0, 18, 19):
+                rate = samples_per_second(corpus, frozen, features)
+                print(f"{corpus}, {frozen} modules frozen: {rate:.0f} samples/s")
+
+
+if __name__ == "__main__":
+    main()

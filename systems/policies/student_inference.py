@@ -1,0 +1,155 @@
+"""What the student sees, what network it has and what its output means."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
+from splatpilot.systems.policies.mobilenet import CHANNELS, MobileNet, mobilenet_shapes
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
+
+RATE = 15.0  # [Hz]
+HYPOTHESES = 3
+OBSERVATIONS = "rgb", "depth"
+NEAREST, FARTHEST = 0.3, 20.0  # [m] range of depth
+WAYPOINT_SCALE = 2.0  # [m] that a waypoint of 1 at the network's output means
+STATE_SIZE = 6
+
+
+@dataclass(frozen=True)
+class StudentSpec:
+    """The architecture: MobileNetV2 for the image, layers for the state, one linear head for all
+    hypotheses."""
+
+    observation: str = "depth"
+    """One of `OBSERVATIONS`."""
+    width: int = 160
+    height: int = 120
+    """Of the images [px]."""
+    fov_x: float = 90.0
+    """Of the camera [deg]."""
+    cell_features: int = 64
+    """To which the encoder's channels are reduced in each of its cells, which are then kept apart:
+    where something is decides where to fly."""
+    state_features: int = 64
+
+    @property
+    def pixels(self) -> str:
+        """The name of what it sees, of a sample of a corpus: `color` or `depth`."""
+        return {"rgb": "color", "depth": "depth"}[self.observation]
+
+    def image_features(self) -> int:
+        """Numbers that the image becomes."""
+        return self.cell_features * -(-self.height // 32) * -(-self.width // 32)
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The name and shape of every array of weights."""
+        shapes = mobilenet_shapes()
+        joined = self.image_features() + self.state_features
+        for name, inputs, outputs in (
+            ("cell_layer", CHANNELS, self.cell_features),
+            ("state_layer", STATE_SIZE, self.state_features),
+            ("state_layer_2", self.state_features, self.state_features),
+            ("head", joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1)),
+        ):
+            shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (outputs, inputs), (outputs,)
+        return shapes
+
+
+class StudentNetwork:
+    """The network with its weights, in OpenCV and numpy.
+
+    Raises:
+        ValueError: if weights are missing, of another shape or not finite.
+    """
+
+    def __init__(self, spec: StudentSpec, weights: dict[str, np.ndarray]) -> None:
+        self.spec = spec
+        self._weights = check_weights(weights, spec.weight_shapes())
+        self._encoder = MobileNet(spec.height, spec.width, self._weights)
+
+    def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Waypoints (3, 10, 3) [m] in the body frame and costs (3,).
+
+        Args:
+            image: (3, height, width), see `encode_color` and `encode_depth`.
+            state: (6,), see `state_observation`.
+
+        Raises:
+            ValueError: if the image has another shape.
+        """
+        spec = self.spec
+        if np.shape(image) != (3, spec.height, spec.width):
+            raise ValueError(
+                f"the student's image has shape {np.shape(image)}, but its network takes "
+                f"{(3, spec.height, spec.width)}; give it a camera of {spec.width}x{spec.height}"
+            )
+        features = self._encoder(image).reshape(CHANNELS, -1)
+        cells = _rectified(self._linear("cell_layer", features.T))
+        y = _rectified(self._linear("state_layer", np.asarray(state, np.float32)))
+        y = _rectified(self._linear("state_layer_2", y))
+        output = self._linear("head", np.concatenate([cells.ravel(), y])).reshape(HYPOTHESES, -1)
+        waypoints = WAYPOINT_SCALE * output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
+        return waypoints, output[:, -1]
+
+    def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
+        return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
+
+
+def _rectified(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, np.float32(0.0))
+
+
+def load_network(path: str, observation: str) -> StudentNetwork:
+    """The network from a file of weights; see `PolicyCheckpoint.load`."""
+    checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
+    return StudentNetwork(checkpoint.spec, dict(checkpoint.weights))
+
+
+def encode_color(color: np.ndarray) -> np.ndarray:
+    """Colours (H, W, 3) uint8 as (3, H, W): 0 to 255 as -1 to 1."""
+    return color.transpose(2, 0, 1) * np.float32(1.0 / 127.5) - np.float32(1.0)
+
+
+def encode_depth(depth: np.ndarray) -> np.ndarray:
+    """Planar depth (H, W) [m] as a grey image (3, H, W): its logarithm, near 1 and far -1.
+
+    Equal ratios of depths are equal contrasts, wherever they are.
+    """
+    z = np.log(np.clip(depth, NEAREST, FARTHEST, dtype=np.float32))
+    near, far = np.log(NEAREST), np.log(FARTHEST)
+    encoded = np.float32((far + near) / (far - near)) - np.float32(2.0 / (far - near)) * z
+    return np.broadcast_to(encoded, (3, *depth.shape))
+
+
+def state_observation(X_WB: RigidTransform, v_WB: np.ndarray, p_WG: np.ndarray) -> np.ndarray:
+    """(6,): velocity [m/s] and direction to the goal, in the body frame."""
+    R_WB = X_WB.rotation().matrix()
+    to_goal = p_WG - X_WB.translation()
+    rows = np.stack([v_WB, to_goal / max(float(np.linalg.norm(to_goal)), 1e-6)])
+    return (rows @ R_WB).ravel()
+
+
+def plan(
+    network: StudentNetwork,
+    time: float,
+    image: np.ndarray,
+    X_WB: RigidTransform,
+    v_WB: np.ndarray,
+    p_WG: np.ndarray,
+) -> Hypotheses:
+    """The hypotheses of one observation.
+
+    Args:
+        time: [s].
+        image: (H, W, 3) uint8 colours or (H, W) [m] planar depth, as `network.spec.observation`.
+        X_WB, v_WB: pose and velocity [m/s].
+        p_WG: the goal [m].
+
+    Raises:
+        ValueError: for an image of another size.
+    """
+    encode = encode_color if network.spec.pixels == "color" else encode_depth
+    waypoints_B, costs = network(encode(image), state_observation(X_WB, v_WB, p_WG))
+    return Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))

@@ -1,0 +1,97 @@
+"""The student as a Drake system."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.student import (
+    Student,
+    StudentConfig,
+    StudentDepthConfig,
+    StudentRgbConfig,
+)
+from splatpilot.systems.policies.student_inference import StudentSpec, load_network, plan
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+
+P_WG = np.array([12.0, 3.0, 2.0])
+CONFIGS = {"rgb": StudentRgbConfig, "depth": StudentDepthConfig}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, str]:
+    """Random weights of both kinds for images of 64x48."""
+    folder, rng = tmp_path_factory.mktemp("weights"), np.random.default_rng(0)
+    paths = {name: str(folder / f"student_{name}.npz") for name in CONFIGS}
+    for name, path in paths.items():
+        spec = StudentSpec(name, 64, 48)
+        weights = {
+            key: rng.normal(scale=0.1, size=shape).astype(np.float32)
+            for key, shape in spec.weight_shapes().items()
+        }
+        PolicyCheckpoint(f"student_{name}", spec, weights, {}).save(Path(path))
+    return paths
+
+
+def config_of(name: str, files: dict[str, str], **camera) -> StudentConfig:
+    camera = OnboardCamera(**{"width": 64, "height": 48} | camera)
+    return CONFIGS[name](weights=files[name], camera=camera)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_plans_at_its_rate(name, files):
+    """The hypotheses are those of the pure policy at the last multiple of the period, from the kind
+    of image that the student sees and no other."""
+    config = config_of(name, files)
+    system, rng = Student(config), np.random.default_rng(1)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    state = hover_state([1.0, 2.0, 1.5], yaw=0.6)
+    state[3:6] = [1.0, 0.3, 0.1]
+    system.GetInputPort("state").FixValue(context, state)
+    system.GetInputPort("goal").FixValue(context, P_WG)
+    if name == "rgb":
+        image, port = ImageRgba8U(64, 48), "color_image"
+        image.mutable_data[...] = rng.integers(0, 256, (48, 64, 4))
+        seen = np.asarray(image.data)[..., :3]
+    else:
+        image, port = ImageDepth32F(64, 48), "depth_image_32f"
+        image.mutable_data[..., 0] = rng.uniform(0.5, 25.0, (48, 64))
+        seen = np.asarray(image.data)[..., 0]
+    system.GetInputPort(port).FixValue(context, Value(image))
+    assert system.num_input_ports() == 3
+    simulator.Initialize()
+    simulator.AdvanceTo(1.5 / config.rate)
+    vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
+    found = Hypotheses.from_vector(vector, 3)
+    assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
+    network = load_network(files[name], name)
+    X_WB = pose_from_state(state)
+    expected = plan(network, 0.0, seen, X_WB, state[3:6], P_WG)
+    np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
+    np.testing.assert_array_equal(found.costs, expected.costs)
+
+
+def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
+    """Weights of the other observation, of none, of an architecture that there is not, and a camera
+    other than in training are named."""
+    with pytest.raises(ValueError, match="holds weights of the policy 'student_rgb'"):
+        Student(StudentDepthConfig(weights=files["rgb"]))
+    with pytest.raises(FileNotFoundError, match="train them with: splatpilot train student_rgb"):
+        Student(StudentRgbConfig(weights=str(tmp_path / "absent.npz")))
+    with pytest.raises(ValueError, match=r"camera\.width of the student is 160, .* with 64"):
+        Student(StudentDepthConfig(weights=files["depth"]))
+    with pytest.raises(ValueError, match=r"camera\.fov_x of the student is 80"):
+        Student(config_of("depth", files, fov_x=80.0))
+    about = {"format": 1, "policy": "student_depth", "spec": {"depth": 3}, "provenance": {}}
+    np.savez(tmp_path / "odd.npz", about=json.dumps(about))
+    with pytest.raises(ValueError, match=r"odd\.npz holds weights of another architecture"):
+        load_network(str(tmp_path / "odd.npz"), "depth")

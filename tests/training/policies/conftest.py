@@ -1,0 +1,95 @@
+"""A corpus of three small worlds with pillars, gathered in a second: what students learn from."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RollPitchYaw, RotationMatrix
+
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import Cylinder, HalfSpace, Shape
+from splatpilot.systems.configuration import claim_folder
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.corpus.corpus import CONFIG
+from splatpilot.training.corpus.gather import shard_folder
+from splatpilot.training.corpus.sample import EXPERT, Samples
+from splatpilot.training.corpus.shard import write_shard
+from splatpilot.training.corpus.world_record import WorldSource, record_world
+from splatpilot.training.policies.evaluation import CAMERA_AHEAD
+from splatpilot.training.policies.expert import Labeller
+from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
+
+P_WG = np.array([11.0, 4.0, 1.5])
+UPPER_W = np.array([12.0, 8.0, 3.0])
+CAMERA = OnboardCamera(width=32, height=24)
+
+
+@pytest.fixture(scope="session")
+def student_corpus(tmp_path_factory) -> Path:
+    """The folder of a corpus of 3 worlds with 24 samples each."""
+    return write_corpus(tmp_path_factory.mktemp("corpus"), 3, 24)
+
+
+def write_corpus(folder: Path, worlds: int, states: int) -> Path:
+    """Random states on the way past pillars; red is near, and what is far is blue."""
+    config = CorpusConfig(camera=CAMERA)
+    claim_folder(folder / CONFIG, config)
+    for part in ("worlds", "shards"):
+        (folder / part).mkdir()
+    for number in range(worlds):
+        rng = np.random.default_rng(number)
+        shapes: list[Shape] = [HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0)]
+        for x, y in zip(rng.uniform(4, 9, 3), rng.permutation([2.0, 4.0, 6.0]), strict=True):
+            shapes.append(Cylinder([x, y, -1], [x, y, 4], 0.4))
+        exact = AnalyticDistanceField(shapes, np.zeros(3), UPPER_W)
+        esdf = esdf_from_distance_field(exact, 0.25)
+        source = WorldSource(f"pillars-{number}", seed=number)
+        record_world(folder / "worlds" / source.name, source, esdf)
+        labeller, rows = Labeller(esdf, P_WG, config.expert), []
+        while len(rows) < states:
+            p_WB = rng.uniform([1, 2, 1], [9, 6, 2])
+            if labeller.field.distance(p_WB) < 0.7:
+                continue
+            yaw = np.arctan2(*(P_WG - p_WB)[1::-1]) + rng.normal(0, 0.4)
+            rotation = RollPitchYaw(*rng.normal(0, 0.1, 2), yaw)
+            v_WB = rotation.ToRotationMatrix() @ rng.normal([1.5, 0, 0], 0.3)
+            q_WB = rotation.ToQuaternion().wxyz()
+            label = labeller.label(0.0, np.concatenate([p_WB, v_WB, q_WB, np.zeros(3)]))
+            rows.append((q_WB, p_WB, v_WB, label.waypoints_B))
+        samples = _seen(rows, shapes, config)
+        write_shard(
+            shard_folder(folder, source.name),
+            samples,
+            world=source.name,
+            source=EXPERT,
+            flights=[],
+            revision="",
+        )
+    return folder
+
+
+def _seen(rows: list, shapes: list[Shape], config: CorpusConfig) -> Samples:
+    samples = Samples.zeros(len(rows), config.size)
+    rays, geometry = (
+        PixelRays.of(CAMERA.width, CAMERA.height, CAMERA.fov_x),
+        ShapeGeometry([shapes]),
+    )
+    for n, (q_WB, p_WB, v_WB, waypoints_B) in enumerate(rows):
+        R_WB = RotationMatrix(Quaternion(q_WB)).matrix()
+        x, y, z = R_WB.T
+        p_WC = torch.tensor((p_WB + CAMERA_AHEAD * x)[None], dtype=torch.float32)
+        R_WC = torch.tensor(np.stack([-y, -z, x], 1)[None], dtype=torch.float32)
+        depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(1, dtype=torch.int64))
+        samples.depth[n] = depth.reshape(CAMERA.height, CAMERA.width).clamp(max=1e4)
+        near = np.clip(1.0 - samples.depth[n].astype(float) / 10.0, 0.0, 1.0)
+        samples.color[n] = 255.0 * np.stack([near, 0.0 * near, 1.0 - near], 2)
+        samples.X_WB[n] = *q_WB, *p_WB
+        samples.v_B[n] = v_WB @ R_WB
+        to_goal = (P_WG - p_WB) @ R_WB
+        samples.goal_B[n] = to_goal / np.linalg.norm(to_goal)
+        samples.trajectories_B[n] = waypoints_B
+    return samples

@@ -1,0 +1,95 @@
+"""The student's two stages, as one command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus import make
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.library import LibraryConfig
+from splatpilot.training.corpus.sample import EXPERT, RECOVERY
+from splatpilot.training.policies import recovery
+from splatpilot.training.policies.expert import ExpertConfig
+from splatpilot.training.policies.student_config import StudentDepthTraining
+
+TINY = [
+    "pretrained=false",
+    "frozen=0",
+    "held_out=0.5",
+    "batch=2",
+    "schedule.updates=2",
+    "schedule.checkpoint_every=2",
+]
+
+
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory) -> Path:
+    """The folder of a corpus of one short flight in each of two small forests."""
+    folder = tmp_path_factory.mktemp("expert")
+    grove = folder / "grove.yaml"
+    grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
+    config = CorpusConfig(
+        worlds=LibraryConfig(kinds=[str(grove)]),
+        expert=ExpertConfig(period=0.5),
+        flights=1,
+        camera=OnboardCamera(width=32, height=24),
+    )
+    make.run(config=config, out=folder, worlds=2, jobs=1)
+    return folder
+
+
+def both_stages(expert: Path, out: Path) -> dict:
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    return recovery.run(config=config, out=out, flights=1, jobs=1)
+
+
+def weights(out: Path) -> dict[str, np.ndarray]:
+    with np.load(out / "stage_2" / "student_depth.npz") as file:
+        return {name: file[name] for name in file.files if name != "about"}
+
+
+def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path, monkeypatch):
+    """The student flies once in the world that it was trained in; what is added are samples of
+    recovery of that world alone, to a corpus of the run's own; the ledger counts what there is.
+    Interrupted before the flight and before the second stage, it ends with the same weights."""
+    before = {path: path.stat().st_mtime_ns for path in expert.rglob("*")}
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    ledger = both_stages(expert, whole)
+    assert {path: path.stat().st_mtime_ns for path in expert.rglob("*")} == before
+    corpus = Corpus(whole / "corpora" / "0")
+    samples = corpus.samples(np.arange(len(corpus)))
+    assert ledger["expert_samples"] == (samples.source == EXPERT).sum() == len(Corpus(expert))
+    assert ledger["recovery_samples"] == (samples.source == RECOVERY).sum() > 0
+    assert sum(ledger["flights"].values()) == 1 <= ledger["near_misses"]
+    assert len(set(samples.world[samples.source == RECOVERY])) == 1
+    assert len(list((whole / "flights" / "0").iterdir())) == 1
+    assert json.loads((whole / "recovery.json").read_text()) == ledger
+
+    for step in ("_fly_world", "_ledger"):
+        with monkeypatch.context() as patch:
+            patch.setattr(recovery, step, interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                both_stages(expert, parts)
+    monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
+    assert both_stages(expert, parts)["flights"] == ledger["flights"]
+    expected, found = weights(whole), weights(parts)
+    assert all(np.array_equal(found[name], value) for name, value in expected.items())
+
+
+def interrupt(*_args) -> None:
+    raise KeyboardInterrupt
+
+
+def test_counts_out_of_range_are_refused(expert, tmp_path):
+    """The option is named, before anything is trained."""
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    with pytest.raises(ValueError, match="--flights is 0"):
+        recovery.run(config=config, out=tmp_path, flights=0, jobs=1)
+    with pytest.raises(ValueError, match="--jobs is -1"):
+        recovery.run(config=config, out=tmp_path, flights=1, jobs=-1)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,157 @@
+"""The student from a corpus to a flight."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchvision.models import mobilenet_v2
+
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.policies.mobilenet import mobilenet_blocks
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.policies.pretrained import imagenet_weights
+from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.policies.student_config import StudentTraining
+from splatpilot.training.policies.train import run
+
+OVERRIDES = [
+    "pretrained=false",
+    "frozen=0",
+    "held_out=0.34",
+    "batch=12",
+    "schedule.updates=50",
+    "schedule.validate_every=50",
+    "schedule.checkpoint_every=25",
+    "schedule.learning_rate=0.001",
+]
+
+
+def training(corpus: Path, observation: str, *overrides: str) -> StudentTraining:
+    config = TRAINERS.find(f"student_{observation}").config()
+    return load_config(config, overrides=[f"corpora=[{corpus}]", *OVERRIDES, *overrides])
+
+
+@pytest.fixture(scope="module")
+def trained(student_corpus, tmp_path_factory) -> Path:
+    """The folder of a run that saw depth."""
+    out = tmp_path_factory.mktemp("trained")
+    config = training(student_corpus, "depth")
+    run(config=config, out=out, make=TRAINERS.find("student_depth").make)
+    return out
+
+
+def test_student_learns_what_it_is_shown(trained):
+    """A minute's worth of samples is imitated better and better, every hypothesis keeps votes, and
+    what is chosen is measured on the held-out world."""
+    rows = list(csv.DictReader((trained / "curves.csv").open()))
+    curve = [{name: float(value) for name, value in row.items() if value} for row in rows]
+    assert curve[-1]["winners"] < 0.7 * curve[0]["winners"]
+    votes = [[row[f"votes_{m}"] for m in range(3)] for row in curve]
+    np.testing.assert_allclose(np.sum(votes, axis=1), 1.0, atol=1e-5)
+    assert min(votes[-1]) > 0.05
+    terms = sum(curve[-1][name] for name in ("winners", "unvoted", "cost"))
+    assert curve[-1]["loss"] == pytest.approx(terms, rel=1e-5)
+    best = max(row["success"] for row in curve if "success" in row)
+    assert f"| success | {best:.2f} |" in (trained / "student_depth.md").read_text()
+
+
+def test_student_flies_by_its_weights(trained):
+    """Named by its file, it flies through a generated world on plans that lead towards the goal."""
+    config = replace(
+        policy_named(str(trained / "student_depth.npz")),
+        camera=OnboardCamera(width=32, height=24),
+    )
+    world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
+    scenario = Scenario(seed=1_000_000, policy=config, timeout=1.0)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    plans = [Hypotheses.from_vector(row, 3) for row in flight.hypotheses]
+    first, to_goal = plans[0], world.p_WG - flight.states[0, :3]
+    assert len(plans) >= 15 and first is not None
+    ahead = first.waypoints_W[first.best, -1] - flight.states[0, :3]
+    assert ahead @ to_goal > 0.5 * np.linalg.norm(ahead) * np.linalg.norm(to_goal) > 0.0
+    assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
+
+
+def test_interrupted_training_ends_as_whole(student_corpus, tmp_path):
+    """A run that was interrupted between two checkpoints ends with the same weights and curves, bit
+    for bit."""
+    kind = TRAINERS.find("student_rgb")
+    overrides = ["schedule.updates=4", "schedule.validate_every=4", "schedule.checkpoint_every=2"]
+    config = training(student_corpus, "rgb", "batch=2", *overrides)
+
+    def make_interrupted(config):
+        trainer = kind.make(config)
+
+        def interrupt(update: int) -> None:
+            if update == 3:
+                raise KeyboardInterrupt
+
+        trainer.begin_update = interrupt
+        return trainer
+
+    run(config=config, out=tmp_path / "whole", make=kind.make)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "again", make=make_interrupted)
+    run(config=config, out=tmp_path / "again", make=kind.make)
+    with (
+        np.load(tmp_path / "whole" / "student_rgb.npz") as whole,
+        np.load(tmp_path / "again" / "student_rgb.npz") as again,
+    ):
+        for name in whole.files:
+            np.testing.assert_array_equal(whole[name], again[name])
+    curves = [(tmp_path / name / "curves.csv").read_text() for name in ("whole", "again")]
+    assert curves[0] == curves[1]
+
+
+def test_frozen_modules_keep_the_weights_they_began_with(student_corpus, tmp_path):
+    """Of an encoder read from a file all modules but the last are, in the weights that fly, what
+    they were in the file."""
+    torch.manual_seed(0)
+    encoder = mobilenet_v2().state_dict()
+    for layer in (layer for block in mobilenet_blocks() for layer in block):
+        torch.nn.init.kaiming_normal_(encoder[layer.weight])
+    torch.save(encoder, tmp_path / "encoder.pt")
+    overrides = [
+        "pretrained=true",
+        "frozen=18",
+        f"encoder={tmp_path / 'encoder.pt'}",
+        f"features={tmp_path / 'features'}",
+        "schedule.updates=3",
+        "schedule.checkpoint_every=2",
+    ]
+    config = training(student_corpus, "depth", *overrides)
+    run(config=config, out=tmp_path / "run", make=TRAINERS.find("student_depth").make)
+    began = imagenet_weights(str(tmp_path / "encoder.pt"))
+    with np.load(tmp_path / "run" / "student_depth.npz") as weights:
+        for name, value in began.items():
+            assert np.array_equal(weights[name], value) == (not name.startswith("features.18"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("corpora=[]", "corpora is empty"),
+        ("held_out=1", r"held_out is 1\.0; it must be 0 to 0\.9"),
+        ("frozen=20", "frozen is 20; the encoder has 0 to 19 modules"),
+        ("draws=0", "draws is 0; it must be at least 1"),
+        ("frozen=3", "set pretrained=true or frozen=0"),
+        ("noise.latency=0.1", r"noise\.latency is 0\.1 s"),
+        ("appearance.hue=200", r"appearance\.hue is 200"),
+        ("corpora=[absent]", r"absent holds no corpus"),
+    ],
+)
+def test_configurations_out_of_range_are_refused(override, message, student_corpus, tmp_path):
+    """The field, its value and the remedy are named, before anything is trained."""
+    config = training(student_corpus, "rgb", override)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        run(config=config, out=tmp_path / "out", make=TRAINERS.find("student_rgb").make)

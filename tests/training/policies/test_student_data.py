@@ -1,0 +1,79 @@
+"""Samples of several corpora as one, split by world."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.configuration import dump_config
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.corpus.corpus import CONFIG, Corpus
+from splatpilot.training.policies.student_data import StudentData
+
+
+@pytest.fixture(scope="module")
+def two(student_corpus, tmp_path_factory) -> list[Corpus]:
+    """The corpus, and one of the same worlds that lacks the samples of the first."""
+    part = tmp_path_factory.mktemp("part") / "corpus"
+    shutil.copytree(student_corpus, part)
+    shutil.rmtree(part / "shards" / "expert-pillars-0")
+    return [Corpus(student_corpus), Corpus(part)]
+
+
+def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
+    """A third of the worlds is held out with all samples of theirs; more samples of the same worlds
+    change no world's side."""
+    alone, joined = StudentData(two[:1], 0.34), StudentData(two, 0.34)
+    assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
+    for data, count in ((alone, 72), (joined, 120)):
+        assert sorted([*data.training, *data.held_out]) == list(range(count))
+        outside = {data.worlds[w] for w in data.labels(data.held_out).world}
+        inside = {data.worlds[w] for w in data.labels(data.training).world}
+        assert outside == set(data.held_out_worlds) and not outside & inside
+
+
+def test_samples_keep_their_order_and_world(two):
+    """Numbers from both corpora in any order give what each corpus says of them."""
+    data = StudentData(two, 0.34)
+    numbers = np.array([100, 3, 71, 72, 5, 119])
+    depth, color = data.pixels(numbers, "depth"), data.pixels(numbers, "color")
+    labels = data.labels(numbers)
+    for row, number in enumerate(numbers):
+        corpus, within = (two[0], number) if number < 72 else (two[1], number - 72)
+        one = corpus.samples(np.array([within]))
+        np.testing.assert_array_equal(depth[row], one.depth[0])
+        np.testing.assert_array_equal(color[row], one.color[0])
+        np.testing.assert_array_equal(labels.trajectories_B[row], one.trajectories_B[0])
+        np.testing.assert_array_equal(labels.goal_B[row], one.goal_B[0])
+        assert data.worlds[labels.world[row]] == corpus.worlds[one.world[0]].name
+
+
+def test_distances_along_trajectories_are_those_of_the_world(two):
+    """At the waypoints of the experts, brought into the world by the sample's pose, the distance is
+    the one of the recorded field, which counts unknown space as occupied."""
+    data = StudentData(two, 0.34)
+    labels = data.labels(np.arange(0, 120, 7))
+    found = data.distance_along(labels.trajectories_B, labels)
+    fields = {world.name: world.esdf().conservative() for world in two[0].worlds}
+    for n, world in enumerate(labels.world):
+        q_WB, p_WB = labels.X_WB[n, :4].double().numpy(), labels.X_WB[n, 4:].double().numpy()
+        points_B = labels.trajectories_B[n].double().numpy()
+        twice = 2.0 * np.cross(q_WB[1:], points_B)
+        points_W = p_WB + points_B + q_WB[0] * twice + np.cross(q_WB[1:], twice)
+        expected = fields[data.worlds[world]].distance(points_W)
+        np.testing.assert_allclose(found[n], expected, atol=2e-4)
+
+
+def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
+    """Another camera is named, and so are shares that leave no world to one side."""
+    other = tmp_path / "corpus"
+    shutil.copytree(two[1].worlds[0].path.parents[1], other)
+    config = two[0].config
+    wider = replace(config, camera=replace(config.camera, fov_x=100.0))
+    assert isinstance(wider, CorpusConfig)
+    (other / CONFIG).write_text(dump_config(wider))
+    with pytest.raises(ValueError, match="different cameras or numbers of trajectories"):
+        StudentData([two[0], Corpus(other)], 0.34)
+    with pytest.raises(ValueError, match="of 3 worlds 3 are held out, which leaves 0 samples"):
+        StudentData(two[:1], 1.0)

@@ -1,0 +1,158 @@
+"""The student's network in torch, against the one that flies and against torchvision's."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from pydrake.math import RigidTransform, RollPitchYaw
+from torchvision.models import mobilenet_v2
+
+from splatpilot.systems.policies.mobilenet import mobilenet_shapes
+from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.training.policies.pretrained import IN_DATA, imagenet_weights
+from splatpilot.training.policies.student_images import clean_images
+from splatpilot.training.policies.student_network import StudentModule
+
+
+def disturbed(module: StudentModule) -> StudentModule:
+    """With biases that are not zero, so that none may be forgotten."""
+    with torch.no_grad():
+        for name, values in module.named_parameters():
+            if name.endswith("bias"):
+                values.normal_(0.0, 0.1)
+    return module
+
+
+@pytest.mark.parametrize("observation", ["rgb", "depth"])
+@pytest.mark.parametrize("size", [(64, 48), (80, 70)])
+def test_what_flies_is_what_was_trained(observation, size):
+    """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
+    that the module in torch makes of what a corpus would hold of them; whole cells or not."""
+    torch.manual_seed(0)
+    spec = StudentSpec(observation, *size)
+    module = disturbed(StudentModule(spec))
+    weights = {name: w.numpy() for name, w in module.state_dict().items()}
+    assert {name: w.shape for name, w in weights.items()} == spec.weight_shapes()
+    rng = np.random.default_rng(0)
+    color = rng.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+    depth = rng.uniform(0.2, 25.0, (size[1], size[0])).astype(np.float16).astype(np.float32)
+    depth[0, 0], depth[1, 1] = 0.0, np.inf
+    rotation, p_WB, v_WB = RollPitchYaw(0.3, -0.2, 2.0), rng.normal(size=3), rng.normal(size=3)
+    X_WB, p_WG = RigidTransform(rotation, p_WB), np.array([9.0, 2.0, 1.5])
+    R_BW = X_WB.rotation().matrix().T
+    to_goal = R_BW @ (p_WG - p_WB)
+    state = torch.tensor(np.concatenate([R_BW @ v_WB, to_goal / np.linalg.norm(to_goal)]))
+
+    image = color if observation == "rgb" else depth
+    with torch.no_grad():
+        expected = module(clean_images(image[None]), state.float()[None])
+    found = plan(StudentNetwork(spec, weights), 0.5, image, X_WB, v_WB, p_WG)
+    np.testing.assert_allclose(found.waypoints_B, expected[0][0], atol=1e-4)
+    np.testing.assert_allclose(found.costs, expected[1][0], atol=1e-4)
+    assert np.ptp(found.costs) > 1e-3 and found.plan_time == 0.5
+
+
+def test_images_of_another_size_are_refused():
+    """The size that would do is named."""
+    spec = StudentSpec("depth", 64, 48)
+    weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
+    with pytest.raises(ValueError, match="give it a camera of 64x48"):
+        StudentNetwork(spec, weights)(np.zeros((3, 48, 65), np.float32), np.zeros(6))
+
+
+def test_untrained_encoder_lets_images_through():
+    """Numbers of an image are neither lost nor blown up on their way through an encoder that begins
+    from nothing."""
+    torch.manual_seed(0)
+    module = StudentModule(StudentSpec("rgb", 96, 64))
+    with torch.no_grad():
+        features = module.features(torch.rand(4, 3, 64, 96) * 2.0 - 1.0)
+    assert 0.05 < features.std().item() < 2.0
+    assert (features[0] - features[1]).abs().mean() > 0.01
+
+
+def test_frozen_modules_and_modules_in_parts():
+    """What the first modules make of an image can be handed over in its place; frozen ones have no
+    gradient, the others have."""
+    module = StudentModule(StudentSpec("depth", 64, 48))
+    module.freeze(14)
+    image, state = torch.randn(2, 3, 48, 64), torch.randn(2, 6)
+    whole = module(image, state)
+    parts = module(module.features[:14](image), state, first=14)
+    assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
+    (whole[0].square().sum() + whole[1].sum()).backward()
+    frozen = [p.grad is None for p in module.features[:14].parameters()]
+    assert all(frozen) and all(p.grad is not None for p in module.features[14:].parameters())
+
+
+def folded_features(weights: dict[str, torch.Tensor], image: torch.Tensor) -> torch.Tensor:
+    module = StudentModule(StudentSpec())
+    module.load_encoder(weights)
+    with torch.no_grad():
+        return module.features(image)
+
+
+def test_batch_norms_and_scaling_are_folded(tmp_path):
+    """Torchvision's network, of any statistics, on an image scaled its way has the features of ours
+    on an image of -1 to 1, but where the first layer sees padding."""
+    torch.manual_seed(0)
+    theirs = mobilenet_v2()
+    with torch.no_grad():
+        for module in theirs.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                for name, values in module.state_dict().items():
+                    if name in ("weight", "running_var"):
+                        values.uniform_(0.5, 1.5)
+                    elif name != "num_batches_tracked":
+                        values.normal_(0.0, 0.1)
+    torch.save(theirs.state_dict(), tmp_path / "theirs.pth")
+    weights = imagenet_weights(str(tmp_path / "theirs.pth"))
+    image = torch.rand(1, 3, 64, 96)
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    scaled = (image - mean[:, None, None]) / std[:, None, None]
+    with torch.no_grad():
+        first = theirs.eval().features[0](scaled)
+        rest = theirs.features[1:](first)
+    module = StudentModule(StudentSpec())
+    module.load_encoder(weights)
+    with torch.no_grad():
+        ours = module.features[0](2.0 * image - 1.0)
+        torch.testing.assert_close(ours[..., 1:, 1:], first[..., 1:, 1:], atol=1e-5, rtol=0)
+        torch.testing.assert_close(module.features[1:](first), rest, atol=1e-4, rtol=1e-3)
+
+
+def test_folded_weights_keep_their_scaling(tmp_path):
+    """A file whose variances are 1 already is of images of -1 to 1: its first filters stay."""
+    theirs = mobilenet_v2()
+    torch.save(theirs.state_dict(), tmp_path / "folded.pt")
+    weights = imagenet_weights(str(tmp_path / "folded.pt"))
+    assert weights.keys() == mobilenet_shapes().keys()
+    first = theirs.state_dict()["features.0.0.weight"]
+    torch.testing.assert_close(weights["features.0.0.weight"], first, atol=1e-5, rtol=1e-4)
+
+
+def test_what_is_no_encoder_is_refused(tmp_path, monkeypatch):
+    """A missing file and one of something else are named with the remedy; without the data folder
+    torchvision's download is looked for."""
+    with pytest.raises(FileNotFoundError, match=r"absent\.pt; download them with"):
+        imagenet_weights(str(tmp_path / "absent.pt"))
+    torch.save({"layer.weight": torch.zeros(3)}, tmp_path / "other.pt")
+    with pytest.raises(ValueError, match=r"other\.pt: no weights of MobileNetV2"):
+        imagenet_weights(str(tmp_path / "other.pt"))
+    monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"mobilenet_v2-7ebf99e0\.pth"):
+        imagenet_weights()
+    (tmp_path / "checkpoints").mkdir()
+    torch.save(mobilenet_v2().state_dict(), tmp_path / "checkpoints/mobilenet_v2-7ebf99e0.pth")
+    assert imagenet_weights().keys() == mobilenet_shapes().keys()
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+def test_weights_of_the_data_folder_see_edges(monkeypatch):
+    """They are found without being named, and what they make of a photograph's worth of noise is
+    neither nothing nor saturated."""
+    assert IN_DATA.name == "mobilenet_v2_imagenet.pt"
+    features = folded_features(imagenet_weights(), torch.rand(1, 3, 96, 128) * 2.0 - 1.0)
+    assert 0.02 < (features > 0.0).float().mean().item() < 0.9 and features.max() <= 6.0

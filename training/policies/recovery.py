@@ -1,0 +1,200 @@
+"""The student's two stages: from what its expert shows, and then also from what the expert would
+have done where the student came too near to something.
+
+After the paper, Sec. III-B. The student of the first stage flies, without any guard, the ways that
+the expert flew in the worlds that it was trained in; the second is trained from nothing on all.
+"""
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.files import folder_written_atomically, written_atomically
+from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.processes import map_processes
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.recovery import StudentFlight, add_recovery
+from splatpilot.training.corpus.sample import EXPERT, RECOVERY
+from splatpilot.training.corpus.world_record import WorldRecord
+from splatpilot.training.policies import train
+from splatpilot.training.policies.student import StudentTrainer
+from splatpilot.training.policies.student_config import StudentTraining
+from splatpilot.training.policies.student_data import held_out_names
+
+_PATIENCE = 2.0
+"""How many times as long as the expert took a student may fly."""
+
+
+_ARRAYS = "p_WG", "times", "states", "clearances"
+"""Of each flight in a file of flights, see `StudentFlight`."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A way that the expert flew."""
+
+    start: list[float]  # [m]
+    goal: list[float]  # [m]
+    timeout: float  # [s]
+
+
+def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[str, Any]:
+    """
+    Trains a student, has it fly, gathers what it was to have done, and trains another on all.
+
+    Interrupted anywhere, even by `kill -9`, the same call goes on and leaves the same. The corpora
+    that `config` names stay as they are.
+
+    Leaves in `out`: `stage_1` and `stage_2`, see `train.run`; `corpora`, links to those of the
+    first stage with the recovery samples beside them; `flights`, what the student flew, a file a
+    world; `recovery.json`, how many of what there are.
+
+    Args:
+        config: of both stages.
+        flights: of the student, at most, in each world.
+        jobs: processes that fly.
+
+    Returns:
+        What `recovery.json` says.
+
+    Raises:
+        FileNotFoundError, ValueError: see `train.run` and `add_recovery`.
+        OSError: if `out` cannot be written, or a process was killed.
+    """
+    for name, value in (("flights", flights), ("jobs", jobs)):
+        if value < 1:
+            raise ValueError(f"--{name} is {value}; it must be at least 1")
+    first = train.run(config=config, out=out / "stage_1", make=StudentTrainer)
+    weights = out / "stage_1" / f"{first['policy']}.npz"
+    folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
+    for source, folder in zip(config.corpora, folders, strict=True):
+        _link_corpus(Path(source), folder)
+    corpora = [Corpus(folder) for folder in folders]
+    names = sorted({world.name for corpus in corpora for world in corpus.worlds})
+    held_out = held_out_names(names, config.held_out)
+    outcomes: Counter[str] = Counter()
+    for folder, corpus in zip(folders, corpora, strict=True):
+        flown, ended = _fly_worlds(
+            corpus, held_out, weights, out / "flights" / folder.name, flights, jobs
+        )
+        outcomes += ended
+        add_recovery(folder, flown, jobs)
+    both = replace(config, corpora=[str(folder) for folder in folders])
+    second = train.run(config=both, out=out / "stage_2", make=StudentTrainer)
+    ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
+    ledger |= {"stage_1": first, "stage_2": second}
+    with written_atomically(out / "recovery.json") as path:
+        path.write_text(json.dumps(ledger, indent=2) + "\n")
+    return ledger
+
+
+def _link_corpus(source: Path, folder: Path) -> None:
+    """Makes `folder` a corpus of the same files, which take no room twice, to add others to."""
+    if folder.exists():
+        return
+    Corpus(source)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder_written_atomically(folder) as partial_folder:
+        for path in sorted(source.rglob("*")):
+            target = partial_folder / path.relative_to(source)
+            if path.is_dir():
+                target.mkdir()
+                continue
+            try:
+                os.link(path, target)
+            except OSError:  # on another disk
+                shutil.copyfile(path, target)
+
+
+def _fly_worlds(
+    corpus: Corpus, held_out: Sequence[str], weights: Path, folder: Path, flights: int, jobs: int
+) -> tuple[list[StudentFlight], Counter[str]]:
+    """The student's flights in the worlds of a corpus that are not held out, and how they ended."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks: dict[str, list[Task]] = {world.name: [] for world in corpus.worlds}
+    for shard in corpus.shards:
+        if shard.source == EXPERT and shard.world not in held_out:
+            tasks[shard.world] += [
+                Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
+                for flight in shard.flights
+                if flight["states"]
+            ]
+    work = [
+        (record, tasks[record.name][:flights], folder / f"{record.name}.npz")
+        for record in corpus.worlds
+        if tasks[record.name]
+    ]
+    missing = [piece for piece in work if not piece[2].exists()]
+    fly_world = partial(_fly_world, weights, corpus.config.camera)
+    with tqdm(
+        total=len(work), initial=len(work) - len(missing), desc="flights", unit="world"
+    ) as bar:
+        for _ in map_processes(fly_world, missing, min(jobs, max(len(missing), 1))):
+            bar.update()
+    flown, outcomes = [], Counter()
+    for record, _, file in work:
+        with np.load(file) as arrays:
+            outcomes.update(str(outcome) for outcome in arrays["outcomes"])
+            for n in range(len(arrays["outcomes"])):
+                parts = {
+                    name: arrays[f"{name}_{n}"]
+                    for name in ("p_WG", "times", "states", "clearances")
+                }
+                flown.append(StudentFlight(record.name, **parts))
+    return flown, outcomes
+
+
+def _fly_world(
+    weights: Path, camera: OnboardCamera, work: tuple[WorldRecord, list[Task], Path]
+) -> None:
+    """Flies the tasks of one world and writes the flights to a file."""
+    record, tasks, file = work
+    policy, world = replace(policy_named(str(weights)), camera=camera), record.make()
+    arrays: dict[str, Any] = {}
+    outcomes = []
+    for task in tasks:
+        scenario = Scenario(
+            seed=record.source.seed,
+            world=record.source.world,
+            start=task.start,
+            goal=task.goal,
+            start_radius=0.0,
+            timeout=task.timeout,
+            policy=policy,
+        )
+        try:
+            flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+        except InfeasibleFlightError:
+            continue
+        parts = np.array(task.goal), flight.times, flight.states, flight.clearances
+        for name, array in zip(_ARRAYS, parts, strict=True):
+            arrays[f"{name}_{len(outcomes)}"] = array
+        outcomes.append(str(flight.outcome))
+    with written_atomically(file) as path:
+        np.savez(path, outcomes=np.array(outcomes, dtype="U16"), **arrays)
+
+
+def _ledger(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]:
+    """How many flights ended how, near-misses that they had, and samples by where they are from."""
+    shards = [shard for corpus in corpora for shard in corpus.shards]
+    recovered = [shard for shard in shards if shard.source == RECOVERY]
+    return {
+        "flights": dict(sorted(outcomes.items())),
+        "near_misses": sum(f["near_misses"] for shard in recovered for f in shard.flights),
+        "expert_samples": sum(len(shard) for shard in shards if shard.source == EXPERT),
+        "recovery_samples": sum(map(len, recovered)),
+    }

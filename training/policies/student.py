@@ -1,0 +1,164 @@
+"""Training the student: imitation of an expert's trajectories from images of a corpus.
+
+After the paper, Sec. III-B: MobileNetV2 from ImageNet encodes the image, colours or depth; layers
+encode velocity and direction to the goal in the body frame; one linear layer makes of both three
+hypotheses of ten waypoints at 0.1 s with a cost each. Relaxed winner-takes-all; costs of what was
+predicted, by error and by the clearance of its own way (equation 4).
+
+Chosen here, where the paper is silent: the encoder's 4x5 cells are kept apart, at 64 numbers each,
+which are as many as the average over all cells has at 1280; depth is encoded by its logarithm, as a
+grey image; the barrier is integrated over the second that is predicted.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatpilot.systems.policies.student_inference import StudentSpec
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.policies.pretrained import imagenet_weights
+from splatpilot.training.policies.student_config import StudentTraining
+from splatpilot.training.policies.student_data import StudentData
+from splatpilot.training.policies.student_features import FrozenFeatures
+from splatpilot.training.policies.student_images import clean_images, training_images
+from splatpilot.training.policies.student_loss import (
+    barrier_along,
+    cost_error,
+    cost_targets,
+    hypothesis_errors,
+    hypothesis_penalties,
+    imitation_terms,
+    root_mean_square,
+    winners,
+)
+from splatpilot.training.policies.student_network import StudentModule
+
+_CLOSE = 0.25
+"""[m] Root mean square distance from an expert's trajectory within which one is as good."""
+
+
+class StudentTrainer:
+    """See `splatpilot.training.policies.trainer.Trainer`."""
+
+    measures = f"""\
+Of samples, not of flights. The hypothesis of least predicted cost is chosen; `success` is the part
+in which it keeps the vehicle's radius clear and stays within {_CLOSE} m, root mean square, of a
+trajectory of the expert's; `clear` that in which it keeps clear; `error` [m] its mean distance from
+the nearest such trajectory; `best_chosen` the part in which none of the three hypotheses has a
+lower penalty, of error and clearance."""
+
+    def __init__(self, config: StudentTraining) -> None:
+        self._config = config
+        self.policy = f"student_{config.observation}"
+        corpora = [Corpus(Path(path)) for path in config.corpora]
+        self._data = StudentData(corpora, config.held_out, config.device)
+        camera = self._data.camera
+        self.spec = StudentSpec(config.observation, camera.width, camera.height, camera.fov_x)
+        self.network = StudentModule(self.spec)
+        if config.pretrained:
+            self.network.load_encoder(imagenet_weights(config.encoder))
+        self.network.freeze(config.frozen)
+        self.network.to(config.device)
+        self._features = None
+        if config.frozen:
+            self._features = FrozenFeatures(
+                Path(config.features),
+                self._data,
+                self.network,
+                config.frozen,
+                config.draws,
+                config.appearance,
+                config.noise,
+            )
+        self._generator = torch.Generator(config.device).manual_seed(config.seed)
+        data, count = self._data.held_out, config.validation_samples
+        self._validation = data[np.linspace(0, len(data) - 1, min(count, len(data))).astype(int)]
+
+    def begin_update(self, update: int) -> None:
+        pass
+
+    def losses(self) -> dict[str, Tensor]:
+        config, training = self._config, self._data.training
+        drawn = torch.randint(
+            len(training), (config.batch,), generator=self._generator, device=config.device
+        )
+        numbers = training[drawn.cpu().numpy()]
+        return self._judge(numbers, self._drawn_images(numbers)).terms
+
+    @torch.no_grad()
+    def evaluate(self) -> dict[str, float]:
+        """On held-out worlds, of clean images; see `measures`."""
+        batch, rows = self._config.batch, []
+        for first in range(0, len(self._validation), batch):
+            numbers = self._validation[first : first + batch]
+            judged = self._judge(numbers, self._clean_images(numbers))
+            chosen = judged.costs.argmin(1)
+            each = torch.arange(len(chosen))
+            clear = (judged.distances[each, chosen] > VEHICLE_RADIUS).all(1)
+            error = root_mean_square(judged.errors.amin(1)[each, chosen])
+            measures = {
+                "success": clear & (error < _CLOSE),
+                "clear": clear,
+                "error": error,
+                "best_chosen": judged.penalties.argmin(1) == chosen,
+            }
+            rows.append({name: value.float() for name, value in measures.items()})
+        return {name: float(torch.cat([row[name] for row in rows]).mean()) for name in rows[0]}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"generator": self._generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._generator.set_state(state["generator"])
+
+    def _drawn_images(self, numbers: np.ndarray) -> Tensor:
+        """Images of samples to train with, or what frozen modules made of them."""
+        config, generator = self._config, self._generator
+        if self._features is None:
+            pixels = self._data.pixels(numbers, self.spec.pixels)
+            return training_images(pixels, config.appearance, config.noise, generator)
+        size = (len(numbers),)
+        draw = torch.randint(config.draws, size, generator=generator, device=config.device)
+        return self._features(numbers, draw.cpu().numpy()).to(config.device)
+
+    def _clean_images(self, numbers: np.ndarray) -> Tensor:
+        """Images of held-out samples, or what frozen modules made of them."""
+        device = self._config.device
+        if self._features is None:
+            return clean_images(self._data.pixels(numbers, self.spec.pixels), device)
+        return self._features(numbers, np.zeros(len(numbers), int)).to(device)
+
+    def _judge(self, numbers: np.ndarray, images: Tensor) -> "_Judged":
+        """What the network makes of samples, against their experts and their worlds."""
+        config, labels = self._config, self._data.labels(numbers)
+        state = torch.cat([labels.v_B, labels.goal_B], 1)
+        waypoints, costs = self.network(images, state, config.frozen)
+        distances = self._data.distance_along(waypoints, labels)
+        errors = hypothesis_errors(labels.trajectories_B, waypoints)
+        barriers = barrier_along(distances)
+        penalties = hypothesis_penalties(errors.detach(), barriers, config.geometric_weight)
+        won, unvoted = imitation_terms(errors, config.epsilon)
+        votes = winners(errors.detach()).sum((0, 1))
+        shares = (votes / votes.sum()).unbind()
+        terms = {
+            "winners": won,
+            "unvoted": unvoted,
+            "cost": config.cost_weight * cost_error(costs, cost_targets(penalties)),
+            **{f"votes_{m}": share for m, share in enumerate(shares)},
+        }
+        return _Judged(terms, costs, errors, distances, penalties)
+
+
+class _Judged(NamedTuple):
+    """N samples, K experts, M hypotheses, T waypoints."""
+
+    terms: dict[str, Tensor]
+    """Of the loss; and the parts of the votes that each hypothesis got, which have no gradient."""
+    costs: Tensor  # (N, M), predicted
+    errors: Tensor  # (N, K, M) [m^2]
+    distances: Tensor  # (N, M, T) [m] to the nearest surface
+    penalties: Tensor  # (N, M), of equation 4

@@ -1,0 +1,114 @@
+"""How a student is trained."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from splatpilot.systems.policies.mobilenet import BLOCKS
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.training.policies.student_images import Appearance
+from splatpilot.training.policies.trainer import Schedule
+
+
+def _noise() -> ObservationNoise:
+    """A depth camera's and a colour camera's at once: each student takes what concerns it."""
+    return ObservationNoise(
+        depth_multiplicative=0.03,
+        depth_additive=0.02,
+        depth_dropout=0.01,
+        color_noise=0.02,
+        brightness_jitter=0.2,
+    )
+
+
+@dataclass
+class StudentTraining:
+    """A training run."""
+
+    observation: ClassVar[str]
+    """What the student sees: rgb or depth."""
+
+    # Seed of everything random.
+    seed: int = 0
+    # Where the tensors live: cpu, or cuda.
+    device: str = "cpu"
+    # Folders of what is learned from, as `splatpilot corpus make` writes them.
+    corpora: list[str] = field(default_factory=lambda: ["out/corpus"])
+    # [-] Part of the corpora's worlds, by name, that choose among checkpoints instead.
+    held_out: float = 0.1
+    # [-] Held-out samples that are looked at, evenly spaced.
+    validation_samples: int = 2000
+    schedule: Schedule = field(
+        default_factory=lambda: Schedule(
+            updates=6000, validate_every=1000, checkpoint_every=500, learning_rate=3e-4, decay=0.5
+        )
+    )
+    # Whether the encoder begins with what it learned from ImageNet, or from nothing.
+    pretrained: bool = True
+    # File of those weights; where left empty, that of the data folder or torchvision's download.
+    encoder: str = ""
+    # [-] First modules of the encoder, of 19, that keep their weights; what they make of images is
+    # computed once.
+    frozen: int = 18
+    # [-] Draws of light and noise that are kept of each image, where modules are frozen; a new one
+    # for each step where none are.
+    draws: int = 2
+    # Folder that they are kept in, for other runs too.
+    features: str = "out/features"
+    # [-] Samples a step of the optimiser.
+    batch: int = 32
+    # [-] Part of an expert's pull that hypotheses without votes share; more of it makes all
+    # hypotheses alike, none lets those that begin badly never be used.
+    epsilon: float = 0.05
+    # [1/(m s)] What a metre of soft barrier for a second adds to an error in square metres: at 1
+    # grazing an obstacle all along costs as much as flying half a metre beside the expert.
+    geometric_weight: float = 1.0
+    # [-] Weight of the cost head's error beside the imitation: costs are about 1 where errors are
+    # tenths of a square metre, and would rule the encoder at 1.
+    cost_weight: float = 0.1
+    appearance: Appearance = field(default_factory=Appearance)
+    # What the images are disturbed by.
+    noise: ObservationNoise = field(default_factory=_noise)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        self.schedule.validate()
+        if not self.corpora:
+            raise ValueError("corpora is empty; name one or more folders of corpora")
+        for name, limit in (("held_out", 0.9), ("epsilon", 0.5)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= limit:
+                raise ValueError(f"{name} is {value}; it must be 0 to {limit}")
+        for name in ("batch", "draws", "validation_samples"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("geometric_weight", "cost_weight"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
+        if not 0 <= self.frozen <= BLOCKS:
+            raise ValueError(f"frozen is {self.frozen}; the encoder has 0 to {BLOCKS} modules")
+        if self.frozen and not self.pretrained:
+            raise ValueError(
+                f"frozen is {self.frozen}, but what was not trained yet cannot stay as it is; set "
+                "pretrained=true or frozen=0"
+            )
+        if self.noise.latency > 0.0:
+            raise ValueError(
+                f"noise.latency is {self.noise.latency} s, but a corpus has images of the moment; "
+                "it must be 0"
+            )
+        self.noise.validate("noise")
+        self.appearance.validate("appearance")
+
+
+@dataclass
+class StudentRgbTraining(StudentTraining):
+    """Of a student that sees colours."""
+
+    observation = "rgb"
+
+
+@dataclass
+class StudentDepthTraining(StudentTraining):
+    """Of a student that sees depth."""
+
+    observation = "depth"

@@ -1,0 +1,119 @@
+"""What the student learns from: samples of several corpora, and the distances in their worlds."""
+
+from collections.abc import Sequence
+from hashlib import blake2b
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.policies.ray_casting import EsdfGeometry
+from splatpilot.training.policies.vehicles import rotation_matrix
+
+
+class Labels(NamedTuple):
+    """Of N samples, float32 in the body frame B; see `Samples`."""
+
+    X_WB: Tensor  # (N, 7) quaternion wxyz and position [m]
+    v_B: Tensor  # (N, 3) [m/s]
+    goal_B: Tensor  # (N, 3)
+    trajectories_B: Tensor  # (N, K, 10, 3) [m]
+    world: Tensor  # (N,) int64, index into `StudentData.worlds`
+
+
+class StudentData:
+    """Corpora as one, their worlds known by name, some of them held out.
+
+    Args:
+        corpora: may share worlds.
+        held_out: part of the worlds whose samples are not trained with. Which they are their names
+            decide, so that samples gathered in them later stay on the same side.
+        device: where labels live; images stay on disk.
+
+    Raises:
+        ValueError: if the corpora's samples differ in kind, or too few worlds are left to train in.
+    """
+
+    def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
+        configs = [corpus.config for corpus in corpora]
+        self.camera = configs[0].camera
+        for config in configs:
+            if (config.camera, config.size) != (self.camera, configs[0].size):
+                raise ValueError(
+                    f"the corpora were gathered with different cameras or numbers of trajectories, "
+                    f"{configs[0].size} by {self.camera} and {config.size} by {config.camera}; "
+                    "gather them alike"
+                )
+        records = {world.name: world for corpus in reversed(corpora) for world in corpus.worlds}
+        self.worlds = sorted(records)
+        """Names."""
+        self.held_out_worlds = held_out_names(self.worlds, held_out)
+        self.shards = [shard for corpus in corpora for shard in corpus.shards if len(shard)]
+        """Blocks of samples, which are numbered through them."""
+        counts = [len(shard) for shard in self.shards]
+        self.first = np.cumsum([0, *counts])
+        """The number of each shard's first sample."""
+        number = {name: k for k, name in enumerate(self.worlds)}
+        world = np.repeat([number[shard.world] for shard in self.shards], counts)
+        outside = np.isin(world, [number[name] for name in self.held_out_worlds])
+        self.training, self.held_out = np.flatnonzero(~outside), np.flatnonzero(outside)
+        """Numbers of samples."""
+        if not (len(self.training) and len(self.held_out)):
+            raise ValueError(
+                f"of {len(self.worlds)} worlds {len(self.held_out_worlds)} are held out, which "
+                f"leaves {len(self.training)} samples to train with and {len(self.held_out)} to "
+                "validate with; gather in more worlds, or change held_out"
+            )
+
+        def joined(name: str) -> Tensor:
+            arrays = [shard.arrays[name] for shard in self.shards]
+            return torch.from_numpy(np.concatenate(arrays)).float().to(device)
+
+        self._labels = Labels(
+            X_WB=joined("X_WB"),
+            v_B=joined("v_B"),
+            goal_B=joined("goal_B"),
+            trajectories_B=joined("trajectories_B"),
+            world=torch.from_numpy(world).to(device),
+        )
+        self._fields = EsdfGeometry([_trusted(records[name].esdf()) for name in self.worlds])
+
+    def labels(self, numbers: np.ndarray) -> "Labels":
+        """What belongs to the images of the samples of `numbers` (N,)."""
+        chosen = torch.from_numpy(numbers).to(self._labels.world.device)
+        return Labels(*(values[chosen] for values in self._labels))
+
+    def pixels(self, numbers: np.ndarray, name: str) -> np.ndarray:
+        """The images `color` or `depth` of the samples of `numbers` (N,), see `Samples`."""
+        arrays = [shard.arrays[name] for shard in self.shards]
+        found = np.empty((len(numbers), *arrays[0].shape[1:]), arrays[0].dtype)
+        for row, (k, within) in enumerate(zip(*self.places(numbers), strict=True)):
+            found[row] = arrays[k][within]
+        return found
+
+    def places(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """In which shards, and where in these, the samples of `numbers` (N,) are."""
+        shard = np.searchsorted(self.first, numbers, side="right") - 1
+        return shard, numbers - self.first[shard]
+
+    def distance_along(self, waypoints_B: Tensor, labels: Labels) -> Tensor:
+        """Signed distance (N, M, T) [m] at waypoints (N, M, T, 3) [m] from samples' poses."""
+        N, M, T, _ = waypoints_B.shape
+        R_WB, p_WB = rotation_matrix(labels.X_WB[:, :4]), labels.X_WB[:, None, 4:]
+        p_WQ = waypoints_B.detach().flatten(1, 2) @ R_WB.mT + p_WB
+        world = labels.world.repeat_interleave(M * T)
+        return self._fields.interpolate(p_WQ.flatten(0, 1), world)[0].reshape(N, M, T)
+
+
+def held_out_names(names: Sequence[str], share: float) -> list[str]:
+    """At least one of the names, about `share` of them: those of the least digests."""
+    ranked = sorted(names, key=lambda name: blake2b(name.encode()).digest())
+    return sorted(ranked[: max(1, round(share * len(names)))])
+
+
+def _trusted(esdf: Esdf) -> Esdf:
+    """Unknown space counts as occupied, as for the expert."""
+    return esdf if esdf.occupied_outside else esdf.conservative()

@@ -1,0 +1,92 @@
+"""What frozen modules of the encoder make of images: computed once, and kept in files."""
+
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.training.corpus.shard import Shard
+from splatpilot.training.policies.student_data import StudentData
+from splatpilot.training.policies.student_images import Appearance, clean_images, training_images
+from splatpilot.training.policies.student_network import StudentModule
+
+_BATCH = 32
+
+
+class FrozenFeatures:
+    """Features of all samples: of the images as they are in worlds that are held out, in the others
+    of several draws of light and noise.
+
+    A file for each shard is named by everything that it depends on: runs share what they have in
+    common, a corpus that grew costs what is new, and a run that was interrupted goes on.
+
+    Args:
+        folder: of the files.
+        data: the samples.
+        network: whose encoder it is.
+        frozen: how many of its first modules.
+        draws: of each image that is trained with.
+        appearance, noise: what is drawn.
+
+    Raises:
+        OSError: if `folder` cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        data: StudentData,
+        network: StudentModule,
+        frozen: int,
+        draws: int,
+        appearance: Appearance,
+        noise: ObservationNoise,
+    ) -> None:
+        require_writable_folder(folder)
+        self._data, self.draws = data, draws
+        self._modules = network.features[:frozen]
+        self._pixels = network.spec.pixels
+        self._appearance, self._noise = appearance, noise
+        settings = repr((network.spec.observation, draws, appearance, noise)).encode()
+        weights = [values.detach().cpu().numpy() for values in self._modules.parameters()]
+        what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
+        files = []
+        for shard in tqdm(data.shards, desc="features", unit="shard", disable=None):
+            outside = shard.world in data.held_out_worlds
+            digest = what.copy()
+            # It states the checksums of the images.
+            digest.update((shard.path / "shard.json").read_bytes() + bytes([outside]))
+            files.append(folder / f"{digest.hexdigest()[:32]}.npy")
+            if not files[-1].exists():
+                seed = int.from_bytes(digest.digest()[:7])
+                with written_atomically(files[-1]) as path:
+                    np.save(path, self._features(shard, 0 if outside else draws, seed))
+        self._files = [np.load(file, mmap_mode="r") for file in files]
+
+    def __call__(self, numbers: np.ndarray, draw: np.ndarray) -> Tensor:
+        """Features (N, C, h, w) of the samples of `numbers` (N,), of the draws `draw` (N,); samples
+        of held-out worlds have the draw 0 alone."""
+        rows = zip(*self._data.places(numbers), draw, strict=True)
+        return torch.from_numpy(np.stack([self._files[k][d, n] for k, n, d in rows])).float()
+
+    @torch.no_grad()
+    def _features(self, shard: Shard, draws: int, seed: int) -> np.ndarray:
+        """(draws, n, C, h, w) float16; of clean images where draws is 0."""
+        device = next(self._modules.parameters()).device
+        generator = torch.Generator(device).manual_seed(seed)
+        pixels = shard.arrays[self._pixels]
+        kept = []
+        for _ in range(max(draws, 1)):
+            for first in range(0, len(pixels), _BATCH):
+                batch = np.array(pixels[first : first + _BATCH])
+                if draws:
+                    images = training_images(batch, self._appearance, self._noise, generator)
+                else:
+                    images = clean_images(batch, str(device))
+                kept.append(self._modules(images).half().cpu().numpy())
+        return np.concatenate(kept).reshape(max(draws, 1), len(pixels), *kept[0].shape[1:])

@@ -1,0 +1,64 @@
+"""Images for the student: encoded, and in training never twice the same."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.training.policies.observation import noisy_color, noisy_depth
+from splatpilot.training.policies.student_network import encode_color, encode_depth
+
+
+@dataclass
+class Appearance:
+    """How far the looks of a place are changed; uniform up to each, up and down, for each image."""
+
+    # [stops] Exposure: twice as bright for each.
+    exposure: float = 0.5
+    # [deg] By which colours are turned about grey.
+    hue: float = 15.0
+
+    def validate(self, name: str) -> None:
+        """Raises ValueError on a value out of range, naming it as a field of `name`."""
+        for field, limit in (("exposure", 5.0), ("hue", 180.0)):
+            value = getattr(self, field)
+            if not 0.0 <= value <= limit:
+                raise ValueError(f"{name}.{field} is {value}; it must be 0 to {limit:g}")
+
+
+def clean_images(pixels: np.ndarray, device: str = "cpu") -> Tensor:
+    """Images (N, 3, H, W) as the network takes them, of colours (N, H, W, 3) or depth (N, H, W)
+    [m]."""
+    images = torch.from_numpy(pixels).to(device).float()
+    return encode_color(images) if images.ndim == 4 else encode_depth(images)
+
+
+def training_images(
+    pixels: np.ndarray,
+    appearance: Appearance,
+    noise: ObservationNoise,
+    generator: torch.Generator,
+) -> Tensor:
+    """The same in another light and through a worse camera, drawn anew each time."""
+    images = torch.from_numpy(pixels).to(generator.device).float()
+    if images.ndim == 3:
+        return encode_depth(noisy_depth(images, noise, generator))
+    draws = torch.rand(2, len(images), generator=generator, device=images.device) * 2.0 - 1.0
+    images = relit(images, 2.0 ** (appearance.exposure * draws[0]), appearance.hue * draws[1])
+    return encode_color(noisy_color(images, noise, generator))
+
+
+def relit(color: Tensor, gain: Tensor, hue: Tensor) -> Tensor:
+    """Colours (N, H, W, 3), 0 to 255, times `gain` (N,), turned by `hue` (N,) [deg] about grey:
+    red towards green, green towards blue; clipped."""
+    angle = hue * (math.pi / 180.0)
+    cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
+    identity = torch.eye(3, device=color.device)
+    cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
+    cross = cross.to(color.device) / math.sqrt(3.0)
+    turned = cos * identity + (1.0 - cos) / 3.0 + sin * cross  # (N, 3, 3), Rodrigues' formula
+    mixed = color.flatten(1, 2) @ (gain[:, None, None] * turned).mT
+    return mixed.reshape(color.shape).clamp(0.0, 255.0)

@@ -1,0 +1,100 @@
+"""The student's network for torch; `systems.policies.student_inference` flies it."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torchvision.models import mobilenet_v2
+
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
+from splatpilot.systems.policies.mobilenet import CHANNELS, adds_input, mobilenet_blocks
+from splatpilot.systems.policies.student_inference import (
+    FARTHEST,
+    HYPOTHESES,
+    NEAREST,
+    STATE_SIZE,
+    WAYPOINT_SCALE,
+    StudentSpec,
+)
+
+
+class StudentModule(nn.Module):
+    """The network of a `StudentSpec`, with the names of weights that `StudentNetwork` takes.
+
+    The encoder is torchvision's, with a bias in the place of each batch norm: what is trained is
+    what flies, and no sample depends on the others of its batch.
+    """
+
+    def __init__(self, spec: StudentSpec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.features = mobilenet_v2(norm_layer=_Bias).features
+        self._initialize_encoder()
+        self.cell_layer = nn.Linear(CHANNELS, spec.cell_features)
+        self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
+        self.state_layer_2 = nn.Linear(spec.state_features, spec.state_features)
+        joined = spec.image_features() + spec.state_features
+        self.head = nn.Linear(joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
+
+    def _initialize_encoder(self) -> None:
+        """Has numbers keep their size through the encoder, as no batch norm sees to it: a rectifier
+        halves their squares, and modules that add their input begin with adding nothing."""
+        weights = self.state_dict()
+        for block in mobilenet_blocks():
+            rectified = False
+            for layer in block:
+                kind = "relu" if rectified else "linear"
+                nn.init.kaiming_normal_(weights[layer.weight], nonlinearity=kind)
+                rectified = layer.rectified
+            if adds_input(block):
+                nn.init.zeros_(weights[block[-1].weight])
+
+    def load_encoder(self, weights: dict[str, Tensor]) -> None:
+        """Has the encoder begin with weights by the names of `mobilenet_shapes`."""
+        with torch.no_grad():
+            for name, value in self.state_dict().items():
+                if name in weights:
+                    value.copy_(weights[name])
+
+    def freeze(self, modules: int) -> None:
+        """Has the first modules of the encoder keep their weights."""
+        self.features[:modules].requires_grad_(False)
+
+    def forward(self, image: Tensor, state: Tensor, first: int = 0) -> tuple[Tensor, Tensor]:
+        """Waypoints (N, 3, 10, 3) [m] and costs (N, 3).
+
+        Args:
+            image: (N, 3, height, width), or what the `first` modules of the encoder made of it.
+            state: (N, 6).
+            first: module of the encoder that takes `image`.
+        """
+        features = self.features[first:](image).flatten(2).mT  # (N, cells, CHANNELS)
+        cells = self.cell_layer(features).relu().flatten(1)
+        y = self.state_layer_2(self.state_layer(state).relu()).relu()
+        output = self.head(torch.cat([cells, y], 1)).unflatten(1, (HYPOTHESES, -1))
+        waypoints = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
+        return waypoints, output[..., -1]
+
+
+class _Bias(nn.Module):
+    """What is left of a batch norm that is folded into the convolution before it."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.bias[:, None, None]
+
+
+def encode_color(color: Tensor) -> Tensor:
+    """Colours (N, H, W, 3), 0 to 255, as (N, 3, H, W): -1 to 1."""
+    return color.movedim(3, 1) / 127.5 - 1.0
+
+
+def encode_depth(depth: Tensor) -> Tensor:
+    """Planar depth (N, H, W) [m] as grey images (N, 3, H, W), see `student_inference`."""
+    z = depth.clamp(NEAREST, FARTHEST).log()
+    near, far = math.log(NEAREST), math.log(FARTHEST)
+    encoded = (far + near - 2.0 * z) / (far - near)
+    return encoded[:, None].expand(-1, 3, -1, -1)
