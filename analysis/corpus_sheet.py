@@ -77,4 +77,5 @@ def project(camera: OnboardCamera, p_BQ: np.ndarray) -> np.ndarray:
     p_CQ = camera.X_BC().inverse().multiply(p_BQ.T.astype(float)).reshape(3, -1).T
     p_CQ = p_CQ[p_CQ[:, 2] > _NEAR]
     center = np.array([camera.width, camera.height]) / 2
-    return center + camera.focal_length * p_CQ[:, :2] / p_CQ[:, 2:]
+    focal = np.array([camera.focal_x, camera.focal_y])
+    return center + focal * p_CQ[:, :2] / p_CQ[:, 2:]

@@ -94,8 +94,8 @@ def test_images_are_taken_from_the_pose_that_is_recorded(world, labeller):
     camera = CONFIG.camera
     for k, X_WP in enumerate(poses(samples)):
         forward, left, up = X_WP.inverse().multiply(BALL) - np.array(camera.p_BC)
-        column = camera.width / 2 - camera.focal_length * left / forward
-        row = camera.height / 2 - camera.focal_length * up / forward
+        column = camera.width / 2 - camera.focal_x * left / forward
+        row = camera.height / 2 - camera.focal_y * up / forward
         light = samples.color[k].sum(axis=2)
         rows, columns = np.nonzero(light > light.max() / 2)
         assert light.max() > 300
