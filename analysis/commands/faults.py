@@ -21,6 +21,14 @@ def _faults(options: argparse.Namespace) -> None:
     from splatpilot.analysis.faults.run import FaultsConfig, run
     from splatpilot.systems.configuration import load_config
 
-    for name in ("drake", "splatpilot"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    run(config=load_config(FaultsConfig(), options.config, options.overrides), out=options.out)
+    config = load_config(FaultsConfig(), options.config, options.overrides)
+    # Thousands of packets are refused on purpose.
+    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        run(config=config, out=options.out)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
