@@ -3,9 +3,10 @@
 from typing import cast
 
 from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput
-from pydrake.systems.sensors import CameraInfo
+from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.meshcat import AddMeshcat
 from splatpilot.diagrams.observation import (
@@ -132,18 +133,10 @@ def BuildFlightDiagram(
 def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
     """The scenario's camera, looking at the world's Gaussians."""
     config = scenario.camera
-    center_x, center_y = config.principal_point()
     return SplatCamera(
         world.baked,
-        CameraInfo(
-            width=config.width,
-            height=config.height,
-            focal_x=config.focal_x(),
-            focal_y=config.focal_y(),
-            center_x=center_x,
-            center_y=center_y,
-        ),
-        config.X_PB.GetDeterministicValue() @ config.X_BC.GetDeterministicValue(),
+        camera_info(config),
+        camera_mount(config),
         min_depth=config.z_near,
         max_depth=config.z_far,
         near=config.clipping_near,
@@ -151,3 +144,21 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
         background=world.background,
         moving=world.moving.gaussians if world.moving else None,
     )
+
+
+def camera_info(config: CameraConfig) -> CameraInfo:
+    """The intrinsics of a camera."""
+    center_x, center_y = config.principal_point()
+    return CameraInfo(
+        width=config.width,
+        height=config.height,
+        focal_x=config.focal_x(),
+        focal_y=config.focal_y(),
+        center_x=center_x,
+        center_y=center_y,
+    )
+
+
+def camera_mount(config: CameraConfig) -> RigidTransform:
+    """X_BC, the pose of a camera in the vehicle's body frame."""
+    return config.X_PB.GetDeterministicValue() @ config.X_BC.GetDeterministicValue()

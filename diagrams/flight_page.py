@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpilot.diagrams.flight import Flight
-from splatpilot.diagrams.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight_diagram import camera_info, camera_mount
 from splatpilot.diagrams.meshcat import open_meshcat
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
@@ -55,11 +55,10 @@ def write_flight_page(
     Raises:
         OSError: if it cannot be written.
     """
-    camera = MakeCamera(scenario, world)
     field = world.distance_field
     view = ReplayView(
-        X_BC=camera.X_BC(),
-        fov_y=camera.camera_info().fov_y(),
+        X_BC=camera_mount(scenario.camera),
+        fov_y=camera_info(scenario.camera).fov_y(),
         radius=VEHICLE_RADIUS,
         lower=float(np.asarray(field.lower_W)[2]),
         upper=float(np.asarray(field.upper_W)[2]),

@@ -8,7 +8,8 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1360px; margin: 2em auto;
        padding: 0 1em; }
 h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .6em 0; }
+table { display: block; overflow-x: auto; border-collapse: collapse;
+        font-variant-numeric: tabular-nums; margin: .6em 0; }
 th, td { padding: .25em .5em; white-space: nowrap; text-align: right;
          border-bottom: 1px solid #e3e5e8; }
 th:first-child, td:first-child { text-align: left; }

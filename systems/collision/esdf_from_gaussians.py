@@ -73,14 +73,7 @@ def density_on_grid(
     scene: GaussianScene, lower_W: np.ndarray, shape: tuple[int, int, int], voxel_size: float
 ) -> np.ndarray:
     """The Gaussians' density at the voxel centres, (nx, ny, nz) float32."""
-    w, x, y, z = scene.quats.astype(float).T
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)  # (N, 3, 3)
+    R = scene.rotations
     # In voxels from the first voxel's centre from here on.
     variance = np.square(scene.scales / voxel_size, dtype=float) + _FILTER**2
     mean = (scene.means - lower_W) / voxel_size - 0.5

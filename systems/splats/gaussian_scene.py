@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.splats.spherical_harmonics import C0, degree_of, rotation_matrices
 
@@ -112,6 +113,11 @@ class GaussianScene:
     def base_colors(self) -> NDArray[np.float32]:
         """Colours without their dependence on direction, (N, 3), clipped to 0 to 1."""
         return np.clip(0.5 + C0 * self.sh[:, 0], 0, 1)
+
+    @property
+    def rotations(self) -> NDArray[np.float64]:
+        """Orientations of the principal axes as matrices, (N, 3, 3)."""
+        return Rotation.from_quat(self.quats, scalar_first=True).as_matrix()
 
     def transformed_by(self, X_WO: RigidTransform) -> GaussianScene:
         """Returns these Gaussians, standing in frame O, expressed in W."""

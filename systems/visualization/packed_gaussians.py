@@ -1,11 +1,7 @@
 """Gaussians as a page holds them, for `page/splats.js` to show."""
 
-import base64
-import gzip
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -25,15 +21,9 @@ def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
     words[:, :3] = scene.means.view(np.uint32)
     shades = np.column_stack([scene.base_colors, scene.opacities])
     words[:, 3] = np.round(255 * shades).astype(np.uint8).view(np.uint32)[:, 0]
-    R_WA = Rotation.from_quat(scene.quats, scalar_first=True).as_matrix()
-    axes = R_WA * scene.scales[:, None, :]
+    axes = scene.rotations * scene.scales[:, None, :]
     covariances = _COVARIANCE_SCALE * axes @ axes.transpose(0, 2, 1)
     rows, columns = np.triu_indices(3)
     halves = np.minimum(covariances[:, rows, columns], np.finfo(np.float16).max)
     words[:, 4:7] = np.ascontiguousarray(halves, np.float16).view(np.uint32)
     return words
-
-
-def packed_base64(data: bytes) -> str:
-    """Bytes, compressed, as text for a page; `unpack` of `page/page.js` reads them."""
-    return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()

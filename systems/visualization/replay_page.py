@@ -1,6 +1,7 @@
 """A page to watch flights in: what Meshcat has drawn, the world's Gaussians, and a time slider."""
 
 import base64
+import gzip
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +18,11 @@ from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-from splatpilot.systems.visualization.packed_gaussians import pack_gaussians, packed_base64
+from splatpilot.systems.visualization.packed_gaussians import pack_gaussians
 
 _COLORS = ("#e8432e", "#2f8fe8", "#e8b52e", "#a05ce0", "#30b870", "#e060b0", "#50c8d0", "#b0b0b0")
 _RATE = 30.0  # [Hz], samples of a flight in the page
+_SCRIPTS = "splats.js", "replay_flight.js", "replay.js", "page.js"
 _BALLS_PERIOD = 0.1  # [s], between which balls go straight
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
@@ -101,19 +103,22 @@ def replay_page(
         # The page's columns run against the azimuth.
         mirrored = EnvironmentMap(background.texels[:, ::-1])
         sky = base64.b64encode(mirrored.png()).decode()
-    scripts = "".join(
-        f"<script>{_source(name)}</script>" for name in ("splats.js", "replay.js", "page.js")
-    )
+    scripts = "".join(f"<script>{_source(name)}</script>" for name in _SCRIPTS)
     added = (
         f"<style>{_source('replay.css')}</style>"
         f'<script type="text/plain" id="gaussians">'
-        f"{packed_base64(pack_gaussians(gaussians).tobytes())}</script>"
+        f"{_compressed(pack_gaussians(gaussians).tobytes())}</script>"
         f'<script type="text/plain" id="sky">{sky}</script>'
         f'<script type="text/plain" id="flights">'
-        f"{packed_base64(json.dumps(data).encode())}</script>{scripts}"
+        f"{_compressed(json.dumps(data).encode())}</script>{scripts}"
     )
     head, body, tail = meshcat_page.rpartition("</body>")
     return head + added + body + tail
+
+
+def _compressed(data: bytes) -> str:
+    """Bytes as text, which `unpack` of `page/page.js` reads; the same every time."""
+    return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
 
 
 def _source(name: str) -> str:

@@ -1,7 +1,7 @@
 // Puts what the page holds (see `replay_page.py`) into Meshcat's viewer.
 "use strict";
 
-// Bytes that `packed_base64` has written into an element.
+// The bytes that an element holds, compressed.
 async function unpack(id) {
   const text = document.getElementById(id).textContent;
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));

@@ -1,14 +1,11 @@
 """Gaussians as a page holds them."""
 
-import base64
-import gzip
-
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.visualization.packed_gaussians import pack_gaussians, packed_base64
+from splatpilot.systems.visualization.packed_gaussians import pack_gaussians
 
 
 def test_words_hold_centres_shades_and_covariances():
@@ -36,10 +33,3 @@ def test_words_hold_centres_shades_and_covariances():
         packed = covariance[np.triu_indices(3)]
         np.testing.assert_allclose(row, packed, atol=2**-11 * np.abs(packed).max() + 1e-9)
     assert (words[:, 7] == 0).all()
-
-
-def test_packed_bytes_come_back_and_are_the_same_every_time():
-    """Text that base64 and gzip undo, without a date in it."""
-    data = bytes(range(256)) * 10
-    assert gzip.decompress(base64.b64decode(packed_base64(data))) == data
-    assert packed_base64(data) == packed_base64(data)

@@ -1,5 +1,8 @@
 """Pages of flights, in a real browser where there is one."""
 
+import base64
+import gzip
+import re
 import shutil
 
 import cv2
@@ -17,6 +20,7 @@ from splatpilot.systems.splats.drake_images import render_view
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.visualization.drawing import draw_vehicle
+from splatpilot.systems.visualization.packed_gaussians import pack_gaussians
 from splatpilot.systems.visualization.replay_page import (
     Frames,
     ReplayedFlight,
@@ -239,6 +243,17 @@ def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
     ball = page.run("() => Array.from(replay.balls.mesh.instanceMatrix.array)")
     assert ball[0] == 0
     assert page.errors == []
+
+
+def test_page_holds_its_gaussians_and_is_the_same_every_time():
+    """What is compressed into the page comes back by gzip and base64; there is no date in it."""
+    gaussians, flights = cloud(np.random.default_rng(4)), [straight("a", "goal")]
+    pages = [replay_page("<body></body>", gaussians, SKY, VIEW, flights) for _ in range(2)]
+    assert pages[0] == pages[1]
+    packed = re.search(r'id="gaussians">([^<]*)<', pages[0])
+    assert packed is not None
+    held = np.frombuffer(gzip.decompress(base64.b64decode(packed[1])), np.uint32)
+    np.testing.assert_array_equal(held.reshape(-1, 8), pack_gaussians(gaussians))
 
 
 def test_page_without_flights_is_refused():
