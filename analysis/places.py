@@ -35,8 +35,8 @@ PLACES = {
         "tartanair/hospital",
         ("reconstruct.initial_gaussians=60000", "reconstruct.voxel_size=0.05"),
     ),
-    "bookstore": Place("worlds/bookstore.gltf", ("render.up=z",)),
-    "warehouse": Place("worlds/warehouse.gltf", ("render.up=z",)),
+    "bookstore": Place("worlds/bookstore.gltf", ("render.up=z", "reconstruct.iterations=10000")),
+    "warehouse": Place("worlds/warehouse.gltf", ("render.up=z", "reconstruct.iterations=10000")),
     "hospital_building": Place(
         "worlds/hospital_building.gltf",
         (

@@ -142,10 +142,11 @@ class Optimization:
         k = self._image_of_step(self.step)
         viewmat, K = self._views.camera(k, config.device)
         backdrop = self._backdrop_of_step(self.step)
+        gaussians = self._gaussians()
         outlines = self._outlined[k] and self.step % 2 == 1
         rendering = render(
             config.representation,
-            self._gaussians(),
+            gaussians,
             viewmat,
             K,
             self._views.width,
@@ -158,7 +159,7 @@ class Optimization:
             renderer=self._renderer,
         )
         loss = self._objective.loss(
-            rendering, self._gaussians(), k, self.gains[k], self.step, backdrop, outlines
+            rendering, gaussians, k, self.gains[k], self.step, backdrop, outlines
         )
         if config.strategy == "mcmc":
             loss = loss + mcmc.penalty(splats)
