@@ -24,9 +24,6 @@ from splatpilot.systems.splats.gaussian_scene import GaussianScene
 _INSET = 0.012
 """[m], how deep the closed layer may lie inside a trunk, where patches are finest: fissures."""
 
-_SINGLE = 0.5
-"""How far single patches bulge over those of a closed layer."""
-
 
 @dataclass(frozen=True)
 class _Marks:
@@ -82,8 +79,7 @@ def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
                 surfels = _roughen(surfels, marks, rng)
                 opacity = rng.uniform(0.75, 0.97, len(surfels))
             surfels, tree = surfels[keep], tree[keep]
-            across = surfels.extent[:, 1] * (1.0 if layer == "fissures" else _SINGLE)
-            surfels = inset(surfels, across, trees.radius[tree])
+            surfels = inset(surfels, surfels.extent[:, 1], trees.radius[tree])
             albedo = _bark(layout, light, species, layer, surfels, tree)
             scenes.append(light.paint(surfels, albedo, opacity[keep]))
     return merge(scenes)
