@@ -51,5 +51,5 @@ clean:
 	touch $@
 
 .venv/installed: .venv/flying
-	.venv/bin/uv pip install --python .venv/bin/python --requirements pyproject.toml --extra dev
+	.venv/bin/uv pip install --python .venv/bin/python --compile-bytecode --requirements pyproject.toml --extra dev
 	touch $@

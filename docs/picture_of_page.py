@@ -1,48 +1,76 @@
-"""A picture of a flight's page: from above, and following the vehicle.
+"""A picture of a flight page: two views side by side, or a moving one that follows the vehicle.
 
     splatpilot fly --seed 7 --out out/fly
     python docs/picture_of_page.py out/fly/flight.html docs/page.jpg
+    python docs/picture_of_page.py out/fly/flight.html docs/flight.webp
 
 It needs a Chromium on the PATH, without a display.
 """
 
 import argparse
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
-import cv2
 import numpy as np
-from playwright.sync_api import sync_playwright
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+from tqdm import tqdm
 
-SIZE = {"width": 1000, "height": 620}
 SETTLED = "window.replay && replay.splats.settled && !viewer.needs_render"
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+RATE = 8
+"""[1/s], pictures of a moving one."""
 
 
-def photograph(page: Path, time: float) -> np.ndarray:
-    """(H, W, 3) uint8, blue first: two views of a page at a time [s], side by side."""
-    pictures = []
+@contextmanager
+def opened(page: Path, width: int, height: int) -> Iterator[Page]:
+    """A page in a browser of that size [px]."""
     with sync_playwright() as playwright:
         chromium = shutil.which("chromium")
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        tab = browser.new_page(viewport=SIZE)
+        tab = browser.new_page(viewport={"width": width, "height": height})
         tab.set_default_timeout(300_000)
         tab.goto(page.resolve().as_uri())
-        for view in ("overview", "chase"):
-            tab.wait_for_function(SETTLED)
-            tab.evaluate(f"() => {{ replay.look('{view}'); replay.seek({time}); }}")
-            tab.wait_for_function(SETTLED)
-            shot = np.frombuffer(tab.screenshot(), np.uint8)
-            pictures.append(cv2.imdecode(shot, cv2.IMREAD_COLOR))
+        tab.wait_for_function(SETTLED)
+        yield tab
         browser.close()
-    return cv2.resize(np.hstack(pictures), None, fx=0.8, fy=0.8, interpolation=cv2.INTER_AREA)
+
+
+def photograph(tab: Page, view: str, time: float) -> Image.Image:
+    """A view of the page at a time [s]."""
+    tab.evaluate(f"() => {{ replay.look('{view}'); replay.seek({time}); }}")
+    tab.wait_for_function(SETTLED)
+    return Image.open(BytesIO(tab.screenshot())).convert("RGB")
+
+
+def write_still(page: Path, out: Path, time: float) -> None:
+    """Two views of the page at a time [s], side by side."""
+    with opened(page, 1000, 620) as tab:
+        views = [np.asarray(photograph(tab, view, time)) for view in ("overview", "chase")]
+    picture = Image.fromarray(np.hstack(views))
+    picture.resize((1600, 496), Image.Resampling.LANCZOS).save(out, quality=82)
+
+
+def write_moving(page: Path, out: Path) -> None:
+    """The whole flight, following the vehicle."""
+    with opened(page, 720, 450) as tab:
+        times = np.arange(0, tab.evaluate("replay.duration"), 1 / RATE)
+        pictures = [photograph(tab, "chase", time) for time in tqdm(times, unit="picture")]
+    pictures[0].save(
+        out, save_all=True, append_images=pictures[1:], duration=1000 // RATE, loop=0, quality=60
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("page", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--time", type=float, default=6.0, help="[s] (%(default)s)")
+    parser.add_argument("out", type=Path, help=".webp for a moving picture")
+    parser.add_argument("--time", type=float, default=6.0, help="[s] of the still (%(default)s)")
     options = parser.parse_args()
-    picture = photograph(options.page, options.time)
-    cv2.imwrite(str(options.out), picture, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    if options.out.suffix == ".webp":
+        write_moving(options.page, options.out)
+    else:
+        write_still(options.page, options.out, options.time)
