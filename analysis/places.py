@@ -36,20 +36,10 @@ PLACES = {
         ("reconstruct.initial_gaussians=60000", "reconstruct.voxel_size=0.05"),
     ),
     "bookstore": Place(
-        "worlds/bookstore.gltf",
-        (
-            "render.up=z",
-            "reconstruct.initial_gaussians=160000",
-            "reconstruct.max_gaussians=160000",
-        ),
+        "worlds/bookstore.gltf", ("render.up=z", "reconstruct.initial_gaussians=160000")
     ),
     "warehouse": Place(
-        "worlds/warehouse.gltf",
-        (
-            "render.up=z",
-            "reconstruct.initial_gaussians=160000",
-            "reconstruct.max_gaussians=160000",
-        ),
+        "worlds/warehouse.gltf", ("render.up=z", "reconstruct.initial_gaussians=160000")
     ),
     "hospital_building": Place(
         "worlds/hospital_building.gltf",
