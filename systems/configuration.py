@@ -17,7 +17,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.registry import Registry
 
-_REGISTRY = "registry"
+OPEN_REGISTRY = "registry"
 """Key of an open field's registry in its metadata."""
 
 
@@ -27,7 +27,7 @@ def open_field(registry: Registry, default: Callable[[], Any]) -> Any:
     have, or a dictionary of such. In YAML its tag names the type; one without a tag is of the type
     that `default` makes.
     """
-    return dataclasses.field(default_factory=default, metadata={_REGISTRY: registry})
+    return dataclasses.field(default_factory=default, metadata={OPEN_REGISTRY: registry})
 
 
 def load_config[Config](
@@ -120,7 +120,7 @@ def _resolve_open_fields(config: Any, tags: set[str]) -> None:
         return
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        registry: Registry | None = field.metadata.get(_REGISTRY)
+        registry: Registry | None = field.metadata.get(OPEN_REGISTRY)
         if registry is None:
             _resolve_open_fields(value, tags)
             continue
