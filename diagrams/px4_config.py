@@ -17,8 +17,9 @@ class Px4Config:
     url: str = DEFAULT_URL
     # Where PX4's packets come to.
     udp: UdpConfig = field(default_factory=lambda: UdpConfig(port=14540))
-    # Where PX4 is.
+    # Address of PX4.
     vehicle_host: str = "127.0.0.1"
+    # Port at which PX4 listens.
     vehicle_port: int = 14580
     # MAVLink's number of the vehicle.
     system: int = 1

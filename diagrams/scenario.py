@@ -63,8 +63,9 @@ class Scenario:
     # What is flown in: a generated world, or (!SceneConfig) a reconstructed scene, or another of
     # `make_world.py` and of other packages.
     world: WorldConfig = open_field(WORLDS, ForestConfig)
-    # [m] Start p_WS and goal p_WG in the world frame; the world's own where left out.
+    # [m] Start p_WS in the world frame; the world's own where left out.
     start: list[float] | None = None
+    # [m] Goal p_WG in the world frame; the world's own where left out.
     goal: list[float] | None = None
     # [m] The vehicle starts anywhere within this distance of the start, level and at rest.
     start_radius: float = 0.1

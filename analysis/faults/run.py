@@ -30,6 +30,7 @@ class FaultsConfig:
 
     # [-] Flights; the kinds of faults take turns.
     trials: int = 300
+    # Seed of everything random.
     seed: int = 0
     # [-] Worlds that the trials take turns in.
     worlds: int = 10

@@ -36,16 +36,16 @@ class ClutterConfig:
     length: float = 36.0  # [m] flyable volume along x: from 0 to length
     width: float = 20.0  # [m] along y, centred on 0
     height: float = 6.0  # [m] along z
-    spheres: int = 10  # [-]
+    spheres: int = 10  # [-] spheres
     sphere_min: float = 0.6  # [m] smallest radius
     sphere_max: float = 1.8  # [m] largest radius
-    boxes: int = 20  # [-]
+    boxes: int = 20  # [-] boxes
     half_min: float = 0.3  # [m] smallest half edge of a box
     half_max: float = 0.9  # [m] largest half edge
     # Whether boxes float, turned anyhow. Otherwise they are pillars on the ground, 2 m high at
     # least, that lean up to `lean_max`.
     floating: bool = False
-    lean_max: float = 15.0  # [deg]
+    lean_max: float = 15.0  # [deg] largest tilt of a pillar
     voxel_size: float = 0.15  # [m] of the distance grid
 
     def validate(self) -> None:

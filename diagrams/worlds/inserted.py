@@ -33,10 +33,10 @@ _MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
 class InsertedConfig(SceneSource):
     """A scene on disk with 3 to 5 solids, hanging or standing in its free space."""
 
-    least: int = 3  # [-] solids
-    most: int = 5  # [-]
+    least: int = 3  # [-] least number of solids
+    most: int = 5  # [-] greatest number of solids
     half_min: float = 0.10  # [m] smallest half width of a solid
-    half_max: float = 0.25  # [m] largest
+    half_max: float = 0.25  # [m] largest half width of a solid
     gap: float = GAP  # [m] least width of every gap on the way, and between two solids
 
     def validate(self) -> None:

@@ -29,7 +29,7 @@ class OctomapConfig(SceneSource):
     """A binary OctoMap (.bt) on disk; `path` is found as that of a scene."""
 
     lower: list[float] | None = None  # [m] lower corner of the part that is flown in
-    upper: list[float] | None = None  # [m] upper corner
+    upper: list[float] | None = None  # [m] upper corner of that part
 
     def validate(self) -> None:
         """Raises ValueError for an empty path, or a box with one corner or none in order."""

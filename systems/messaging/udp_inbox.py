@@ -12,6 +12,7 @@ _BUFFER = 4_000_000  # [bytes] that wait in the kernel: a second of raw frames.
 class UdpConfig:
     """Where packets come to, and from whom."""
 
+    # Port that packets come to.
     port: int = 5600
     # Address that packets come to: that of this host only, or 0.0.0.0 for all networks.
     host: str = "127.0.0.1"

@@ -41,29 +41,37 @@ class ReactiveConfig:
     speed: float = 2.0
     # [Hz] Images and decisions per second.
     rate: float = 15.0
-    # [-] Of each block of pixels the nearest counts; blocks across and down the image.
+    # [-] Blocks across the image, of each of which the nearest pixel counts.
     columns: int = 16
+    # [-] Blocks down the image.
     rows: int = 9
     # [-] How many images are remembered.
     memory: int = 20
     # [s] How far ahead candidates are followed.
     horizon: float = 1.5
-    # [-] Number of directions to the sides, and [rad] the largest angle from the goal's direction.
+    # [-] Number of directions to the sides.
     num_yaws: int = 17
+    # [rad] Largest angle to the sides from the goal's direction.
     max_yaw: float = math.radians(100.0)
-    # [-] Number of directions up and down, and [rad] the largest angle.
+    # [-] Number of directions up and down.
     num_pitches: int = 3
+    # [rad] Largest angle up and down.
     max_pitch: float = math.radians(25.0)
     # [-] Speeds as fractions of the greatest.
     speed_fractions: list[float] = field(default_factory=lambda: [0.33, 0.67, 1.0])
     # [m] Clearance kept for errors of tracking and for what lies between pixels.
     margin: float = 0.15
+    # [m] Margin of the soft barrier.
     barrier_margin: float = 0.5
-    # Weights, see above.
+    # [-] Weight of a metre's difference of height from the goal.
     height_weight: float = 0.3
+    # [1/m] Weight of nearness, along a metre of the way.
     barrier_weight: float = 4.0
+    # [1/m] Weight of coming closer than radius and margin, along a metre of the way.
     contact_weight: float = 100.0
+    # [-] Weight of a metre through what no image has shown.
     unseen_weight: float = 2.0
+    # [s^2/m] Weight of the square of the change of velocity.
     acceleration_weight: float = 0.02
 
     def validate(self) -> None:

@@ -18,7 +18,7 @@ from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 class StraightConfig:
     """How fast the straight line is flown."""
 
-    # [m/s]
+    # [m/s] Speed that is flown.
     speed: float = 2.0
     # [Hz] Decisions per second.
     rate: float = 15.0

@@ -41,11 +41,13 @@ class LatticeConfig:
     speed: float = 2.0
     # [s] Duration of the trajectories, a multiple of 0.1 s, the time between samples.
     horizon: float = 2.0
-    # [-] Number of directions to the sides, and [rad] the largest angle.
+    # [-] Number of directions to the sides.
     num_yaws: int = 25
+    # [rad] Largest angle to the sides.
     max_yaw: float = 1.745
-    # [-] Number of directions up and down, and [rad] the largest angle.
+    # [-] Number of directions up and down.
     num_pitches: int = 7
+    # [rad] Largest angle up and down.
     max_pitch: float = 0.5
     # [-] Final speeds as fractions of the nominal speed.
     speed_fractions: list[float] = field(default_factory=lambda: [0.33, 0.67, 1.0])

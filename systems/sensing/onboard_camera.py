@@ -17,15 +17,17 @@ _R_BC_LEVEL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 
 class OnboardCamera:
     """A pinhole camera and its mount; it takes images when its policy looks."""
 
-    # [px]
+    # [px] Width of its images.
     width: int = 64
+    # [px] Height of its images.
     height: int = 36
     # [deg] Horizontal field of view.
     fov_x: float = 90.0
     # [deg] Vertical field of view; that of square pixels where left out.
     fov_y: float | None = None
-    # [m] Range of its depth images.
+    # [m] Least depth that its depth images show.
     min_depth: float = 0.1
+    # [m] Greatest depth that its depth images show.
     max_depth: float = 20.0
     # [m] Where it sits on the vehicle.
     p_BC: list[float] = field(default_factory=lambda: [0.1, 0.0, 0.0])

@@ -23,7 +23,7 @@ _STEP = 0.1  # [m], at least, between places that are looked at.
 class FlightLimits:
     """What is kept whatever a policy decides."""
 
-    # [m/s]
+    # [m/s] Greatest speed.
     max_speed: float = 6.0
     # [rad] Greatest angle between body z and vertical.
     max_tilt: float = 1.0

@@ -9,19 +9,19 @@ import numpy as np
 class RenderConfig:
     """How a world is captured."""
 
-    width: int = 640  # [px]
-    height: int = 480  # [px]
+    width: int = 640  # [px] of the images
+    height: int = 480  # [px] of the images
     # [m] Points x, y, z that the camera goes through; left out, it visits all the free space
     # between the heights, no two visited places being closer than `apart` on the way.
     path: list[list[float]] = field(default_factory=list)
     lowest: float = 1.0  # [m] of the path where it is not given
     highest: float = 2.2  # [m] of the path where it is not given
-    apart: float = 3.0  # [m]
+    apart: float = 3.0  # [m] least distance of two visited places
     clearance: float = 0.5  # [m] that the camera keeps from surfaces
     spacing: float = 0.6  # [m] between stops on the path
     # [deg] Directions in which the camera looks at each stop, from that of travel to the left.
     yaws: list[float] = field(default_factory=lambda: [0.0, 90.0, -90.0])
-    pitch: float = -5.0  # [deg] upwards
+    pitch: float = -5.0  # [deg] by which the camera looks up
     # [m] to the camera's left, negative to its right: for each, a second capture `offset_...` from
     # there, of the poses that have room for the camera.
     offsets: list[float] = field(default_factory=list)

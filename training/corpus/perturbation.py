@@ -14,8 +14,9 @@ class PerturbationConfig:
     copies: int = 1
     # [m] Displacement, in worlds whose fidelity bound is no less.
     distance: float = 0.3
-    # [rad] Turn about the vertical, and about each of the other axes.
+    # [rad] Turn about the vertical.
     yaw: float = 0.2
+    # [rad] Turn about each of the other axes.
     tilt: float = 0.1
 
     def validate(self) -> None:

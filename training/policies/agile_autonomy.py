@@ -89,9 +89,9 @@ class AgileAutonomyTraining:
     rounds: int = 8
     # [-] Updates between rounds.
     round_updates: int = 1000
-    # [-] Vehicles in flight at once, each in a world of its own, and steps of 1/15 s that they fly
-    # in a round.
+    # [-] Vehicles in flight at once, each in a world of its own.
     environments: int = 90
+    # [-] Steps of 1/15 s that they fly in a round.
     steps: int = 450
     # [-] Steps between two questions to the expert.
     ask_every: int = 4

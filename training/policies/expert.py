@@ -43,7 +43,7 @@ class ExpertConfig:
     # `planner`, which knows the way, or a policy of the benchmark that flies by depth, or a file of
     # weights.
     policy: str = PLANNER
-    # [m/s]
+    # [m/s] Nominal speed of the expert.
     speed: float = 2.0
     # [s] Between two labelled states; when the planner flies, also between two of its plans.
     period: float = 0.4

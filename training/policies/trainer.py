@@ -20,7 +20,9 @@ class Schedule:
     checkpoint_every: int = 100
     # [-] Step size of AdamW, which falls to nothing over the last part `decay` of the updates.
     learning_rate: float = 1e-3
+    # [-] Last part of the updates, over which the step size falls.
     decay: float = 0.3
+    # [-] AdamW's decay of the weights.
     weight_decay: float = 0.01
     # [-] Greatest norm of the gradient.
     clip: float = 1.0

@@ -90,10 +90,13 @@ class ReconstructConfig:
     """Learning rate of the means relative to the extent of the scene; falls to a hundredth. A
     quarter of it where they start on surfaces that depth shows."""
     scales_rate: float = 5e-3
+    """Learning rate of the logarithms of the scales."""
     quats_rate: float = 1e-3
+    """Learning rate of the quaternions."""
     opacities_rate: float = 5e-2
+    """Learning rate of the logits of the opacities."""
     colors_rate: float = 2.5e-3
-    """Of degree 0; of higher ones a twentieth."""
+    """Learning rate of the colours of degree 0; of higher ones a twentieth."""
 
     contrast: float = 0.05
     """Standard deviation of colour (0 to 1) that one Gaussian may hide at first."""
@@ -114,6 +117,7 @@ class ReconstructConfig:
     """[m], depth beyond which the distance field does not believe the camera; the same applies."""
 
     seed: int = 0
+    """Seed of everything random."""
     device: str = "cpu"
     """"cpu", or "cuda", which needs gsplat."""
     threads: int = 0
