@@ -7,7 +7,7 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(wildcard native/*.hpp native/*.cpp)
 
-.PHONY: fly test lint stub messages sanitize nightly clean
+.PHONY: fly test lint docs stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly
@@ -20,6 +20,11 @@ lint: .venv/installed
 	.venv/bin/ruff format --check .
 	.venv/bin/clang-format --dry-run --Werror $(NATIVE)
 	.venv/bin/pyright
+
+# The documentation, in build/site; needs no network.
+docs: .venv/installed
+	.venv/bin/sphinx-build --fail-on-warning --keep-going --quiet docs build/site
+	@echo "open build/site/index.html"
 
 # Writes the types of the native module, after a change of its bindings.
 stub: .venv/installed

@@ -22,7 +22,7 @@ _MAX_PIXELS = 4096 * 4096
 
 # Fields of Drake's CameraConfig about render engines and LCM, which a splat camera has no use for.
 # Its background is the world's, and its depth image is registered with its colour image.
-_WITHOUT_EFFECT = (
+WITHOUT_EFFECT = (
     "X_BD",
     "renderer_name",
     "renderer_class",
@@ -126,7 +126,7 @@ def _check_camera(camera: CameraConfig) -> None:
     valid = np.all((center > 0) & (center < [camera.width, camera.height]))
     _check("camera's principal point", center.tolist(), valid, "inside the image [pixels]")
     _check("camera.fps", camera.fps, 0 < camera.fps <= 1000, "more than 0, at most 1000 Hz")
-    for name in _WITHOUT_EFFECT:
+    for name in WITHOUT_EFFECT:
         value, default = (repr(getattr(c, name)) for c in (camera, CameraConfig()))
         _check(f"camera.{name}", value, value == default, "left out: a splat camera ignores it")
 

@@ -1,0 +1,43 @@
+"""Writes the page `api`: the public names, and every LeafSystem of `systems/`."""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+
+from pydrake.systems.framework import LeafSystem
+
+import splatpilot
+import splatpilot.systems
+
+
+def public_names() -> list[str]:
+    """What `import splatpilot as sp` has as `sp.NAME`."""
+    return [name for name in splatpilot.__all__ if name != "__version__"]
+
+
+def leaf_systems() -> Iterator[str]:
+    """The LeafSystems of `systems/` that have no public name, by where they stand."""
+    public = {getattr(splatpilot, name) for name in public_names()}
+    for module in pkgutil.walk_packages(splatpilot.systems.__path__, "splatpilot.systems."):
+        for name, member in inspect.getmembers(importlib.import_module(module.name)):
+            own = inspect.isclass(member) and member.__module__ == module.name
+            if own and issubclass(member, LeafSystem) and member not in public:
+                if not name.startswith("_"):
+                    yield f"{module.name}.{name}"
+
+
+def page() -> str:
+    """The page's sections, in Markdown."""
+    parts = ["## Public names\n"]
+    for name in public_names():
+        kind = "class" if inspect.isclass(getattr(splatpilot, name)) else "function"
+        parts.append(_entry(f"sp.{name}", kind, f"splatpilot.{name}"))
+    parts.append("## Other systems\n")
+    parts += [_entry(name.rpartition(".")[2], "class", name) for name in leaf_systems()]
+    return "\n".join(parts)
+
+
+def _entry(heading: str, kind: str, name: str) -> str:
+    members = "   :members:\n" if kind == "class" else ""
+    return f"### {heading}\n\n```{{eval-rst}}\n.. auto{kind}:: {name}\n{members}```\n"

@@ -1,0 +1,154 @@
+"""Writes the page `configuration`: every field of every configuration, as its class has it."""
+
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import yaml
+
+from splatpilot.analysis.faults.run import FaultsConfig
+from splatpilot.analysis.fidelity.config import FidelityConfig
+from splatpilot.analysis.places import PlaceConfig
+from splatpilot.analysis.tour import TourConfig
+from splatpilot.diagrams.hardware_config import HardwareConfig
+from splatpilot.diagrams.policies import POLICIES
+from splatpilot.diagrams.px4_config import Px4Config
+from splatpilot.diagrams.scenario import WITHOUT_EFFECT, Scenario
+from splatpilot.diagrams.sensors import SENSORS
+from splatpilot.diagrams.worlds.make_world import WORLDS
+from splatpilot.systems.field_descriptions import (
+    FieldDescription,
+    describe_fields,
+    is_configuration,
+)
+from splatpilot.systems.registry import Registry
+from splatpilot.training.captures.check import CheckConfig
+from splatpilot.training.captures.render_config import RenderConfig
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.reconstruction.config import ReconstructConfig
+
+GROUPS: list[tuple[str, str, list[type] | Registry]] = [
+    (
+        "Flights",
+        "Of `splatpilot fly`, `vehicle`, `bridge` and `benchmark`: `--set timeout=20`, and the "
+        "fields of a scenario's file.",
+        [Scenario],
+    ),
+    (
+        "Policies",
+        "What may be a scenario's `policy`: `policy: !ReactiveConfig {margin: 0.2}` in its file, "
+        "`--policy reactive --set policy.margin=0.2`, `--policies reactive:margin=0.2`.",
+        POLICIES,
+    ),
+    (
+        "Worlds",
+        "What may be a scenario's `world`: `world: !RoomConfig {items: 8}` in its file, "
+        "`--set 'world=!RoomConfig {items: 8}'`.",
+        WORLDS,
+    ),
+    ("Sensors", "What may be among the `sensors` of a scenario or of a policy.", SENSORS),
+    (
+        "Captures",
+        "Of `splatpilot capture check` and `capture render`.",
+        [CheckConfig, RenderConfig],
+    ),
+    ("Reconstruction", "Of `splatpilot reconstruct` and `ablate`.", [ReconstructConfig]),
+    (
+        "From meshes to flights",
+        "Of `splatpilot tour`, `splatpilot places` and `splatpilot fidelity`.",
+        [TourConfig, PlaceConfig, FidelityConfig],
+    ),
+    ("Training", "Of `splatpilot train` and `recover`, for each policy.", TRAINERS),
+    ("Corpora", "Of `splatpilot corpus make`.", [CorpusConfig]),
+    (
+        "Hardware",
+        "Of `splatpilot bridge` and `vehicle` (`--hardware FILE`), `splatpilot px4` and "
+        "`splatpilot faults`.",
+        [HardwareConfig, Px4Config, FaultsConfig],
+    ),
+]
+"""Heading, introduction, and the configurations that begin there."""
+
+
+def configurations() -> Iterator[tuple[str, str, list[Any]]]:
+    """Each group's heading and introduction, and its configurations with those that they hold:
+    each once, where it is met first, and Drake's own in a group at the end."""
+    seen: set[type] = set()
+    drakes: list[Any] = []
+
+    def met(config: Any) -> Iterator[Any]:
+        if type(config) in seen:
+            return
+        seen.add(type(config))
+        if type(config).__module__.startswith("pydrake"):
+            drakes.append(config)
+            return
+        yield config
+        for described in describe_fields(config):
+            if is_configuration(described.value) and described.registry is None:
+                yield from met(described.value)
+
+    for heading, introduction, roots in GROUPS:
+        types = roots.configs(set()) if isinstance(roots, Registry) else roots
+        yield heading, introduction, [config for root in types for config in met(root())]
+    yield (
+        "Drake's own",
+        "As Drake documents them; what flights have no use for is left out.",
+        drakes,
+    )
+
+
+def page() -> str:
+    """The page's sections, in Markdown."""
+    parts = []
+    for heading, introduction, configs in configurations():
+        parts.append(f"## {heading}\n\n{introduction}\n")
+        parts += [_section(config) for config in configs]
+    return "\n".join(parts)
+
+
+def _section(config: Any) -> str:
+    name = type(config).__name__
+    about = inspect.cleandoc(type(config).__doc__ or "").replace("::\n", ":\n")
+    if type(config).__module__.startswith("pydrake"):
+        about = about.partition("\n\n")[0]
+    rows = [
+        f"| `{field.name}` | {_default(field)} | {_text(field)} |"
+        for field in describe_fields(config)
+        if not (name == "CameraConfig" and field.name in WITHOUT_EFFECT)
+    ]
+    table = ["| field | default | what it is |", "|---|---|---|", *rows]
+    return f"(config-{name})=\n### {name}\n\n{about}\n\n" + "\n".join(table) + "\n"
+
+
+def _text(field: FieldDescription) -> str:
+    text = field.text.replace("|", "\\|") or "See Drake's documentation."
+    if field.registry is None:
+        return text
+    kinds = ", ".join(_link(kind) for kind in field.registry.configs(set()))
+    return f"{text} One of {kinds}."
+
+
+def _default(field: FieldDescription) -> str:
+    """A default as YAML; of a configuration its section, and where it differs from that."""
+    value = field.value
+    if not is_configuration(value):
+        return f"`{_yaml(value)}`"
+    if type(value).__module__.startswith("pydrake"):
+        return _link(type(value)) if type(value).__name__.endswith("Config") else f"`{value}`"
+    ours = zip(describe_fields(value), describe_fields(type(value)()), strict=True)
+    changed = [f"`{a.name}: {_yaml(a.value)}`" for a, b in ours if a.value != b.value]
+    return _link(type(value)) + (f" with {', '.join(changed)}" if changed else "")
+
+
+def _link(config: type) -> str:
+    return f"[{config.__name__}](#config-{config.__name__})"
+
+
+def _yaml(value: Any) -> str:
+    if is_configuration(value):
+        return str(value)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name}: {_yaml(held)}" for name, held in value.items()) + "}"
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).split("\n")[0]

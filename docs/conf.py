@@ -1,0 +1,32 @@
+"""How the documentation is built: `make docs`, without a network, warnings being errors."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "splatpilot"
+author = "The splatpilot authors"
+copyright = author
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "generated_pages",
+    "pydrake_system",
+]
+exclude_patterns = ["_ext"]
+myst_heading_anchors = 4
+# What stands in a code block without a language are commands.
+highlight_language = "bash"
+# Single backticks in docstrings: a link where there is something of that name, code elsewhere.
+default_role = "py:obj"
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_class_signature = "mixed"
+napoleon_numpy_docstring = False
+html_theme = "furo"
+html_title = "splatpilot"
+html_static_path = ["_static"]
+html_css_files = ["ports.css"]
+html_show_sourcelink = False

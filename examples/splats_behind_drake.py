@@ -1,0 +1,72 @@
+"""Splats behind an existing Drake simulation: one line adds a place to what its cameras see.
+
+    python examples/splats_behind_drake.py --out out/ball.png
+
+A ball of Drake's MultibodyPlant falls in a forest of Gaussians, and an RgbdSensor looks at both.
+What is particular to splats is the line `AddRenderer`; the rest is a simulation like any other.
+Shapes are drawn by RenderEngineVtk, which needs OpenGL (see the README) but no display.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from pydrake.geometry import (
+    ClippingRange,
+    DepthRange,
+    DepthRenderCamera,
+    RenderCameraCore,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
+
+import splatpilot as sp
+
+
+def main(out: Path, width: int, seconds: float) -> None:
+    scenario = sp.load_config(sp.Scenario(), overrides=["world.length=12"])
+    world = sp.make_world(scenario.world, seed=0)
+
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.2))
+    red = np.array([0.8, 0.1, 0.1, 1.0])
+    plant.RegisterVisualGeometry(ball, RigidTransform(), Sphere(0.2), "ball", red)
+    p_WB = world.p_WS + np.array([2.5, 0.0, 0.5])
+    plant.SetDefaultFloatingBaseBodyPose(ball, RigidTransform(p_WB))
+    plant.Finalize()
+
+    splats = sp.SplatRenderEngine(world.baked, background=world.background)
+    scene_graph.AddRenderer("splats", splats)
+
+    intrinsics = CameraInfo(width, width * 3 // 4, fov_y=np.deg2rad(60))
+    core = RenderCameraCore("splats", intrinsics, ClippingRange(0.1, 100), RigidTransform())
+    # Optical axes (x right, y down, z forward) of a camera that looks along x of the world.
+    R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+    X_WC = RigidTransform(R_WC, world.p_WS)
+    sees = DepthRenderCamera(core, DepthRange(0.1, 20.0))  # and colours, by the same camera
+    camera = builder.AddSystem(RgbdSensor(SceneGraph.world_frame_id(), X_WC, sees))
+    builder.Connect(scene_graph.get_query_output_port(), camera.query_object_input_port())
+    simulator = Simulator(builder.Build())
+
+    simulator.AdvanceTo(seconds)
+    context = camera.GetMyContextFromRoot(simulator.get_context())
+    image = camera.color_image_output_port().Eval(context).data
+    depth = camera.depth_image_32F_output_port().Eval(context).data
+    Image.fromarray(image[..., :3]).save(out)
+    print(f"Wrote {out}; the nearest thing in it is {depth.min():.2f} m away.")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("ball.png"))
+    parser.add_argument("--width", type=int, default=640, help="of the image [px]")
+    parser.add_argument("--seconds", type=float, default=0.3, help="until it is taken")
+    main(**vars(parser.parse_args()))

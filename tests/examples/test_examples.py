@@ -1,0 +1,140 @@
+"""The examples: each runs as its docstring says, from a folder outside, and shows what it says."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from splatpilot.training.captures import render_capture
+from splatpilot.training.captures.render_config import RenderConfig
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FILES = sorted(EXAMPLES.glob("*.py"))
+MAIN = "from splatpilot.analysis.cli import main; raise SystemExit(main())"
+SHORT = "world: {length: 9, width: 6}\ntimeout: 12\n"
+
+
+def answer(*words: object, cwd: Path) -> str:
+    """What a Python program prints."""
+    command = [sys.executable, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def run(name: str, *words: object, cwd: Path) -> str:
+    """What an example prints."""
+    return answer(EXAMPLES / name, *words, cwd=cwd)
+
+
+def number(pattern: str, text: str) -> float:
+    """The number that a pattern finds in a text."""
+    found = re.search(pattern, text)
+    assert found is not None, text
+    return float(found[1])
+
+
+@pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
+def test_each_is_short_and_says_how_to_run_it(file):
+    """An example begins with what it shows and the command, and is read on a page; another test
+    here runs it."""
+    docstring = file.read_text().split('"""')[1]
+    assert re.search(rf"\n    .*\b{file.stem}\b", docstring)
+    assert len(file.read_text().splitlines()) <= 75
+    assert f'"{file.name}"' in Path(__file__).read_text()
+
+
+def test_flight_by_hand(tmp_path):
+    """The vehicle arrives without touching anything, and the camera sees."""
+    out = run("flight_by_hand.py", "--length", 9, cwd=tmp_path)
+    assert "s at the goal" in out
+    assert number(r"clearance (\S+) m", out) > 0
+    assert 20 < number(r"mean (\d+)", out) < 240
+
+
+def test_splats_behind_drake(opengl, tmp_path):
+    """The ball is seen before the forest: a tenth of the image is red, the rest has its colours;
+    and nothing is nearer than the nearest trunk."""
+    run("splats_behind_drake.py", "--width", 160, "--out", tmp_path / "b.png", cwd=tmp_path)
+    image = np.array(cv2.imread(str(tmp_path / "b.png")), dtype=int)
+    red = image[..., 2] > 100 + image[..., :2].max(axis=-1)
+    assert 0.005 < red.mean() < 0.1
+    assert image[~red].std() > 20
+
+
+def test_own_policy(tmp_path):
+    """Copied anywhere and installed nowhere, it flies in the benchmark to its goal."""
+    (tmp_path / "own_policy.py").write_text((EXAMPLES / "own_policy.py").read_text())
+    (tmp_path / "short.yaml").write_text(SHORT)
+    words = ["--policies", "sidestep=own_policy:SidestepConfig", "--scenarios", "short.yaml"]
+    words = ["--import", "own_policy", "benchmark", *words, "--seeds", "1", "--jobs", "1"]
+    out = answer("-c", MAIN, *words, "--out", "study", cwd=tmp_path)
+    assert re.search(r"sidestep +2 +1/1", out)
+
+
+def test_photographs_to_flight(opengl, tmp_path):
+    """A capture of a room becomes a scene in which a flight arrives."""
+    room = trimesh.creation.box((7.0, 4.0, 3.0))
+    room.invert()
+    room.export(tmp_path / "room.obj", include_normals=True)
+    config = RenderConfig(
+        width=64, height=48, path=[[-2, 0, 0], [2, 0, 0]], spacing=1, yaws=[0, 90, 180, -90], up="z"
+    )
+    render_capture.run(world=tmp_path / "room.obj", out=tmp_path / "photos", config=config)
+    out = run("photographs_to_flight.py", "photos", "--iterations", 20, cwd=tmp_path)
+    assert re.search(r"outcome +goal", out)
+    assert (tmp_path / "out/place/flight/flight.html").is_file()
+
+
+def test_monte_carlo(tmp_path):
+    """pandas reads both studies, of which every flight is in the summary."""
+    pytest.importorskip("pandas")
+    (tmp_path / "short.yaml").write_text(SHORT)
+    words = ["--scenarios", "short.yaml", "--seeds", 1, "--jobs", 1]
+    out = run("monte_carlo.py", *words, cwd=tmp_path)
+    summary = out[out.index("policy   observation") :]
+    assert re.findall(r"(clean|noisy) +1 ", summary) == ["clean", "noisy"] * 2
+    assert "of 2 flights arrive without noise" in out
+
+
+def test_distance_gradient(tmp_path):
+    """The gradient predicts the distance far better than the steps are long, 0.1 mm, and leads
+    every point to where there is room."""
+    out = run("distance_gradient.py", "--points", 4000, cwd=tmp_path)
+    assert number(r"predict to (\S+) m", out) < 1e-6
+    assert number(r"(\d+)% have room", out) > 95
+
+
+def test_lqr_hover(tmp_path):
+    """It comes to rest where it is to hover."""
+    out = run("lqr_hover.py", cwd=tmp_path)
+    assert number(r"from (\S+) s on", out) < 5
+    assert number(r", (\S+) mm", out) < 0.5
+
+
+def test_crash_replayed(tmp_path):
+    """The crash into a wall is found and repeats to the last bit; the wall is ahead, and was as far
+    away as the vehicle flies in half a second, its radius and its camera's place considered."""
+    wall = "world: !WallsConfig {pattern: big_wall, length: 14, width: 14, wall: 8}\n"
+    (tmp_path / "wall.yaml").write_text(wall)
+    out = run("crash_replayed.py", "--scenario", "wall.yaml", cwd=tmp_path)
+    assert "equals the recorded flight to the last bit" in out
+    assert number(r"along \[(\S+),", out) == pytest.approx(1.0, abs=0.05)
+    speed = number(r"at (\S+) m/s", out)
+    ahead = number(r"was (\S+) m away", out)
+    assert ahead == pytest.approx(0.5 * speed + 0.354 - 0.1, abs=0.25)
+    assert (tmp_path / "out/crash/before.png").is_file()
+
+
+def test_drakes_quadrotor(tmp_path):
+    """Drake's quadrotor flies towards where it is to hover, and a video of it can be read."""
+    out = run("drakes_quadrotor.py", "--seconds", 1, "--out", "flight.mp4", cwd=tmp_path)
+    assert number(r"flown \[(\S+),", out) > 0.5
+    video = cv2.VideoCapture(str(tmp_path / "flight.mp4"))
+    assert video.read()[0]
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == pytest.approx(15, abs=1)
