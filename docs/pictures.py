@@ -1,0 +1,132 @@
+"""Makes the pictures of the documentation of what the program leaves; `pictures.md` has commands.
+
+python docs/pictures.py moments out/fly/flight.mp4 docs/flight.jpg
+"""
+
+import argparse
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+from playwright.sync_api import sync_playwright
+from pydrake.systems.sensors import CameraConfig
+
+from splatpilot.diagrams.flight import sample_initial_state
+from splatpilot.diagrams.flight_diagram import MakeCamera
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.diagrams.worlds.make_world import is_procedural, make_world
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+
+Picture = np.ndarray  # (H, W, 3) uint8, red first
+
+
+def frames(video: Path) -> list[Picture]:
+    """All frames of a flight's video, colour beside depth."""
+    stream, found = cv2.VideoCapture(str(video)), []
+    while (read := stream.read())[0]:
+        found.append(read[1][..., ::-1])
+    if not found:
+        raise OSError(f"{video}: there is no video")
+    return found
+
+
+def moments(video: Path, out: Path) -> None:
+    """Three moments of a flight, colour above depth."""
+    shown = frames(video)
+    columns = [
+        np.vstack(np.hsplit(shown[round(part * (len(shown) - 1))], 2)) for part in (0.25, 0.5, 0.75)
+    ]
+    save(np.hstack(columns), out)
+
+
+def worlds(out: Path) -> None:
+    """The benchmark's generated worlds, each from where its flights start."""
+    views = []
+    for file in benchmark_scenarios().values():
+        scenario = load_config(Scenario(), file)
+        if not file.stem.startswith("P") or not is_procedural(scenario.world):
+            continue
+        scenario.camera.width, scenario.camera.height = 480, 180
+        scenario.camera.focal = CameraConfig.FovDegrees(x=90.0)
+        world = make_world(scenario.world, scenario.seed)
+        X_WB = pose_from_state(sample_initial_state(scenario, world))
+        color = MakeCamera(scenario, world).render(X_WB).color
+        views.append((255 * color.clip(0, 1)).astype(np.uint8))
+    pairs = zip(views[::2], views[1::2], strict=True)
+    save(np.vstack([np.hstack(pair) for pair in pairs]), out)
+
+
+def row(left: Path, right: Path, out: Path) -> None:
+    """Two pictures side by side."""
+    save(shrunk(np.hstack([load(left), load(right)]), 1280), out)
+
+
+def column(upper: Path, lower: Path, out: Path) -> None:
+    """Two pictures, one above the other."""
+    pictures = [load(upper), load(lower)]
+    width = max(picture.shape[1] for picture in pictures)
+    padding = [((0, 0), (0, width - picture.shape[1]), (0, 0)) for picture in pictures]
+    padded = [np.pad(p, pad, constant_values=255) for p, pad in zip(pictures, padding, strict=True)]
+    save(np.vstack(padded), out)
+
+
+def sheet(picture: Path, out: Path) -> None:
+    """A picture that the program has drawn, no wider than a page."""
+    save(shrunk(load(picture), 1500), out)
+
+
+def report(html: Path, out: Path) -> None:
+    """The whole of a report, in Debian's Chromium."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
+        tab = browser.new_page(viewport={"width": 1000, "height": 800})
+        tab.goto(html.resolve().as_uri())
+        tab.screenshot(path=out, full_page=True, type="jpeg", quality=80)
+        browser.close()
+
+
+def load(path: Path) -> Picture:
+    return np.array(Image.open(path).convert("RGB"))
+
+
+def shrunk(picture: Picture, width: int) -> Picture:
+    """A picture no wider than `width` [px]."""
+    scale = min(1.0, width / picture.shape[1])
+    return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
+def save(picture: Picture, out: Path) -> None:
+    Image.fromarray(picture).save(out, quality=82)
+
+
+KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
+    "moments": (moments, ["video"]),
+    "worlds": (worlds, []),
+    "row": (row, ["left", "right"]),
+    "column": (column, ["upper", "lower"]),
+    "sheet": (sheet, ["picture"]),
+    "report": (report, ["html"]),
+}
+"""What is made, and of which files."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    for name, (make, files) in KINDS.items():
+        kind = kinds.add_parser(name, help=make.__doc__)
+        for file in [*files, "out"]:
+            kind.add_argument(file, type=Path)
+    return parser
+
+
+if __name__ == "__main__":
+    options = vars(make_parser().parse_args())
+    KINDS[options.pop("kind")][0](**options)

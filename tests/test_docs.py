@@ -1,0 +1,250 @@
+"""The documentation: the site builds, and what its pages say can be done."""
+
+import importlib
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+import zlib
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splatpilot.analysis.cli import main
+from splatpilot.analysis.faults.run import FaultsConfig
+from splatpilot.analysis.fidelity.config import FidelityConfig
+from splatpilot.analysis.places import PlaceConfig
+from splatpilot.analysis.tour import TourConfig
+from splatpilot.diagrams.hardware_config import HardwareConfig
+from splatpilot.diagrams.policies import POLICIES, policy_named
+from splatpilot.diagrams.px4_config import Px4Config
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.sensors import SENSORS
+from splatpilot.diagrams.worlds.make_world import WORLDS
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.field_descriptions import describe_fields
+from splatpilot.training.captures.check import CheckConfig
+from splatpilot.training.captures.render_config import RenderConfig
+from splatpilot.training.corpus.config import CorpusConfig
+from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.reconstruction.config import ReconstructConfig
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
+
+CONFIGS: dict[str, Any] = {
+    "reconstruct": ReconstructConfig,
+    "ablate": ReconstructConfig,
+    "tour": TourConfig,
+    "places": PlaceConfig,
+    "fidelity": FidelityConfig,
+    "px4": Px4Config,
+    "faults": FaultsConfig,
+    "capture check": CheckConfig,
+    "capture render": RenderConfig,
+    "corpus make": CorpusConfig,
+}
+"""What `--set` sets; the other verbs set a scenario or a policy's training."""
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The code blocks of a page in these languages."""
+    found = re.findall(r"^```(\S*)\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [code for language, code in found if language in languages]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The commands in a page's code blocks, as words; variables of the shell are 1."""
+    text = "\n".join(blocks(page, "", "bash")).replace("\\\n", " ").replace("&&", "\n")
+    text = re.sub(r"\$\w+", "1", text)
+    lines = [shlex.split(line, comments=True) for line in text.splitlines()]
+    return [[word for word in words if word != "&"] for words in lines if words]
+
+
+class ParsedError(Exception):
+    """Raised in the place of running what was parsed."""
+
+
+@pytest.fixture
+def parse(monkeypatch):
+    """What the command line understands of words, which ends the test where it does not."""
+    whole, parsed = ArgumentParser.parse_args, []
+
+    def parse_only(parser: ArgumentParser, *words: Any) -> None:
+        parsed.append(whole(parser, *words))
+        raise ParsedError
+
+    monkeypatch.setattr(ArgumentParser, "parse_args", parse_only)
+
+    def parse(words: list[str]) -> Namespace:
+        with pytest.raises(ParsedError):
+            main(words)
+        return parsed[-1]
+
+    return parse
+
+
+def defaults(words: list[str], options: Namespace) -> Any:
+    """The configuration that a command's `--set` changes."""
+    for verb, config in CONFIGS.items():
+        if words[: len(verb.split())] == verb.split():
+            return config()
+    if words[0] == "train":
+        return TRAINERS.find(options.policies[0]).config()
+    if words[0] == "recover":
+        return TRAINERS.find(options.policy).config()
+    scenario = Scenario()
+    policy = getattr(options, "policy", None)
+    if policy in POLICIES.names():
+        scenario.policy = policy_named(policy)
+    return scenario
+
+
+@pytest.fixture
+def hedgehop(monkeypatch):
+    """What the example package adds is known, as it is where that is installed."""
+    for registry in (POLICIES, SENSORS, WORLDS):
+        monkeypatch.setattr(registry, "_kinds", dict(registry._kinds))
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "hedgehop"))
+    before = set(sys.modules)
+    importlib.import_module("hedgehop.climber")
+    importlib.import_module("hedgehop.hedges")
+    yield
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_commands_are_understood(page, parse, hedgehop):
+    """Every command of ours in a code block parses, and the fields that it sets are there and take
+    these values."""
+    pictures = runpy.run_path(str(ROOT / "docs" / "pictures.py"))["make_parser"]()
+    for words in commands(page):
+        words = words[1:] if words[0] == "srun" else words
+        if words[:2] == ["python", "docs/pictures.py"]:
+            with pytest.raises(ParsedError):
+                pictures.parse_args(words[2:])
+        if words[0] != "splatpilot":
+            continue
+        options = parse(words[1:])
+        verb = words[1:]
+        while verb[0] == "--import":
+            verb = verb[2:]
+        overrides = getattr(options, "overrides", [])
+        load_config(defaults(verb, options), overrides=overrides)
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in PAGES if blocks(p, "yaml")], ids=lambda page: page.stem
+)
+def test_files_are_understood(page, tmp_path):
+    """Every YAML file that is shown is one of the configurations, with values that they take."""
+    for text in blocks(page, "yaml"):
+        if text.startswith("apiVersion:"):
+            continue
+        named = set(re.findall(r"^(\w+):", text, re.MULTILINE))
+        (config,) = [
+            config
+            for config in (Scenario, HardwareConfig, Px4Config)
+            if named <= {field.name for field in describe_fields(config())}
+            and (config is not Px4Config or "motion_capture" in named)
+        ]
+        (tmp_path / "file.yaml").write_text(text)
+        load_config(config(), tmp_path / "file.yaml").validate()
+
+
+@pytest.mark.parametrize(
+    "page",
+    [p for p in PAGES if blocks(p, "python") and p.name != "README.md"],
+    ids=lambda page: page.stem,
+)
+def test_python_runs(page):
+    """Every Python block runs, those of a page one after the other."""
+    names: dict[str, Any] = {}
+    for code in blocks(page, "python"):
+        exec(code, names)
+    assert names["flight"].summary()["outcome"] in ("goal", "collision")
+
+
+def _anchors(page: Path) -> set[str]:
+    """What headings of a page can be linked by."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    kept = [re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings]
+    return {heading.strip().replace(" ", "-") for heading in kept}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_links_lead_somewhere(page):
+    """Files that a page links are there, and headings too."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if link.startswith("https://"):
+            continue
+        assert target.exists(), link
+        assert not anchor or anchor in _anchors(target), link
+
+
+def test_every_picture_has_its_command():
+    """Each picture that a page shows is what a command of `pictures.md` ends with."""
+    shown = {
+        f"docs/{Path(image).name}" for page in PAGES for image in IMAGE.findall(page.read_text())
+    }
+    made = {words[-1] for words in commands(ROOT / "docs" / "pictures.md")}
+    assert len(shown) > 10
+    assert shown <= made
+
+
+@pytest.fixture(scope="module")
+def configuration_page():
+    """The module that writes the page of configurations."""
+    sys.path.insert(0, str(ROOT / "docs" / "_ext"))
+    import configuration_page
+
+    return configuration_page
+
+
+def test_every_field_has_a_description(configuration_page):
+    """Each field of ours says what it is, in more than a unit."""
+    for _, _, configs in configuration_page.configurations():
+        for config in configs:
+            if type(config).__module__.startswith("pydrake"):
+                continue
+            for field in describe_fields(config):
+                said = re.sub(r"\[[^]]*\]", "", field.text).strip()
+                assert len(said) > 3, f"{type(config).__name__}.{field.name}: {field.text!r}"
+
+
+def test_every_configuration_of_a_verb_is_there(configuration_page):
+    """What the command line loads a file or overrides into has a section."""
+    loaded = set()
+    for module in (ROOT / "analysis" / "commands").glob("*.py"):
+        loaded |= set(re.findall(r"load_config\((?:\w+\.)?(\w+)\(\)", module.read_text()))
+    shown = {type(c).__name__ for _, _, cs in configuration_page.configurations() for c in cs}
+    assert len(loaded) >= 8
+    assert loaded <= shown
+
+
+def test_site_builds(tmp_path):
+    """Without a warning; every public name and every system is in its index, and every field of a
+    scenario on the page of configurations."""
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
+    done = subprocess.run(
+        [*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    inventory = (tmp_path / "objects.inv").read_bytes().split(b"zlib.\n", 1)[1]
+    known = {line.split()[0] for line in zlib.decompress(inventory).decode().splitlines()}
+    api = runpy.run_path(str(ROOT / "docs" / "_ext" / "api_page.py"))
+    systems = list(api["leaf_systems"]())
+    assert len(systems) > 20
+    assert {f"splatpilot.{name}" for name in api["public_names"]()} | set(systems) <= known
+    html = (tmp_path / "configuration.html").read_text()
+    for field in describe_fields(Scenario()):
+        assert f">{field.name}<" in html
+    assert "https://" not in re.sub(r'href="[^"]*"', "", (tmp_path / "index.html").read_text())
