@@ -21,6 +21,7 @@ myst_heading_anchors = 4
 highlight_language = "bash"
 # Single backticks in docstrings: a link where there is something of that name, code elsewhere.
 default_role = "py:obj"
+toc_object_entries = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"

@@ -244,6 +244,7 @@ def test_site_builds(tmp_path):
     systems = list(api["leaf_systems"]())
     assert len(systems) > 20
     assert {f"splatpilot.{name}" for name in api["public_names"]()} | set(systems) <= known
+    assert "alias of" not in (tmp_path / "api.html").read_text()
     html = (tmp_path / "configuration.html").read_text()
     for field in describe_fields(Scenario()):
         assert f">{field.name}<" in html

@@ -4,6 +4,7 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Iterator
+from typing import Any
 
 from pydrake.systems.framework import LeafSystem
 
@@ -31,13 +32,26 @@ def page() -> str:
     """The page's sections, in Markdown."""
     parts = ["## Public names\n"]
     for name in public_names():
-        kind = "class" if inspect.isclass(getattr(splatpilot, name)) else "function"
-        parts.append(_entry(f"sp.{name}", kind, f"splatpilot.{name}"))
+        member = getattr(splatpilot, name)
+        if "𝓣" in member.__name__:
+            parts.append(_template_entry(name, member))
+        else:
+            kind = "class" if inspect.isclass(member) else "function"
+            parts.append(_entry(f"sp.{name}", kind, f"splatpilot.{name}"))
     parts.append("## Other systems\n")
     parts += [_entry(name.rpartition(".")[2], "class", name) for name in leaf_systems()]
     return "\n".join(parts)
 
 
-def _entry(heading: str, kind: str, name: str) -> str:
-    members = "   :members:\n" if kind == "class" else ""
-    return f"### {heading}\n\n```{{eval-rst}}\n.. auto{kind}:: {name}\n{members}```\n"
+def _template_entry(name: str, system: Any) -> str:
+    """Of a system for several scalar types, which bears the type in its name, so that autodoc would
+    show an alias, and is constructed by `_construct`."""
+    system.__name__ = name
+    parameters = inspect.signature(system._construct).parameters.items()
+    shown = ", ".join(str(p) for key, p in parameters if key not in ("self", "converter"))
+    return _entry(f"sp.{name}", "class", f"splatpilot.{name}({shown})", members=False)
+
+
+def _entry(heading: str, kind: str, name: str, members: bool = True) -> str:
+    option = "   :members:\n" if kind == "class" and members else ""
+    return f"### {heading}\n\n```{{eval-rst}}\n.. auto{kind}:: {name}\n{option}```\n"

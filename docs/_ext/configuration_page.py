@@ -1,6 +1,7 @@
 """Writes the page `configuration`: every field of every configuration, as its class has it."""
 
 import inspect
+import typing
 from collections.abc import Iterator
 from typing import Any
 
@@ -35,6 +36,7 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
         "fields of a scenario's file.",
         [Scenario],
     ),
+    ("Sensors", "What may be among the `sensors` of a scenario or of a policy.", SENSORS),
     (
         "Policies",
         "What may be a scenario's `policy`: `policy: !ReactiveConfig {margin: 0.2}` in its file, "
@@ -47,7 +49,6 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
         "`--set 'world=!RoomConfig {items: 8}'`.",
         WORLDS,
     ),
-    ("Sensors", "What may be among the `sensors` of a scenario or of a policy.", SENSORS),
     (
         "Captures",
         "Of `splatpilot capture check` and `capture render`.",
@@ -85,9 +86,9 @@ def configurations() -> Iterator[tuple[str, str, list[Any]]]:
             drakes.append(config)
             return
         yield config
-        for described in describe_fields(config):
-            if is_configuration(described.value) and described.registry is None:
-                yield from met(described.value)
+        for field in describe_fields(config):
+            for held in _held(config, field):
+                yield from met(held)
 
     for heading, introduction, roots in GROUPS:
         types = roots.configs(set()) if isinstance(roots, Registry) else roots
@@ -97,6 +98,16 @@ def configurations() -> Iterator[tuple[str, str, list[Any]]]:
         "As Drake documents them; what flights have no use for is left out.",
         drakes,
     )
+
+
+def _held(config: Any, field: FieldDescription) -> list[Any]:
+    """The configurations that a field has, or may have where it has none by default."""
+    if field.registry is not None:
+        return []
+    if field.value is None:
+        hint = typing.get_type_hints(type(config)).get(field.name)
+        return [kind() for kind in typing.get_args(hint) if is_configuration(kind)]
+    return [field.value] if is_configuration(field.value) else []
 
 
 def page() -> str:
@@ -114,7 +125,7 @@ def _section(config: Any) -> str:
     if type(config).__module__.startswith("pydrake"):
         about = about.partition("\n\n")[0]
     rows = [
-        f"| `{field.name}` | {_default(field)} | {_text(field)} |"
+        f"| `{field.name}` | {_default(field)} | {_text(config, field)} |"
         for field in describe_fields(config)
         if not (name == "CameraConfig" and field.name in WITHOUT_EFFECT)
     ]
@@ -122,10 +133,11 @@ def _section(config: Any) -> str:
     return f"(config-{name})=\n### {name}\n\n{about}\n\n" + "\n".join(table) + "\n"
 
 
-def _text(field: FieldDescription) -> str:
+def _text(config: Any, field: FieldDescription) -> str:
     text = field.text.replace("|", "\\|") or "See Drake's documentation."
     if field.registry is None:
-        return text
+        may = [_link(type(held)) for held in _held(config, field) if field.value is None]
+        return f"{text} A {may[0]}." if may else text
     kinds = ", ".join(_link(kind) for kind in field.registry.configs(set()))
     return f"{text} One of {kinds}."
 
