@@ -20,11 +20,13 @@ LEAST_DEPTH = 1e-3
 class TimeOfFlight:
     """The sensor, and what part of its frame the policy sees; defaults are those of the drone."""
 
-    # [px] Of its frames; one that lies on its side is stood up.
+    # [px] Width of its frames; one that lies on its side is stood up.
     width: int = 180
+    # [px] Height of its frames.
     height: int = 240
-    # [deg] Fields of view.
+    # [deg] Horizontal field of view.
     fov_x: float = 86.0
+    # [deg] Vertical field of view.
     fov_y: float = 106.0
     # [deg] Field of view, both ways, that is left by the crop.
     fov: float = 86.0
@@ -34,8 +36,9 @@ class TimeOfFlight:
     shift: int = -100
     # [m] From which on nothing is near.
     max_range: float = 5.0
-    # Cells.
+    # [-] Cells across.
     columns: int = 16
+    # [-] Cells down.
     rows: int = 9
 
     def validate(self) -> None:
