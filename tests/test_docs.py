@@ -110,11 +110,10 @@ def hedgehop(monkeypatch):
     for registry in (POLICIES, SENSORS, WORLDS):
         monkeypatch.setattr(registry, "_kinds", dict(registry._kinds))
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "hedgehop"))
-    before = set(sys.modules)
     importlib.import_module("hedgehop.climber")
     importlib.import_module("hedgehop.hedges")
     yield
-    for name in set(sys.modules) - before:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "hedgehop"]:
         del sys.modules[name]
 
 
