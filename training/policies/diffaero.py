@@ -60,7 +60,7 @@ class DiffAeroLoss:
 class DiffAeroTraining(RolloutTraining):
     """A training run."""
 
-    schedule: Schedule = field(default_factory=lambda: Schedule(updates=8000, validate_every=500))
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=12000, validate_every=500))
     loss: DiffAeroLoss = field(default_factory=DiffAeroLoss)
 
 
