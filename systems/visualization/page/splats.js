@@ -10,6 +10,7 @@ class Splats {
   constructor(viewer, packed) {
     const THREE = MeshCat.THREE;
     this.viewer = viewer;
+    this.packed = packed;
     this.count = packed.length / 8;
     const rows = Math.ceil(this.count / Splats.perRow);
     const texels = new Uint32Array(rows * Splats.perRow * 8);
@@ -62,6 +63,10 @@ class Splats {
   // Height in W above which nothing is drawn [m].
   set cut(height) {
     this.mesh.material.uniforms.cut.value = Math.min(height, 1e9);
+  }
+
+  get cut() {
+    return this.mesh.material.uniforms.cut.value;
   }
 
   beforeRender(renderer, camera) {
