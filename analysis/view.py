@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import scenario_file
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_folder
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_metadata import FRONTIER, read_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
@@ -32,6 +33,7 @@ _MAX_IMAGES = 60
 _IMAGE_WIDTH = 480  # [px]
 _BALL = 0.25  # [m], radius of what marks start and goal
 _HEADROOM = 0.15  # of the place's height, left above what is of interest
+_BOUNDS = "#fff", "bounds"
 
 type _Ends = tuple[NDArray[np.float64], NDArray[np.float64]] | None
 
@@ -102,8 +104,15 @@ def _scene(path: Path) -> tuple[ShownPlace, _Ends]:
         notes.append("Its unit of length is unknown. Measure what you know the length of.")
     ends = (world.p_WS, world.p_WG) if metadata.metric else None
     target = shlex.quote(f"{path}-scaled")
-    command = f"splatpilot scale {shlex.quote(str(path))} --out {target}"
-    return _place_of(world, world.name, ends, images, metadata.metric, tuple(notes), command), ends
+    place = replace(
+        _place_of(world, world.name, ends, images),
+        num_unknown=len(read_ply(path / FRONTIER)) if metadata.frontier else 0,
+        beyond=False,
+        metric=metadata.metric,
+        notes=notes,
+        scale_command=f"splatpilot scale {shlex.quote(str(path))} --out {target}",
+    )
+    return place, ends
 
 
 def _ply(path: Path) -> tuple[ShownPlace, _Ends]:
@@ -120,6 +129,7 @@ def _ply(path: Path) -> tuple[ShownPlace, _Ends]:
             lower_W,
             upper_W,
             float(upper_W[2]),
+            legend=[_BOUNDS],
             notes=notes,
         ), None
     ends = world.p_WS, world.p_WG
@@ -135,7 +145,6 @@ def _capture(path: Path, overrides: Sequence[str]) -> tuple[ShownPlace, _Ends]:
             "look at; reconstruct it first"
         )
     images = _images_of(capture)
-    p_WCs = np.array([X_WC.translation() for X_WC in images.X_WCs])
     lower_W, upper_W = _bounds(gaussians.means)
     notes = ["Points as they were captured; `splatpilot reconstruct` makes surfaces of them."]
     if not capture.metric:
@@ -144,11 +153,12 @@ def _capture(path: Path, overrides: Sequence[str]) -> tuple[ShownPlace, _Ends]:
         name=capture.name,
         gaussians=gaussians,
         background=(0.1, 0.1, 0.1),
-        lower_W=np.minimum(lower_W, p_WCs.min(axis=0)),
-        upper_W=np.maximum(upper_W, p_WCs.max(axis=0)),
-        height=_height(lower_W, upper_W, p_WCs),
+        lower_W=np.minimum(lower_W, images.p_WCs.min(axis=0)),
+        upper_W=np.maximum(upper_W, images.p_WCs.max(axis=0)),
+        height=_height(lower_W, upper_W, images.p_WCs),
         images=images,
         metric=capture.metric,
+        legend=[_BOUNDS],
         notes=notes,
     ), None
 
@@ -158,14 +168,10 @@ def _place_of(
     name: str,
     ends: _Ends,
     images: CapturedImages | None = None,
-    metric: bool = True,
-    notes: Sequence[str] = (),
-    scale_command: str = "",
 ) -> ShownPlace:
     lower_W, upper_W = world.esdf.lower_W, world.esdf.upper_W
-    poses = images.X_WCs if images else ()
-    seen = [*(ends or ()), *(X_WC.translation() for X_WC in poses)]
-    legend = [("#fff", "bounds")]
+    seen = images.p_WCs if images else np.array([world.p_WS, world.p_WG])
+    legend = [_BOUNDS]
     if ends is not None:
         legend += [(_css(START_COLOR), "start"), (_css(GOAL_COLOR), "goal")]
     return ShownPlace(
@@ -174,13 +180,10 @@ def _place_of(
         background=world.background,
         lower_W=lower_W,
         upper_W=upper_W,
-        height=_height(lower_W, upper_W, np.array(seen)),
+        height=_height(lower_W, upper_W, seen),
         field=world.esdf,
         images=images,
-        metric=metric,
         legend=legend,
-        notes=notes,
-        scale_command=scale_command,
     )
 
 
@@ -195,9 +198,9 @@ def _bounds(p_WQ: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _height(lower_W: NDArray, upper_W: NDArray, p_WQ: NDArray) -> float:
-    """Below which all points of interest (N, 3) are, but hardly a ceiling."""
+    """Below which most points of interest (N, 3) [m] are, but hardly a ceiling."""
     headroom = _HEADROOM * (upper_W[2] - lower_W[2])
-    return min(float(p_WQ[:, 2].max() + headroom), float(upper_W[2]))
+    return min(float(np.median(p_WQ[:, 2]) + headroom), float(upper_W[2]))
 
 
 def _some(capture: Capture) -> list[int]:

@@ -32,6 +32,11 @@ class CapturedImages:
     width: int  # [px]
     height: int  # [px]
 
+    @property
+    def p_WCs(self) -> NDArray[np.float64]:
+        """(N, 3) [m], where the cameras were."""
+        return np.array([X_WC.translation() for X_WC in self.X_WCs])
+
 
 @dataclass(frozen=True, eq=False)
 class ShownPlace:
@@ -45,6 +50,8 @@ class ShownPlace:
     height: float  # [m], above which nothing is shown at first
     field: Esdf | None = None
     images: CapturedImages | None = None
+    num_unknown: int = 0  # of the Gaussians, at their end: where nobody looked any further
+    beyond: bool = True  # whether Gaussians beyond the bounds are shown at first
     metric: bool = True
     legend: Sequence[tuple[str, str]] = ()  # colours, as in CSS, of what is drawn, and its names
     notes: Sequence[str] = ()  # sentences about the place
@@ -61,10 +68,6 @@ def place_page(meshcat_page: str, place: ShownPlace) -> str:
     """
     size = place.upper_W - place.lower_W
     unit = "m" if place.metric else "units"
-    middle = np.array([*(0.5 * (place.lower_W + place.upper_W))[:2], place.height])
-    # Across the shorter side, from a height from which all is in sight.
-    away = 0.75 * max(size[0], size[1], 1.5 * size[2])
-    toward = np.array([0.0, -0.75, 0.9]) if size[0] >= size[1] else np.array([-0.75, 0.0, 0.9])
     data: dict[str, Any] = {
         "name": place.name,
         "size": " x ".join(f"{length:.3g}" for length in size)
@@ -76,8 +79,10 @@ def place_page(meshcat_page: str, place: ShownPlace) -> str:
         "lower": rounded(place.lower_W),
         "upper": rounded(place.upper_W),
         "height": place.height,
-        "eye": rounded(middle + away * toward),
-        "target": rounded(middle),
+        # Seen from above across the shorter side.
+        "toward": [0.0, -0.8, 1.0] if size[0] >= size[1] else [-0.8, 0.0, 1.0],
+        "beyond": place.beyond,
+        "unknown": place.num_unknown,
         "scale_command": place.scale_command,
         "grid": place.field and _grid(place.field, place.metric),
         "cameras": place.images and _cameras(place.images, float(np.linalg.norm(size))),

@@ -26,6 +26,15 @@ function showSky() {
   });
 }
 
+// Puts the view's camera (z backwards) at a pose in W, whatever Meshcat's own controls say.
+function placeCamera(viewer, pose) {
+  const {camera, scene} = viewer;
+  scene.updateMatrixWorld();
+  pose.premultiply(scene.matrixWorld)
+    .premultiply(camera.parent.matrixWorld.clone().invert())
+    .decompose(camera.position, camera.quaternion, camera.scale);
+}
+
 // Shows the Gaussians and the sky; returns the former and the page's other data.
 async function openPage() {
   const splats = new Splats(viewer, new Uint32Array(await unpack("gaussians")));

@@ -10,15 +10,13 @@ const halves = Float32Array.from({length: 1 << 16}, (_, bits) => {
 });
 
 // The point where the ray from `o` along the unit vector `u` meets a surface, or null; W, arrays of
-// three. `forward` is the direction in which depth is ordered; what is above `cut` is not there.
-function surfaceAlong(packed, o, u, forward, cut) {
-  const floats = new Float32Array(packed.buffer, packed.byteOffset, packed.length);
-  const hits = [];
+// three. `forward` is the direction in which depth is ordered.
+function surfaceAlong(splats, o, u, forward) {
+  const {packed, floats} = splats, hits = [];
   for (let i = 0; i < packed.length; i += 8) {
-    if (floats[i + 2] > cut) continue;
     const x = floats[i] - o[0], y = floats[i + 1] - o[1], z = floats[i + 2] - o[2];
     const depth = x * forward[0] + y * forward[1] + z * forward[2];
-    if (depth < 0.05) continue;
+    if (depth < 0.05 || !splats.shows(i / 8)) continue;
     const [p, q, r] = [packed[i + 4], packed[i + 5], packed[i + 6]];
     let xx = halves[p & 65535] / 256, yy = halves[q >>> 16] / 256, zz = halves[r >>> 16] / 256;
     const trace = xx + yy + zz, along = x * u[0] + y * u[1] + z * u[2];

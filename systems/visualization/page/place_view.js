@@ -1,7 +1,8 @@
 // A place in a Meshcat page: what can be hidden, distances at a height, where it was captured from,
 // and a ruler.
 //
-// Keys: r switches the ruler, f the distances, 1 shows the place from above.
+// Keys: 1 shows the place from above; r, f, b and u switch the ruler, the distances, what is beyond
+// the bounds and the hatched surfaces where nobody looked any further.
 "use strict";
 
 class PlaceView {
@@ -12,7 +13,7 @@ class PlaceView {
 
   constructor(viewer, splats, data, values) {
     Object.assign(this, {viewer, splats, data});
-    this.ruling = false;
+    this.pose = null;  // from which the view looks; null where the mouse decides
     this.ruler = new Ruler(viewer, data.unit);
     if (data.cameras) this.cameras = new CaptureCameras(viewer, data.cameras);
     if (values) {
@@ -20,13 +21,21 @@ class PlaceView {
       viewer.scene.add(this.slice.mesh);
     }
     viewer.camera.far = 1000;
+    this.switches = {};
     this.build();
     this.setHeight(data.height);
-    this.showSlice(false);
+    this.choose(null);
     this.look();
-    viewer.render_callback = () => this.ruler.place();
+    viewer.render_callback = () => {
+      if (this.pose) placeCamera(viewer, this.pose.clone());
+      this.ruler.place();
+    };
     const canvas = viewer.renderer.domElement;
-    canvas.addEventListener("pointerdown", (event) => { this.pressed = event; });
+    canvas.addEventListener("pointerdown", (event) => {
+      this.pressed = event;
+      if (!this.ruling) this.leavePose();
+    });
+    canvas.addEventListener("wheel", () => this.leavePose());
     canvas.addEventListener("pointerup", (event) => {
       const moved = Math.hypot(event.clientX - this.pressed?.clientX,
         event.clientY - this.pressed?.clientY);
@@ -34,7 +43,7 @@ class PlaceView {
     });
     canvas.addEventListener("dblclick", (event) => {
       const point = !this.ruling && this.surfaceAt(event.clientX, event.clientY);
-      if (point) this.turnAbout(point);
+      if (point) this.turnAbout(new MeshCat.THREE.Vector3(...point));
     });
   }
 
@@ -74,13 +83,29 @@ class PlaceView {
     this.result = add(panel, "div", {className: "part", id: "view-result"});
 
     const bar = add(document.body, "div", {id: "view-bar", className: "bar"});
-    this.rulerButton = add(bar, "button", {
-      textContent: "ruler (r)", id: "view-ruler", onclick: () => this.rule(!this.ruling)});
-    add(bar, "button", {textContent: "from above (1)", onclick: () => this.look()});
+    const keys = {1: () => this.look()};
+    add(bar, "button", {textContent: "from above (1)", onclick: keys[1]});
+    const toggle = (key, name, text, start, change) => {
+      const button = add(bar, "button", {textContent: `${text} (${key})`, id: `view-${name}`});
+      this.switches[name] = (on) => {
+        button.classList.toggle("chosen", on);
+        change(on);
+        this.viewer.set_dirty();
+      };
+      button.onclick = keys[key] = () =>
+        this.switches[name](!button.classList.contains("chosen"));
+      this.switches[name](start);
+    };
+    toggle("r", "ruler", "ruler", false, (on) => this.rule(on));
     if (this.slice) {
-      this.sliceButton = add(bar, "button", {
-        textContent: "distances at this height (f)", id: "view-slice",
-        onclick: () => this.showSlice(!this.slice.mesh.visible)});
+      toggle("f", "slice", "distances here", false, (on) => { this.slice.mesh.visible = on; });
+    }
+    toggle("b", "beyond", "beyond bounds", data.beyond, (on) => this.splats.bound(
+      on ? [-1e9, -1e9, -1e9] : data.lower, on ? [1e9, 1e9] : data.upper));
+    if (data.unknown > 0) {
+      toggle("u", "unknown", "never seen", false, (on) => {
+        this.splats.shown = this.splats.count - (on ? 0 : data.unknown);
+      });
     }
     add(bar, "span", {textContent: "hide above"});
     this.slider = add(bar, "input", {
@@ -88,16 +113,9 @@ class PlaceView {
     this.slider.oninput = () => this.setHeight(Number(this.slider.value));
     this.heightText = add(bar, "span");
     document.addEventListener("keydown", (event) => {
-      const keys = {
-        r: () => this.rule(!this.ruling),
-        1: () => this.look(),
-        f: () => this.slice && this.showSlice(!this.slice.mesh.visible),
-      };
       if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
       keys[event.key]();
     });
-    this.choose(null);
-    this.rule(false);
   }
 
   setHeight(z) {
@@ -111,13 +129,6 @@ class PlaceView {
     this.viewer.set_dirty();
   }
 
-  showSlice(shown) {
-    if (!this.slice) return;
-    this.slice.mesh.visible = shown;
-    this.sliceButton.classList.toggle("chosen", shown);
-    this.viewer.set_dirty();
-  }
-
   choose(k) {
     if (!this.cameras) return;
     this.cameras.choose(k);
@@ -128,7 +139,6 @@ class PlaceView {
 
   rule(ruling) {
     this.ruling = ruling;
-    this.rulerButton.classList.toggle("chosen", ruling);
     this.viewer.renderer.domElement.style.cursor = ruling ? "crosshair" : "";
     if (!ruling) this.ruler.set([]);
     this.tell();
@@ -157,7 +167,7 @@ class PlaceView {
       const point = this.surfaceAt(x, y);
       if (point) this.ruler.add(point);
       this.tell(!point);
-    } else if (this.cameras) {
+    } else if (this.cameras?.group.visible) {
       this.choose(this.cameras.at(x, y));
     }
   }
@@ -169,39 +179,63 @@ class PlaceView {
     const toward = (u, v) => scene.worldToLocal(new THREE.Vector3(u, v, 0.5).unproject(camera))
       .sub(eye).normalize().toArray();
     const ray = toward(2 * x / window.innerWidth - 1, 1 - 2 * y / window.innerHeight);
-    return surfaceAlong(
-      this.splats.packed, eye.toArray(), ray, toward(0, 0), this.splats.cut);
+    return surfaceAlong(this.splats, eye.toArray(), ray, toward(0, 0));
   }
 
-  // Puts the view's camera at `eye`, turned to `target`, about which the mouse turns it; both in W.
-  place(eye, target) {
-    const {camera, controls, scene} = this.viewer;
-    scene.updateMatrixWorld();
-    const local = (p) => camera.parent.worldToLocal(scene.localToWorld(p));
-    camera.position.copy(local(eye));
-    controls.target.copy(local(target));
+  // The whole place from above, as near as it fits into the window.
+  look() {
+    const THREE = MeshCat.THREE, {lower, upper} = this.data, {camera, scene} = this.viewer;
+    const toward = new THREE.Vector3(...this.data.toward).normalize();
+    const target = new THREE.Vector3(...lower).lerp(new THREE.Vector3(...upper), 0.5)
+      .setZ(Math.min(this.height, upper[2]));
+    this.leavePose();
+    camera.fov = 60;
+    camera.updateProjectionMatrix();
+    const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) => new THREE.Vector3(
+      ...[0, 1, 2].map((axis) => (k >> axis & 1 ? upper : lower)[axis])));
+    const fits = (p) => Math.abs(p.x) < 0.95 && p.y > -0.8 && p.y < 0.95 && p.z < 1;
+    const up = new THREE.Vector3(0, 0, 1);
+    for (let distance = 0.5 * target.distanceTo(corners[0]); ; distance *= 1.05) {
+      const eye = target.clone().addScaledVector(toward, distance);
+      placeCamera(this.viewer, new THREE.Matrix4().lookAt(eye, target, up).setPosition(eye));
+      camera.updateMatrixWorld();
+      if (corners.every((p) => fits(scene.localToWorld(p.clone()).project(camera)))) break;
+    }
+    this.turnAbout(target);
+  }
+
+  // Through the camera of the chosen image; the mouse leads away from there.
+  lookFromCamera() {
+    const {poses, chosen, fov_y} = this.cameras;
+    this.pose = poses[chosen].clone().multiply(new MeshCat.THREE.Matrix4().makeScale(1, -1, -1));
+    this.viewer.controls.enabled = false;
+    this.viewer.camera.fov = fov_y;
+    this.setHeight(this.data.upper[2]);
+    this.switches.beyond(true);
+    this.switches.unknown?.(true);
+    this.showDrawn(false);
+  }
+
+  leavePose() {
+    if (!this.pose) return;
+    const ahead = new MeshCat.THREE.Vector3(0, 0, -1).applyMatrix4(this.pose);
+    this.pose = null;
+    this.viewer.controls.enabled = true;
+    this.showDrawn(true);
+    this.turnAbout(ahead);
+  }
+
+  // Whether what is no part of the place is shown: bounds, start and goal, frusta.
+  showDrawn(shown) {
+    this.viewer.scene_tree.find(["splatpilot"]).object.visible = shown;
+    this.cameras.group.visible = shown;
     this.viewer.set_dirty();
   }
 
-  look() {
-    const THREE = MeshCat.THREE;
-    this.viewer.camera.fov = 60;
-    this.place(new THREE.Vector3(...this.data.eye), new THREE.Vector3(...this.data.target));
-  }
-
-  lookFromCamera() {
-    const THREE = MeshCat.THREE, {poses, chosen, size, fov_y} = this.cameras;
-    const at = (z) => new THREE.Vector3(0, 0, z).applyMatrix4(poses[chosen]);
-    this.viewer.camera.fov = fov_y;
-    this.setHeight(this.data.upper[2]);
-    // From just before the picture in its frustum.
-    this.place(at(1.05 * size), at(4 * size));
-  }
-
+  // Turning the mouse turns the view about this point of W.
   turnAbout(point) {
     const {camera, controls, scene} = this.viewer;
-    const target = new MeshCat.THREE.Vector3(...point);
-    controls.target.copy(camera.parent.worldToLocal(scene.localToWorld(target)));
+    controls.target.copy(camera.parent.worldToLocal(scene.localToWorld(point.clone())));
     this.viewer.set_dirty();
   }
 }

@@ -184,12 +184,7 @@ class Replay {
 
   placeCamera() {
     const pose = this.cameraPose();
-    if (!pose) return;
-    const camera = this.viewer.camera;
-    this.viewer.scene.updateMatrixWorld();
-    pose.premultiply(this.viewer.scene.matrixWorld)
-      .premultiply(camera.parent.matrixWorld.clone().invert())
-      .decompose(camera.position, camera.quaternion, camera.scale);
+    if (pose) placeCamera(this.viewer, pose);
   }
 
   drawPicture() {
