@@ -26,7 +26,7 @@ class DistanceSlice {
       const value = this.values[start + i];
       const hatched = value === 255 && (i % nx + Math.floor(i / nx)) % 6 < 2;
       for (let k = 0; k < 3; ++k) pixels[4 * i + k] = this.palette[value][k] * (hatched ? 0.6 : 1);
-      pixels[4 * i + 3] = 205;
+      pixels[4 * i + 3] = value === 255 ? 130 : 205;
     }
     this.texture.needsUpdate = true;
     this.mesh.position.z = z;

@@ -9,16 +9,25 @@ const halves = Float32Array.from({length: 1 << 16}, (_, bits) => {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : fraction * 2 ** -24);
 });
 
+// Whether the shader leaves out a Gaussian with this mean and these variances.
+function beyond([x, y, z], [xx, yy, zz], lower, upper) {
+  const a = Math.sqrt(xx), b = Math.sqrt(yy);
+  return x - a < lower.x || y - b < lower.y || z - Math.sqrt(zz) < lower.z
+    || x + a > upper.x || y + b > upper.y || z > upper.z;
+}
+
 // The point where the ray from `o` along the unit vector `u` meets a surface, or null; W, arrays of
 // three. `forward` is the direction in which depth is ordered.
 function surfaceAlong(splats, o, u, forward) {
-  const {packed, floats} = splats, hits = [];
-  for (let i = 0; i < packed.length; i += 8) {
+  const {packed, floats} = splats, {lower, upper, shown} = splats.mesh.material.uniforms;
+  const hits = [];
+  for (let i = 0; i < 8 * shown.value; i += 8) {
     const x = floats[i] - o[0], y = floats[i + 1] - o[1], z = floats[i + 2] - o[2];
     const depth = x * forward[0] + y * forward[1] + z * forward[2];
-    if (depth < 0.05 || !splats.shows(i / 8)) continue;
+    if (depth < 0.05) continue;
     const [p, q, r] = [packed[i + 4], packed[i + 5], packed[i + 6]];
     let xx = halves[p & 65535] / 256, yy = halves[q >>> 16] / 256, zz = halves[r >>> 16] / 256;
+    if (beyond(floats.subarray(i, i + 3), [xx, yy, zz], lower.value, upper.value)) continue;
     const trace = xx + yy + zz, along = x * u[0] + y * u[1] + z * u[2];
     const opacity = (packed[i + 3] >>> 24) / 255;
     const reach = 2 * Math.log(255 * opacity) * trace;

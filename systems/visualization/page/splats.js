@@ -67,7 +67,7 @@ class Splats {
     this.mesh.material.uniforms.upper.value.z = Math.min(height, 1e9);
   }
 
-  // Leaves out what is beside or below a box, with corners in W.
+  // Leaves out what reaches beside or below a box, with corners in W.
   bound(lower, upper) {
     const {uniforms} = this.mesh.material;
     uniforms.lower.value.set(...lower);
@@ -77,14 +77,6 @@ class Splats {
   // How many are drawn, from the first.
   set shown(count) {
     this.mesh.material.uniforms.shown.value = count;
-  }
-
-  // Whether the Gaussian of that number is drawn where it is in view.
-  shows(i) {
-    const {lower, upper, shown} = this.mesh.material.uniforms;
-    const [x, y, z] = this.floats.subarray(8 * i, 8 * i + 3);
-    return i < shown.value && x >= lower.value.x && y >= lower.value.y && z >= lower.value.z
-      && x <= upper.value.x && y <= upper.value.y && z <= upper.value.z;
   }
 
   beforeRender(renderer, camera) {
@@ -177,12 +169,14 @@ void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside of the view
   float z = -p.z;
   if (z < 0.05 || int(splat) >= shown) return;
-  if (any(lessThan(mean, lower)) || any(greaterThan(mean, upper))) return;
 
   vec2 xx_xy = unpackHalf2x16(b.x), xz_yy = unpackHalf2x16(b.y), yz_zz = unpackHalf2x16(b.z);
   mat3 covariance = mat3(xx_xy.x, xx_xy.y, xz_yy.x,
                          xx_xy.y, xz_yy.y, yz_zz.x,
                          xz_yy.x, yz_zz.x, yz_zz.y) / COVARIANCE_SCALE;
+  vec3 reach = sqrt(vec3(covariance[0][0], covariance[1][1], covariance[2][2]));
+  if (any(lessThan(mean - reach, lower))) return;
+  if (any(greaterThan(vec3(mean.xy + reach.xy, mean.z), upper))) return;
   vec2 focal = 0.5 * viewport * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   // The Jacobian is taken no farther out than a little beyond the image, as elsewhere.
   vec2 edge = 0.65 * viewport / focal * z;
@@ -197,8 +191,8 @@ void main() {
   float large = mid + radius, small = max(mid - radius, 0.1 * BLUR);
   vec2 axis = abs(w) > 1e-6 * mid ? normalize(vec2(w, large - u))
                                   : (u >= v ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
-  float reach = sqrt(2.0 * log(max(255.0 * color.a, 1.0)));
-  offset = reach * position.xy;
+  float extent = sqrt(2.0 * log(max(255.0 * color.a, 1.0)));
+  offset = extent * position.xy;
   vec2 pixels = offset.x * sqrt(large) * axis + offset.y * sqrt(small) * vec2(-axis.y, axis.x);
   vec4 center = projectionMatrix * p;
   gl_Position = vec4(center.xy + 2.0 * pixels / viewport * center.w, center.zw);
