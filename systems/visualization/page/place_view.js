@@ -30,18 +30,19 @@ class PlaceView {
       if (this.pose) placeCamera(viewer, this.pose.clone());
       this.ruler.place();
     };
-    const canvas = viewer.renderer.domElement;
-    canvas.addEventListener("pointerdown", (event) => {
+    // Meshcat's controls have the pointer's events end here, not at the canvas.
+    const pane = viewer.dom_element;
+    pane.addEventListener("pointerdown", (event) => {
       this.pressed = event;
       if (!this.ruling) this.leavePose();
     });
-    canvas.addEventListener("wheel", () => this.leavePose());
-    canvas.addEventListener("pointerup", (event) => {
+    pane.addEventListener("wheel", () => this.leavePose());
+    pane.addEventListener("pointerup", (event) => {
       const moved = Math.hypot(event.clientX - this.pressed?.clientX,
         event.clientY - this.pressed?.clientY);
       if (event.button === 0 && moved < 4) this.click(event.clientX, event.clientY);
     });
-    canvas.addEventListener("dblclick", (event) => {
+    pane.addEventListener("dblclick", (event) => {
       const point = !this.ruling && this.surfaceAt(event.clientX, event.clientY);
       if (point) this.turnAbout(new MeshCat.THREE.Vector3(...point));
     });
@@ -139,7 +140,7 @@ class PlaceView {
 
   rule(ruling) {
     this.ruling = ruling;
-    this.viewer.renderer.domElement.style.cursor = ruling ? "crosshair" : "";
+    this.viewer.dom_element.style.cursor = ruling ? "crosshair" : "";
     if (!ruling) this.ruler.set([]);
     this.tell();
   }
