@@ -25,6 +25,7 @@ from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.visualization.live_page import live_page
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 
@@ -46,7 +47,8 @@ def run(
     - `scenario.yaml`: the scenario with every field, which gives the same flight again.
 
     Args:
-        live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed.
+        live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
+            `live.html` in `out` shows it with the world's Gaussians.
         video: whether to write `flight.mp4`.
         graphviz: where to write the diagram as Graphviz source.
 
@@ -67,7 +69,12 @@ def run(
 
     meshcat = open_meshcat(scenario, world) if live else None
     if meshcat is not None:
-        print(f"Meshcat shows the flight at {meshcat.web_url()}", flush=True)
+        page = out / "live.html"
+        with written_atomically(page) as path:
+            path.write_text(live_page(meshcat, world.gaussians, world.background))
+        print(
+            f"Watch the flight: open {page}, or {meshcat.web_url()} without Gaussians", flush=True
+        )
     diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
     if graphviz is not None:
         with written_atomically(graphviz) as path:

@@ -105,10 +105,12 @@ def test_capture_shows_what_it_measured(place, monkeypatch, tmp_path):
     data = data_of(view.run(what=str(folder), out=tmp_path / "page.html"))
     assert data["grid"] is None and len(data["cameras"]["poses"]) == 16
     gaussians = capture_gaussians(place.capture, range(16))
+    assert gaussians is not None
     to_wall = np.minimum(np.abs(gaussians.means), np.abs(gaussians.means - [6, 3, 2.5])).min(axis=1)
     assert np.percentile(to_wall, 95) < 0.1  # The room's Gaussians are balls of 6 cm.
     bare = replace(place.capture, load_depth=type(place.capture).load_depth)
     points = capture_gaussians(bare, range(16))
+    assert points is not None
     np.testing.assert_allclose(points.means, place.capture.points.p_WQ, atol=1e-6)
 
 

@@ -163,6 +163,7 @@ def test_slider_and_switches_change_the_picture(open_page):
         return page.run(f"() => Array.from({data})")
 
     field = room().field
+    assert field is not None
     for i, j in ((30, 20), (20, 20), (5, 3)):
         d = np.clip(field.distances[i, j, 10] / 2.0, 0, 1)
         red, green, blue = pixel(i, j)
