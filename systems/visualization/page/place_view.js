@@ -134,7 +134,7 @@ class PlaceView {
     if (!this.cameras) return;
     this.cameras.choose(k);
     this.image.hidden = this.lookButton.hidden = k === null;
-    this.caption.textContent = k === null ? " captured images" : ` ${this.cameras.names[k]}`;
+    this.caption.textContent = k === null ? " captured images; or click on one" : ` ${this.cameras.names[k]}`;
     if (k !== null) this.image.src = this.cameras.source(k);
   }
 
@@ -180,7 +180,8 @@ class PlaceView {
     const toward = (u, v) => scene.worldToLocal(new THREE.Vector3(u, v, 0.5).unproject(camera))
       .sub(eye).normalize().toArray();
     const ray = toward(2 * x / window.innerWidth - 1, 1 - 2 * y / window.innerHeight);
-    return surfaceAlong(this.splats, eye.toArray(), ray, toward(0, 0));
+    const ahead = scene.worldToLocal(camera.localToWorld(new THREE.Vector3(0, 0, -1))).sub(eye);
+    return surfaceAlong(this.splats, eye.toArray(), ray, ahead.normalize().toArray());
   }
 
   // The whole place from above, as near as it fits into the window.
@@ -191,10 +192,13 @@ class PlaceView {
       .setZ(Math.min(this.height, upper[2]));
     this.leavePose();
     camera.fov = 60;
-    camera.updateProjectionMatrix();
+    // The middle of the view is that of what the panel leaves of the window, if that is wide.
+    const {innerWidth: width, innerHeight: height} = window, panel = width > 800 ? 348 : 0;
+    camera.setViewOffset(width, height, -panel / 2, 0, width, height);
     const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) => new THREE.Vector3(
       ...[0, 1, 2].map((axis) => (k >> axis & 1 ? upper : lower)[axis])));
-    const fits = (p) => Math.abs(p.x) < 0.95 && p.y > -0.8 && p.y < 0.95 && p.z < 1;
+    const left = 2 * panel / width - 0.97;
+    const fits = (p) => p.x > left && p.x < 0.97 && p.y > -0.8 && p.y < 0.95 && p.z < 1;
     const up = new THREE.Vector3(0, 0, 1);
     for (let distance = 0.5 * target.distanceTo(corners[0]); ; distance *= 1.05) {
       const eye = target.clone().addScaledVector(toward, distance);
@@ -211,6 +215,7 @@ class PlaceView {
     this.pose = poses[chosen].clone().multiply(new MeshCat.THREE.Matrix4().makeScale(1, -1, -1));
     this.viewer.controls.enabled = false;
     this.viewer.camera.fov = fov_y;
+    this.viewer.camera.clearViewOffset();
     this.setHeight(this.data.upper[2]);
     this.switches.beyond(true);
     this.switches.unknown?.(true);

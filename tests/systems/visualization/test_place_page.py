@@ -65,7 +65,7 @@ def room(**said) -> ShownPlace:
 
 @pytest.fixture
 def open_page(open_in_browser):
-    def opened(place: ShownPlace):
+    def opened(place: ShownPlace, width: int = WIDTH):
         meshcat = Meshcat()
         for path in ("/Grid", "/Axes"):
             meshcat.SetProperty(path, "visible", False)
@@ -74,7 +74,7 @@ def open_page(open_in_browser):
         draw_box(meshcat, "/splatpilot/bounds", place.lower_W, place.upper_W)
         html = place_page(meshcat.StaticHtml(), place)
         settled = "window.view && view.splats.settled"
-        return open_in_browser(html, WIDTH, HEIGHT, settled, "#view-panel, #view-bar")
+        return open_in_browser(html, width, HEIGHT, settled, "#view-panel, #view-bar")
 
     return opened
 
@@ -101,10 +101,10 @@ def test_ruler_measures_the_room(open_page):
     """Two clicks on known places of floor and wall, from above through the ceiling that is hidden,
     give their distance and each its place to 3 cm, and the command that scales the scene by them;
     a click beside the room says that nothing is there."""
-    page = open_page(room(images=None))
+    page = open_page(room(images=None), width=900)
     floor, wall = [1.0, 1.0, 0.0], [4.5, 4.0, 1.1]
     page.tab.click("#view-ruler")
-    page.picture()  # Without the panel, which covers much of so small a window.
+    page.picture()  # Without the panel and the bar.
     for x, y in pixels_of(page, [floor, wall]):
         page.tab.mouse.click(x, y)
     points = np.array(page.run("() => view.ruler.points"))
