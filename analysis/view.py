@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Rgba
 
-from splatpilot.analysis.reconstruction.scene_views import read_capture_of
 from splatpilot.diagrams.meshcat import empty_meshcat
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
@@ -27,6 +26,7 @@ from splatpilot.systems.visualization.place_page import CapturedImages, ShownPla
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_gaussians import capture_gaussians
+from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
 
 _MAX_IMAGES = 60
@@ -98,7 +98,7 @@ def _scene(path: Path) -> tuple[ShownPlace, _Ends]:
     notes, images = [], None
     try:
         images = _images_of(read_capture_of(path, metadata))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         notes.append(f"Captured images are not shown: {error}.")
     if not metadata.metric:
         notes.append("Its unit of length is unknown. Measure what you know the length of.")

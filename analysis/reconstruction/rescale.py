@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splatpilot.analysis.reconstruction.scene_views import read_capture_of
 from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
@@ -26,6 +25,7 @@ from splatpilot.systems.configuration import load_config
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
+from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.metric_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import start_and_goal

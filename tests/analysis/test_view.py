@@ -4,6 +4,8 @@ import base64
 import gzip
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +124,13 @@ def test_bare_gaussians(place, tmp_path):
     write_ply(place.gaussians.scaled_by(1000.0), path)
     data = data_of(view.run(what=str(path), out=tmp_path / "b.html"))
     assert data["grid"] is None and "Without distances" in data["notes"][0]
+
+
+def test_looking_needs_no_extras():
+    """Without torch and pycolmap everything can be looked at."""
+    script = "import sys; from splatpilot.analysis import view\n"
+    script += "sys.exit(bool({'torch', 'pycolmap'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from pydrake.math import RigidTransform
 
 from splatpilot.analysis.cli import main
 from splatpilot.analysis.reconstruction.rescale import rescale, run
-from splatpilot.analysis.reconstruction.scene_views import read_capture_of
 from splatpilot.diagrams.worlds.scene_folder import (
     read_scene,
     read_scene_folder,
@@ -20,6 +19,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.training.captures.capture_of_scene import read_capture_of
 
 SHRUNK = 0.25
 """Units of the photographs' registration a metre."""
