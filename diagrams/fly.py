@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 from tqdm import tqdm
 
@@ -18,13 +19,16 @@ from splatpilot.diagrams.flight_page import (
     write_flight_page,
 )
 from splatpilot.diagrams.meshcat import open_meshcat
+from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.visualization.live_page import live_page
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 
@@ -46,7 +50,8 @@ def run(
     - `scenario.yaml`: the scenario with every field, which gives the same flight again.
 
     Args:
-        live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed.
+        live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
+            `live.html` in `out` shows it with the world's Gaussians.
         video: whether to write `flight.mp4`.
         graphviz: where to write the diagram as Graphviz source.
 
@@ -67,7 +72,12 @@ def run(
 
     meshcat = open_meshcat(scenario, world) if live else None
     if meshcat is not None:
-        print(f"Meshcat shows the flight at {meshcat.web_url()}", flush=True)
+        page = out / "live.html"
+        with written_atomically(page) as path:
+            path.write_text(_live_page(meshcat, scenario, world))
+        print(
+            f"Watch the flight: open {page}, or {meshcat.web_url()} without Gaussians", flush=True
+        )
     diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
     if graphviz is not None:
         with written_atomically(graphviz) as path:
@@ -128,6 +138,16 @@ def format_summary(summary: dict[str, float | str]) -> str:
         ("render", "render_ms", "{:.1f} ms"),
     )
     return "\n".join(f"{title:<18} {form.format(summary[key])}" for title, key, form in rows)
+
+
+def _live_page(meshcat: Meshcat, scenario: Scenario, world: World) -> str:
+    """The page of a flight that goes on, seen from above at first as the page of a finished one."""
+    field = world.distance_field
+    lower, upper = (float(np.asarray(corner)[2]) for corner in (field.lower_W, field.upper_W))
+    start = world.p_WS if scenario.start is None else scenario.start
+    cut = max(start[2], goal_of(scenario, world)[2]) + 2 * VEHICLE_RADIUS
+    heights = lower, upper
+    return live_page(meshcat, world.gaussians, world.background, heights, min(cut, upper))
 
 
 def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:

@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.splats.background import mean_color
+from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.visualization.balls_visualizer import BallsVisualizer
@@ -23,17 +23,23 @@ from splatpilot.systems.visualization.drawing import (
 from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
 
 
+def empty_meshcat(background: Background) -> Meshcat:
+    """A Meshcat in which nothing stands before the background."""
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    for end in ("top_color", "bottom_color"):
+        meshcat.SetProperty("/Background/<object>", end, list(mean_color(background)))
+    return meshcat
+
+
 def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
     """
     A Meshcat that shows what stands still: goal, distance field and background.
 
     Its camera sees the start and the goal from behind and above the start.
     """
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    for end in ("top_color", "bottom_color"):
-        meshcat.SetProperty("/Background/<object>", end, list(mean_color(world.background)))
+    meshcat = empty_meshcat(world.background)
     p_WG = goal_of(scenario, world)
     draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
     draw_distance_slice(meshcat, "/splatpilot/distance_slice", world.distance_field, float(p_WG[2]))

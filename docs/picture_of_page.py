@@ -1,8 +1,10 @@
-"""A picture of a flight page: two views side by side, or a moving one that follows the vehicle.
+"""A picture of a page: two views side by side, or a moving one that follows the vehicle.
 
     splatpilot fly --seed 7 --out out/fly
     python docs/picture_of_page.py out/fly/flight.html docs/page.jpg
     python docs/picture_of_page.py out/fly/flight.html docs/flight.webp
+    splatpilot view scenes/bookstore --out out/bookstore.html
+    python docs/picture_of_page.py out/bookstore.html docs/place.jpg
 
 It needs a Chromium on the PATH, without a display.
 """
@@ -19,7 +21,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 from tqdm import tqdm
 
-SETTLED = "window.replay && replay.splats.settled && !viewer.needs_render"
+SETTLED = "(window.replay || window.view)?.splats.settled && !viewer.needs_render"
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 RATE = 8
 """[1/s], pictures of a moving one."""
@@ -46,11 +48,23 @@ def photograph(tab: Page, view: str, time: float) -> Image.Image:
     return Image.open(BytesIO(tab.screenshot())).convert("RGB")
 
 
+def photograph_place(tab: Page, distances: bool) -> Image.Image:
+    """The page of a place as it opens, with a captured image, or with distances."""
+    script = "view.switches.slice(true)" if distances else "view.choose(27)"
+    tab.evaluate(f"() => {{ {script}; }}")
+    tab.wait_for_timeout(1000)
+    tab.wait_for_function(SETTLED)
+    return Image.open(BytesIO(tab.screenshot())).convert("RGB")
+
+
 def write_still(page: Path, out: Path, time: float) -> None:
-    """Two views of the page at a time [s], side by side."""
+    """Two views of the page at a time [s], side by side; of a place, with and without distances."""
     with opened(page, 1000, 620) as tab:
-        views = [np.asarray(photograph(tab, view, time)) for view in ("overview", "chase")]
-    picture = Image.fromarray(np.hstack(views))
+        if tab.evaluate("() => 'view' in window"):
+            views = [photograph_place(tab, distances) for distances in (False, True)]
+        else:
+            views = [photograph(tab, view, time) for view in ("overview", "chase")]
+    picture = Image.fromarray(np.hstack([np.asarray(view) for view in views]))
     picture.resize((1600, 496), Image.Resampling.LANCZOS).save(out, quality=82)
 
 

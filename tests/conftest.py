@@ -2,9 +2,14 @@ import os
 
 import pytest
 from hypothesis import settings
+from tqdm import tqdm
 
 from splatpilot.systems.messaging.open_lcm import open_lcm
 from splatpilot.systems.opengl import require_opengl
+
+# Without tqdm's own thread, in which garbage may be collected: Drake aborts the process where a
+# Meshcat is freed by another thread than the one that made it.
+tqdm.monitor_interval = 0
 
 # The same examples in every run, and no failure because the machine was busy.
 settings.register_profile("repeatable", deadline=None, derandomize=True)

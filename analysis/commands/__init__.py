@@ -21,8 +21,10 @@ from splatpilot.analysis.commands import (
     reconstruct,
     recover,
     replay,
+    scale,
     tour,
     train,
+    view,
 )
 
 COMMANDS = (
@@ -33,7 +35,9 @@ COMMANDS = (
     merge,
     replay,
     difficulty,
+    view,
     reconstruct,
+    scale,
     measure,
     ablate,
     fidelity,

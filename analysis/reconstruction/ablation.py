@@ -26,11 +26,12 @@ from splatpilot.analysis.reconstruction.scene_measures import (
     SceneMeasures,
     read_measures,
 )
-from splatpilot.analysis.reconstruction.scene_views import SceneViews, read_capture_of
+from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth

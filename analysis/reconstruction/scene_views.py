@@ -10,35 +10,15 @@ from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.scene_folder import read_background
 from splatpilot.diagrams.worlds.scene_metadata import SceneMetadata, read_scene_metadata
-from splatpilot.systems.configuration import load_config
 from splatpilot.systems.splats.background import put_behind
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame
-from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.measures import SceneRenderer, ViewMeasures, measure_view
 from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
 from splatpilot.training.reconstruction.views import shrink, shrink_factor
-
-
-def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
-    """Opens the capture that a scene folder was made from, with the settings it was made with.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: if `metadata` names none, or it cannot be opened.
-    """
-    file = scene / "scene.yaml"
-    if not metadata.capture:
-        raise ValueError(
-            f"{file}: names no capture to compare the scene with; reconstruct it again"
-        )
-    try:
-        config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
-    except ValueError as error:
-        raise ValueError(f"{file}: capture_settings: {error}") from None
-    return read_capture(metadata.capture, config)
 
 
 class SceneViews:

@@ -45,8 +45,9 @@ def read_scene(path: str | Path) -> World:
     return read_scene_folder(path) if path.is_dir() else _read_bare_ply(path)
 
 
-def read_scene_folder(path: str | Path) -> World:
-    """Reads a scene folder.
+def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
+    """Reads a scene folder; with `metric` false also one whose unit of length is unknown, to be
+    looked at and measured, not flown in.
 
     Raises:
         FileNotFoundError: if the folder or one of its files is missing.
@@ -60,10 +61,11 @@ def read_scene_folder(path: str | Path) -> World:
                 "scene.yaml, as `splatpilot reconstruct` writes it"
             )
     metadata = read_scene_metadata(path)
-    if not metadata.metric:
+    if metric and not metadata.metric:
         raise ValueError(
             f"{path / 'scene.yaml'}: the scale of this scene is unknown (metric: false), so no "
-            "distance in it can be trusted; reconstruct it with a scale"
+            f"distance in it can be trusted; measure something in `splatpilot view {path}` and "
+            "give the scene its size with `splatpilot scale`"
         )
     gaussians = read_ply(path / "gaussians.ply")
     if metadata.frontier:

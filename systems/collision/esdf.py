@@ -163,6 +163,16 @@ class Esdf:
         distances = conservative_distances(self.distances, self.states, self.voxel_size)
         return Esdf(distances, self.states, self.lower_W, self.voxel_size, occupied_outside=True)
 
+    def scaled_by(self, factor: float) -> "Esdf":
+        """The field of the same place with all lengths from the origin times `factor`."""
+        return Esdf(
+            self.distances * np.float32(factor),
+            self.states,
+            factor * self.lower_W,
+            factor * self.voxel_size,
+            self.occupied_outside,
+        )
+
     def save(self, path: str | Path) -> None:
         """Writes the field to `path` (by custom `esdf.npz`), whole or not at all."""
         write_esdf_arrays(

@@ -134,6 +134,13 @@ class GaussianScene:
             sh=sh.astype(np.float32),
         )
 
+    def scaled_by(self, factor: float) -> GaussianScene:
+        """Returns these Gaussians with all lengths from the origin times `factor`."""
+        scale = np.float32(factor)
+        return GaussianScene(
+            self.means * scale, self.quats, self.scales * scale, self.opacities, self.sh
+        )
+
     def merged_with(
         self, other: GaussianScene, X_WO: RigidTransform | None = None
     ) -> GaussianScene:

@@ -39,14 +39,28 @@ def draw_gaussians(
     meshcat.SetObject(path, cloud, point_size=2.0 * float(extent))
 
 
-def draw_goal(meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float) -> None:
+GOAL_COLOR, START_COLOR = Rgba(0.1, 0.9, 0.3, 0.4), Rgba(0.1, 0.5, 1.0, 0.4)
+
+
+def draw_goal(
+    meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float, color: Rgba = GOAL_COLOR
+) -> None:
     """Draws the goal region, a translucent ball of `radius` [m] about p_WG (3,) [m], below a pole
     of 3 m that is seen from afar."""
-    color = Rgba(0.1, 0.9, 0.3, 0.4)
     meshcat.SetObject(path, Sphere(radius), color)
     meshcat.SetObject(f"{path}/pole", Cylinder(0.04, 3.0), color)
     meshcat.SetTransform(f"{path}/pole", RigidTransform(np.array([0.0, 0.0, 1.5])))
     meshcat.SetTransform(path, RigidTransform(p_WG))
+
+
+def draw_box(meshcat: Meshcat, path: str, lower_W: np.ndarray, upper_W: np.ndarray) -> None:
+    """Draws the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    starts, ends = np.nonzero(np.abs(corners[:, None] - corners).sum(axis=-1) == 1)
+    once = starts < ends
+    p_WQ = np.where(corners == 0, lower_W, upper_W)
+    white = Rgba(1.0, 1.0, 1.0)
+    meshcat.SetLineSegments(path, p_WQ[starts[once]].T, p_WQ[ends[once]].T, 1.0, white)
 
 
 def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
@@ -68,6 +82,17 @@ def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
         meshcat.SetTransform(
             f"{path}/{name}_propeller", RigidTransform(R_BA @ np.array([arm, 0, 0.03]))
         )
+
+
+UNKNOWN_GREY = 0.4
+"""Shade of space that nobody saw."""
+
+
+def distance_colors(distances: np.ndarray) -> np.ndarray:
+    """Colours (N, 3), 0 to 1, of distances (N,) in units of that from which on all are alike: red
+    at or inside a surface, fading through yellow at one half to blue."""
+    ramp = np.clip(distances, 0.0, 1.0)
+    return np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2], -1)
 
 
 def draw_distance_slice(
@@ -92,9 +117,8 @@ def draw_distance_slice(
     )
     p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
     sample = field.query(p_WQ)
-    ramp = np.clip(np.nan_to_num(sample.distance) / 2.0, 0.0, 1.0)
-    colors = np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2])
-    colors[:, sample.state >= FieldState.UNKNOWN] = 0.4
+    colors = distance_colors(np.nan_to_num(sample.distance) / 2.0).T
+    colors[:, sample.state >= FieldState.UNKNOWN] = UNKNOWN_GREY
 
     i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
     corner = (i * counts[1] + j).ravel()

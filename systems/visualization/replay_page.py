@@ -1,30 +1,23 @@
 """A page to watch flights in: what Meshcat has drawn, the world's Gaussians, and a time slider."""
 
-import base64
-import gzip
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
-from splatpilot.systems.splats.background import Background, EnvironmentMap
+from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-from splatpilot.systems.visualization.packed_gaussians import pack_gaussians
+from splatpilot.systems.visualization.splat_page import jpeg, rounded, splat_page
 
 _COLORS = ("#e8432e", "#2f8fe8", "#e8b52e", "#a05ce0", "#30b870", "#e060b0", "#50c8d0", "#b0b0b0")
 _RATE = 30.0  # [Hz], samples of a flight in the page
-_SCRIPTS = "splats.js", "replay_flight.js", "replay.js", "page.js"
 _BALLS_PERIOD = 0.1  # [s], between which balls go straight
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,31 +91,14 @@ def replay_page(
             _flight_data(flight, _COLORS[k % len(_COLORS)]) for k, flight in enumerate(flights)
         ],
     }
-    sky = ""
-    if isinstance(background, EnvironmentMap):
-        # The page's columns run against the azimuth.
-        mirrored = EnvironmentMap(background.texels[:, ::-1])
-        sky = base64.b64encode(mirrored.png()).decode()
-    scripts = "".join(f"<script>{_source(name)}</script>" for name in _SCRIPTS)
-    added = (
-        f"<style>{_source('replay.css')}</style>"
-        f'<script type="text/plain" id="gaussians">'
-        f"{_compressed(pack_gaussians(gaussians).tobytes())}</script>"
-        f'<script type="text/plain" id="sky">{sky}</script>'
-        f'<script type="text/plain" id="flights">'
-        f"{_compressed(json.dumps(data).encode())}</script>{scripts}"
+    return splat_page(
+        meshcat_page,
+        gaussians,
+        background,
+        data,
+        ("replay_flight.js", "replay.js"),
+        "window.replay = new Replay(viewer, splats, data);",
     )
-    head, body, tail = meshcat_page.rpartition("</body>")
-    return head + added + body + tail
-
-
-def _compressed(data: bytes) -> str:
-    """Bytes as text, which `unpack` of `page/page.js` reads; the same every time."""
-    return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
-
-
-def _source(name: str) -> str:
-    return (resources.files(__package__) / "page" / name).read_text()
 
 
 def _highest(flights: Sequence[ReplayedFlight]) -> float:
@@ -138,17 +114,17 @@ def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
         "name": flight.name,
         "outcome": flight.outcome,
         "color": color,
-        "times": _rounded(flight.times[rows]),
-        "p_WB": _rounded(state.p_WB),
-        "q_WB": _rounded(state.q_WB),
-        "speeds": _rounded(np.linalg.norm(state.v_WB, axis=1)),
+        "times": rounded(flight.times[rows]),
+        "p_WB": rounded(state.p_WB),
+        "q_WB": rounded(state.q_WB),
+        "speeds": rounded(np.linalg.norm(state.v_WB, axis=1)),
         "clearances": [None if np.isnan(c) else round(c, 3) for c in flight.clearances[rows]],
         "plans": _plans(flight.hypotheses),
         "frames": flight.frames
         and {
             "period": flight.frames.period,
-            "color": [_jpeg(image) for image in flight.frames.color],
-            "depth": [_jpeg(image) for image in flight.frames.depth],
+            "color": [jpeg(image) for image in flight.frames.color],
+            "depth": [jpeg(image) for image in flight.frames.depth],
         },
     }
 
@@ -158,7 +134,7 @@ def _balls_data(balls: MovingBalls, duration: float) -> dict[str, Any]:
     centers = [np.round(balls.centers(time), 3).tolist() for time in times]
     return {
         "period": _BALLS_PERIOD,
-        "radii": _rounded(balls.radii),
+        "radii": rounded(balls.radii),
         "centers": [
             [center if np.isfinite(center).all() else [None] * 3 for center in row]
             for row in centers
@@ -174,16 +150,8 @@ def _plans(vectors: NDArray[np.float64]) -> list[dict[str, Any]]:
         if plan is not None:
             plans[plan.plan_time] = {
                 "time": plan.plan_time,
-                "p_WB": _rounded(plan.X_WB.translation()),
-                "waypoints_W": _rounded(plan.waypoints_W),
-                "costs": _rounded(plan.costs),
+                "p_WB": rounded(plan.X_WB.translation()),
+                "waypoints_W": rounded(plan.waypoints_W),
+                "costs": rounded(plan.costs),
             }
     return list(plans.values())
-
-
-def _rounded(values: NDArray[np.float64]) -> list:
-    return np.round(values, 4).tolist()
-
-
-def _jpeg(image: NDArray[np.uint8]) -> str:
-    return base64.b64encode(cv2.imencode(".jpg", image, _JPEG)[1].tobytes()).decode()

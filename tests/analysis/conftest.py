@@ -8,12 +8,13 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.reconstruction import ablation, scene_views
+from splatpilot.analysis.reconstruction import ablation
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.captures import capture_of_scene
 from splatpilot.training.captures.capture import Capture, SfmPoints
 
 WIDTH, HEIGHT = 64, 48
@@ -104,7 +105,7 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
         assert str(path) == "room"
         return capture
 
-    for module in (scene_views, ablation):
+    for module in (capture_of_scene, ablation):
         monkeypatch.setattr(module, "read_capture", read_capture)
     monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
     return Place(gaussians, capture, tmp_path)

@@ -47,7 +47,7 @@ def make_metric(
             raise ValueError(f"scale.between: {' and '.join(scale.between)} are the same place")
         factor = scale.distance / length
     elif scale.camera_height:
-        factor = scale.camera_height / _camera_height(capture)
+        factor = scale.camera_height / camera_height(capture)
     else:
         factor = _factor_from_depth(capture)
     source = f"{capture.source}, scale {factor:.6g} from {given[0]}"
@@ -77,8 +77,12 @@ def _locate(
     return locate(name, np.array([u, v]))
 
 
-def _camera_height(capture: Capture) -> float:
-    """Returns the median height of the cameras above the ground, in the capture's units."""
+def camera_height(capture: Capture) -> float:
+    """Returns the median height of the cameras above the ground, in the capture's units.
+
+    Raises:
+        ValueError: if no ground can be found, see `fit_ground` and `known_points`.
+    """
     cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     up = up_of_cameras(list(capture.X_WCs))
     n, d = fit_ground(known_points(capture), cameras, up)

@@ -151,7 +151,8 @@ def reconstruct(
     frontier = None
     if capture.metric:
         field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
-    p_WS, p_WG, geodesic, warnings = _start_and_goal(capture, field)
+    ends = capture.X_WCs[0].translation(), capture.X_WCs[-1].translation()
+    p_WS, p_WG, geodesic, warnings = start_and_goal(field, capture.metric, ends)
     write_scene_folder(
         out,
         World(capture.name, gaussians, field, field, background, p_WS, p_WG),
@@ -186,18 +187,17 @@ def reconstruct(
     )
 
 
-def _start_and_goal(
-    capture: Capture, field: Esdf
+def start_and_goal(
+    field: Esdf, metric: bool, otherwise: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[str, ...]]:
     """Returns p_WS, p_WG, the length of the shortest path [m] and warnings.
 
-    Where nothing can fly, the scene can still be looked at: the ends are those of the capture.
+    Where nothing can fly, the scene can still be looked at: there the ends are `otherwise`.
     """
     try:
-        if capture.metric:
+        if metric:
             return *choose_start_and_goal(field, VEHICLE_RADIUS), ()
         reason = "its scale is unknown"
     except ValueError as error:
         reason = str(error)
-    p_WS, p_WG = (capture.X_WCs[i].translation() for i in (0, -1))
-    return p_WS, p_WG, float("nan"), (f"this scene cannot be flown in: {reason}",)
+    return *otherwise, float("nan"), (f"this scene cannot be flown in: {reason}",)

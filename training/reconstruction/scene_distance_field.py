@@ -77,6 +77,17 @@ def render_depth(
     return DepthSource(load, K, X_WCs)
 
 
+def render_depth_of(
+    capture: Capture, factor: int, gaussians: GaussianScene, representation: str, threads: int
+) -> DepthSource:
+    """Returns what the cameras of a capture would measure in the scene, see `render_depth`, in
+    images shrunken by a whole `factor`."""
+    K = capture.K.copy()
+    K[:2] /= factor
+    width, height = capture.width // factor, capture.height // factor
+    return render_depth(gaussians, representation, K, width, height, capture.X_WCs, threads)
+
+
 def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
     """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
     number shows the infinitely far: there the space before the sky was seen to be free."""
@@ -164,16 +175,8 @@ def make_distance_field(
     every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
     if config.iterations == 0:
         return fuse(every, config.voxel_size, config.max_range), None, every
-    K = capture.K.copy()
-    K[:2] /= frames.factor
-    rendered = render_depth(
-        gaussians,
-        config.representation,
-        K,
-        capture.width // frames.factor,
-        capture.height // frames.factor,
-        capture.X_WCs,
-        config.renderer_threads,
+    rendered = render_depth_of(
+        capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
     unit = unit_of(rendered, capture.metric)
     voxel_size, max_range = config.voxel_size * unit, config.max_range * unit

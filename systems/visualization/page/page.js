@@ -1,12 +1,16 @@
-// Puts what the page holds (see `replay_page.py`) into Meshcat's viewer.
+// Puts what a page holds (see `splat_page.py`) into Meshcat's viewer.
 "use strict";
 
-// The bytes that an element holds, compressed.
-async function unpack(id) {
-  const text = document.getElementById(id).textContent;
+// The bytes of a compressed text, see `splat_page.compressed`.
+async function inflate(text) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).arrayBuffer();
+}
+
+// Those that an element holds.
+function unpack(id) {
+  return inflate(document.getElementById(id).textContent);
 }
 
 // The sky is an equirectangular picture whose columns run against the azimuth.
@@ -22,10 +26,19 @@ function showSky() {
   });
 }
 
-(async () => {
+// Puts the view's camera (z backwards) at a pose in W, whatever Meshcat's own controls say.
+function placeCamera(viewer, pose) {
+  const {camera, scene} = viewer;
+  scene.updateMatrixWorld();
+  pose.premultiply(scene.matrixWorld)
+    .premultiply(camera.parent.matrixWorld.clone().invert())
+    .decompose(camera.position, camera.quaternion, camera.scale);
+}
+
+// Shows the Gaussians and the sky; returns the former and the page's other data.
+async function openPage() {
   const splats = new Splats(viewer, new Uint32Array(await unpack("gaussians")));
   viewer.scene.add(splats.mesh);
   showSky();
-  const flights = JSON.parse(new TextDecoder().decode(await unpack("flights")));
-  window.replay = new Replay(viewer, splats, flights);
-})();
+  return {splats, data: JSON.parse(new TextDecoder().decode(await unpack("data")))};
+}

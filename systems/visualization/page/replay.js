@@ -38,7 +38,7 @@ class Replay {
   build() {
     const add = (parent, tag, properties = {}) =>
       parent.appendChild(Object.assign(document.createElement(tag), properties));
-    const panel = add(document.body, "div", {id: "replay-panel"});
+    const panel = add(document.body, "div", {id: "replay-panel", className: "panel"});
     for (const flight of this.flights) {
       flight.button = add(panel, "button", {
         className: "flight", onclick: () => this.choose(flight)});
@@ -59,7 +59,7 @@ class Replay {
       <span class="mark" style="background:#ff1a1a"></span>dearest plan
       <span class="mark" style="background:#1ae64d"></span>goal`});
 
-    const bar = add(document.body, "div", {id: "replay-bar"});
+    const bar = add(document.body, "div", {id: "replay-bar", className: "bar"});
     this.playButton = add(bar, "button", {onclick: () => this.play(!this.playing)});
     this.slider = add(bar, "input", {
       type: "range", min: 0, max: this.duration, step: 0.01, id: "replay-time"});
@@ -184,12 +184,7 @@ class Replay {
 
   placeCamera() {
     const pose = this.cameraPose();
-    if (!pose) return;
-    const camera = this.viewer.camera;
-    this.viewer.scene.updateMatrixWorld();
-    pose.premultiply(this.viewer.scene.matrixWorld)
-      .premultiply(camera.parent.matrixWorld.clone().invert())
-      .decompose(camera.position, camera.quaternion, camera.scale);
+    if (pose) placeCamera(this.viewer, pose);
   }
 
   drawPicture() {

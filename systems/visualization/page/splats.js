@@ -10,6 +10,8 @@ class Splats {
   constructor(viewer, packed) {
     const THREE = MeshCat.THREE;
     this.viewer = viewer;
+    this.packed = packed;
+    this.floats = new Float32Array(packed.buffer, packed.byteOffset, packed.length);
     this.count = packed.length / 8;
     const rows = Math.ceil(this.count / Splats.perRow);
     const texels = new Uint32Array(rows * Splats.perRow * 8);
@@ -35,7 +37,9 @@ class Splats {
       uniforms: {
         packed: {value: texture},
         viewport: {value: new THREE.Vector2()},
-        cut: {value: 1e9},
+        lower: {value: new THREE.Vector3(-1e9, -1e9, -1e9)},
+        upper: {value: new THREE.Vector3(1e9, 1e9, 1e9)},
+        shown: {value: this.count},
       },
       transparent: true,
       depthWrite: false,
@@ -50,9 +54,8 @@ class Splats {
     this.worker = new Worker(URL.createObjectURL(new Blob([source])));
     this.worker.onmessage = (event) => this.sorted(event.data);
     const centers = new Float32Array(3 * this.count);
-    const floats = new Float32Array(packed.buffer, packed.byteOffset, packed.length);
     for (let i = 0; i < this.count; ++i) {
-      centers.set(floats.subarray(8 * i, 8 * i + 3), 3 * i);
+      centers.set(this.floats.subarray(8 * i, 8 * i + 3), 3 * i);
     }
     this.worker.postMessage({centers}, [centers.buffer]);
     this.view = null;     // of what is drawn in order
@@ -61,7 +64,19 @@ class Splats {
 
   // Height in W above which nothing is drawn [m].
   set cut(height) {
-    this.mesh.material.uniforms.cut.value = Math.min(height, 1e9);
+    this.mesh.material.uniforms.upper.value.z = Math.min(height, 1e9);
+  }
+
+  // Leaves out what reaches beside or below a box, with corners in W.
+  bound(lower, upper) {
+    const {uniforms} = this.mesh.material;
+    uniforms.lower.value.set(...lower);
+    uniforms.upper.value.setX(upper[0]).setY(upper[1]);
+  }
+
+  // How many are drawn, from the first.
+  set shown(count) {
+    this.mesh.material.uniforms.shown.value = count;
   }
 
   beforeRender(renderer, camera) {
@@ -137,7 +152,8 @@ precision highp int;
 precision highp usampler2D;
 uniform usampler2D packed;
 uniform vec2 viewport;
-uniform float cut;
+uniform vec3 lower, upper;
+uniform int shown;
 uniform mat4 modelViewMatrix, projectionMatrix;
 in vec3 position;
 in uint splat;
@@ -148,15 +164,19 @@ void main() {
   ivec2 texel = ivec2(2 * int(splat % ${Splats.perRow}u), int(splat / ${Splats.perRow}u));
   uvec4 a = texelFetch(packed, texel, 0), b = texelFetch(packed, texel + ivec2(1, 0), 0);
   color = vec4(a.w & 255u, (a.w >> 8) & 255u, (a.w >> 16) & 255u, a.w >> 24) / 255.0;
-  vec4 p = modelViewMatrix * vec4(uintBitsToFloat(a.xyz), 1.0);
+  vec3 mean = uintBitsToFloat(a.xyz);
+  vec4 p = modelViewMatrix * vec4(mean, 1.0);
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside of the view
   float z = -p.z;
-  if (z < 0.05 || uintBitsToFloat(a.z) > cut) return;
+  if (z < 0.05 || int(splat) >= shown) return;
 
   vec2 xx_xy = unpackHalf2x16(b.x), xz_yy = unpackHalf2x16(b.y), yz_zz = unpackHalf2x16(b.z);
   mat3 covariance = mat3(xx_xy.x, xx_xy.y, xz_yy.x,
                          xx_xy.y, xz_yy.y, yz_zz.x,
                          xz_yy.x, yz_zz.x, yz_zz.y) / COVARIANCE_SCALE;
+  vec3 reach = sqrt(vec3(covariance[0][0], covariance[1][1], covariance[2][2]));
+  if (any(lessThan(mean - reach, lower))) return;
+  if (any(greaterThan(vec3(mean.xy + reach.xy, mean.z), upper))) return;
   vec2 focal = 0.5 * viewport * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   // The Jacobian is taken no farther out than a little beyond the image, as elsewhere.
   vec2 edge = 0.65 * viewport / focal * z;
@@ -171,8 +191,8 @@ void main() {
   float large = mid + radius, small = max(mid - radius, 0.1 * BLUR);
   vec2 axis = abs(w) > 1e-6 * mid ? normalize(vec2(w, large - u))
                                   : (u >= v ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
-  float reach = sqrt(2.0 * log(max(255.0 * color.a, 1.0)));
-  offset = reach * position.xy;
+  float extent = sqrt(2.0 * log(max(255.0 * color.a, 1.0)));
+  offset = extent * position.xy;
   vec2 pixels = offset.x * sqrt(large) * axis + offset.y * sqrt(small) * vec2(-axis.y, axis.x);
   vec4 center = projectionMatrix * p;
   gl_Position = vec4(center.xy + 2.0 * pixels / viewport * center.w, center.zw);

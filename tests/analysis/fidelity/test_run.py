@@ -152,11 +152,11 @@ def test_bad_settings(place, capsys, setting, message):
 
 def test_capture_without_depth(place, monkeypatch, capsys):
     """Without metric depth there is nothing to compare depth with."""
-    from splatpilot.analysis.reconstruction import scene_views
+    from splatpilot.training.captures import capture_of_scene
     from splatpilot.training.captures.capture import no_depth
 
     blind = replace(place.capture, load_depth=no_depth)
-    monkeypatch.setattr(scene_views, "read_capture", lambda path, config: blind)
+    monkeypatch.setattr(capture_of_scene, "read_capture", lambda path, config: blind)
     scene = place.scene("blind")
     assert main(["fidelity", str(scene), "--out", str(place.folder / "out")]) == 1
     assert "has no metric depth" in capsys.readouterr().err

@@ -9,9 +9,9 @@ import pytest
 
 from splatpilot.analysis.cli import main
 from splatpilot.analysis.reconstruction.run import run
-from splatpilot.analysis.reconstruction.scene_views import read_capture_of
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 SMALL = ReconstructConfig(

@@ -111,6 +111,19 @@ def test_outside_the_bounds_nothing_is_claimed():
     assert sample.distance[0] == field.distance(inside)
 
 
+def test_scaled_field_is_that_of_the_scaled_place():
+    """At points times the factor, distances are those times the factor; gradients and states are
+    the same."""
+    field = sphere_field()
+    scaled = field.scaled_by(3.0)
+    p = points_in(field)
+    sample, expected = scaled.query(3.0 * p), field.query(p)
+    np.testing.assert_allclose(sample.distance, 3.0 * expected.distance, atol=1e-6)
+    np.testing.assert_allclose(sample.gradient, expected.gradient, atol=1e-6)
+    np.testing.assert_array_equal(sample.state, expected.state)
+    np.testing.assert_allclose(scaled.upper_W, 3.0 * field.upper_W)
+
+
 def test_volume_counts_the_voxels_of_a_state():
     """The volume of a state is its number of voxels times theirs."""
     states = np.zeros((20, 16, 12), np.uint8)

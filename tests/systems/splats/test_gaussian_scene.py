@@ -123,6 +123,16 @@ def test_transform_there_and_back_is_the_identity():
     np.testing.assert_allclose(covariances(back), covariances(scene), rtol=1e-4, atol=1e-4)
 
 
+def test_scaled_scene_has_all_lengths_times_the_factor():
+    """Centres and deviations grow; what is seen of them from eyes that moved along does not."""
+    scene = GaussianScene(**random_arrays(K=9))
+    scaled = scene.scaled_by(2.5)
+    np.testing.assert_allclose(scaled.means, 2.5 * scene.means, rtol=1e-6)
+    np.testing.assert_allclose(covariances(scaled), 2.5**2 * covariances(scene), rtol=1e-4)
+    for name in ("quats", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(scaled, name), getattr(scene, name))
+
+
 def test_merge_places_the_other_scene_and_pads_the_lower_degree():
     """Merging keeps the first scene as it is and puts the other, zero padded, at X_WO."""
     first = GaussianScene(**random_arrays(N=3, K=9))

@@ -3,7 +3,6 @@
 import base64
 import gzip
 import re
-import shutil
 
 import cv2
 import numpy as np
@@ -33,8 +32,10 @@ WIDTH, HEIGHT, FOV_Y = 240, 180, 1.2
 X_BC = RigidTransform(RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])), [0.1, 0, 0])
 VIEW = ReplayView(X_BC, FOV_Y, radius=0.35, lower=0.0, upper=4.0)
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-in_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on the PATH")
+SETTLED = (
+    "window.replay && replay.splats.settled"
+    " && viewer.scene_tree.find(['splatpilot', 'vehicles', '0', 'body']).object.children.length > 0"
+)
 
 
 def cloud(generator: np.random.Generator, count: int = 400) -> GaussianScene:
@@ -66,60 +67,11 @@ def straight(name: str, outcome: str, y: float = 0.0, roll: float = 0.0) -> Repl
     return ReplayedFlight(name, outcome, times, states, 1 - times / 4, vectors, frames)
 
 
-class Page:
-    """A page in a browser, with the errors that it reports."""
-
-    def __init__(self, tab, path):
-        self.tab, self.errors = tab, []
-        tab.on("console", lambda message: self._note(message.type, message.text))
-        tab.on("pageerror", lambda error: self._note("error", str(error)))
-        tab.goto(path.as_uri())
-        self.settle()
-
-    def _note(self, kind: str, text: str) -> None:
-        if kind in ("error", "warning") and not any(
-            word in text for word in ("GPU stall", "swiftshader", "getImageData")
-        ):
-            self.errors.append(text)
-
-    def settle(self) -> None:
-        """Waits until the picture shows what was asked for."""
-        self.tab.wait_for_function(
-            "window.replay && replay.splats.settled && !viewer.needs_render"
-            " && viewer.scene_tree.find(['splatpilot', 'vehicles', '0', 'body']).object.children"
-            ".length > 0"
-        )
-
-    def run(self, script: str):
-        """The value of an expression in the page, once it has been drawn."""
-        value = self.tab.evaluate(script)
-        self.settle()
-        return value
-
-    def picture(self) -> np.ndarray:
-        """(H, W, 3) uint8, blue first, of the scene alone."""
-        self.tab.add_style_tag(
-            content="#replay-panel, #replay-bar, .dg { display: none !important }"
-        )
-        self.settle()
-        return cv2.imdecode(np.frombuffer(self.tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
-
-
 @pytest.fixture
-def open_page(browser, tmp_path):
+def open_page(open_in_browser):
     """Opens a page of flights; its window is as large as the onboard camera's image."""
-    tabs = []
 
-    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), balls=None) -> Page:
+    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), balls=None):
         meshcat = Meshcat()
         meshcat.SetCameraPose([-2, 0, 4], [4, 0, 1.5])
         color = background if isinstance(background, tuple) else (0.0, 0.0, 0.0)
@@ -129,17 +81,10 @@ def open_page(browser, tmp_path):
             meshcat.SetProperty(path, "visible", False)
         for k in range(len(flights)):
             draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", 0.35)
-        path = tmp_path / "page.html"
-        html = meshcat.StaticHtml()
-        path.write_text(replay_page(html, gaussians, background, VIEW, flights, balls))
-        tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-        tab.set_default_timeout(120_000)
-        tabs.append(tab)
-        return Page(tab, path)
+        html = replay_page(meshcat.StaticHtml(), gaussians, background, VIEW, flights, balls)
+        return open_in_browser(html, WIDTH, HEIGHT, SETTLED, "#replay-panel, #replay-bar")
 
-    yield opened
-    for tab in tabs:
-        tab.close()
+    return opened
 
 
 def seen(gaussians, background, X_WB: RigidTransform) -> np.ndarray:
@@ -158,7 +103,6 @@ SKY = EnvironmentMap(
 )
 
 
-@in_browser
 @pytest.mark.parametrize("background", [(0.2, 0.4, 0.6), SKY])
 def test_page_shows_what_the_camera_sees(open_page, background):
     """Seen from the vehicle in a banked turn, splats and what is behind them are those of the
@@ -177,7 +121,6 @@ def test_page_shows_what_the_camera_sees(open_page, background):
     assert page.errors == []
 
 
-@in_browser
 def test_controls_move_time_and_view(open_page):
     """The slider, the keys and the views change the picture; in the chase view the vehicle is
     within the middle of the window; the sphere is red where the clearance is below the margin, and
@@ -219,7 +162,6 @@ def test_controls_move_time_and_view(open_page):
     assert page.errors == []
 
 
-@in_browser
 def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
     """Two flights have vehicles and trails of their own, and colours; the page starts two seconds
     before the crash of the first; a chosen flight's plan alone is shown; balls are where they

@@ -1,0 +1,58 @@
+"""`splatpilot scale`."""
+
+import argparse
+import logging
+import re
+from pathlib import Path
+
+
+def add_to(verbs: argparse._SubParsersAction) -> None:
+    scale = verbs.add_parser(
+        "scale",
+        help="give a scene its size: by a factor, a measured length, or the cameras' height",
+        description="Writes the scene anew with all its lengths times one factor. A scene of "
+        "photographs alone, whose scale is unknown, can be flown in then.",
+    )
+    # Points may begin with a minus sign, which argparse takes for an option unless it is a number.
+    scale._negative_number_matcher = re.compile(r"-[\d.]")  # pyright: ignore
+    scale.set_defaults(verb=_scale)
+    scale.add_argument("scene", type=Path, help="scene folder")
+    scale.add_argument("--out", type=Path, required=True, help="scene folder to write")
+    by = scale.add_mutually_exclusive_group(required=True)
+    by.add_argument("--factor", type=float, help="what one unit of the scene becomes [m]")
+    by.add_argument(
+        "--between",
+        nargs=2,
+        metavar="X,Y,Z",
+        help="two points of the scene, as the ruler of `splatpilot view` gives them",
+    )
+    by.add_argument(
+        "--height", type=float, help="median height of the capture's cameras above the ground [m]"
+    )
+    scale.add_argument("--distance", type=float, help="true length between these points [m]")
+
+
+def _scale(options: argparse.Namespace) -> None:
+    if (options.between is None) != (options.distance is None):
+        raise ValueError("--between and --distance belong together: two points and the metres")
+    points = [_point(text) for text in options.between or ()]
+
+    from splatpilot.analysis.reconstruction import rescale
+
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    rescale.run(
+        scene=options.scene,
+        out=options.out,
+        factor=options.factor,
+        between=points,
+        distance=options.distance,
+        height=options.height,
+    )
+
+
+def _point(text: str) -> list[float]:
+    try:
+        x, y, z = (float(each) for each in text.split(","))
+    except ValueError:
+        raise ValueError(f"--between {text!r}: a point X,Y,Z is needed") from None
+    return [x, y, z]

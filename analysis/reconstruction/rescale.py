@@ -1,0 +1,180 @@
+"""A finished scene folder in another scale: metres, where its unit of length was unknown."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatpilot.diagrams.worlds.frontier import close_frontier
+from splatpilot.diagrams.worlds.scene_folder import (
+    check_scene_target,
+    read_background,
+    write_scene_folder,
+)
+from splatpilot.diagrams.worlds.scene_metadata import (
+    FRONTIER,
+    SceneMetadata,
+    read_scene_metadata,
+)
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.splats.gaussian_ply import read_ply
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
+from splatpilot.training.captures.capture_of_scene import read_capture_of
+from splatpilot.training.captures.metric_scale import camera_height
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.reconstruct import start_and_goal
+from splatpilot.training.reconstruction.scene_distance_field import render_depth_of
+from splatpilot.training.reconstruction.views import shrink_factor
+
+
+@dataclass(frozen=True)
+class RescaleSummary:
+    """What was made."""
+
+    scene: Path
+    factor: float
+    size: NDArray[np.float64]  # (3,) [m], of the distance field's box
+    geodesic: float  # [m], length of the shortest path from start to goal
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        rows = {
+            "scene": self.scene,
+            "factor": f"{self.factor:.6g}",
+            "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
+            "shortest path [m]": f"{self.geodesic:.1f}",
+        }
+        lines = [f"{name:<18} {value}" for name, value in rows.items()]
+        return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
+
+
+def run(
+    *,
+    scene: Path,
+    out: Path,
+    factor: float | None = None,
+    between: Sequence[ArrayLike] = (),
+    distance: float | None = None,
+    height: float | None = None,
+) -> RescaleSummary:
+    """Writes the scene folder `scene` anew as `out`, see `rescale`, and prints what it is.
+
+    Args:
+        factor: of all lengths; or
+        between, distance: two points (3,) of the scene, and the metres between them; or
+        height: [m], median height of the capture's cameras above the ground.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: see `rescale`; or if the two points are one, a
+            length is not positive, or no height of the cameras can be found in the capture.
+    """
+    metadata = read_scene_metadata(scene)
+    if distance is not None:
+        a, b = (np.asarray(p, dtype=float) for p in between)
+        if not (length := float(np.linalg.norm(a - b))) > 0:
+            raise ValueError(f"both points are {a.tolist()}; two places are needed")
+        factor = _positive("distance", distance) / length
+    elif height is not None:
+        factor = _positive("height", height) / camera_height(read_capture_of(scene, metadata))
+    if factor is None:
+        raise ValueError("give a factor, two points and the distance between them, or a height")
+    summary = rescale(scene, out, factor)
+    print(summary)
+    return summary
+
+
+def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
+    """Writes the scene folder `scene` anew as `out`, all its lengths times `factor`, in metres.
+
+    It is what reconstruction would have written of the capture in that scale: start and goal are
+    chosen for the vehicle, and a place whose scale was unknown is closed where nobody looked
+    (`close_frontier`). The grid of the distance field stays; its voxels grow. What was measured of
+    the scene is not copied, `splatpilot measure` and `fidelity` measure the new one.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: for a damaged scene, a factor that is not positive,
+            or if `out` exists or cannot be written.
+    """
+    _positive("factor", factor)
+    if out.exists():
+        raise ValueError(f"{out}: exists already; choose another folder for the scaled scene")
+    check_scene_target(out)
+    metadata = read_scene_metadata(scene)
+    gaussians = read_ply(scene / "gaussians.ply").scaled_by(factor)
+    field = Esdf.load(scene / "esdf.npz").scaled_by(factor)
+    about, warnings = _about_capture(metadata, factor)
+    frontier = None
+    if metadata.frontier:
+        frontier = read_ply(scene / FRONTIER).scaled_by(factor)
+    elif not metadata.metric:
+        try:
+            field, frontier = _closed(scene, about, gaussians, field)
+        except (ValueError, OSError) as error:
+            warnings += (f"where nobody looked the scene stays open: {error}",)
+    ends = factor * np.array(metadata.p_WS), factor * np.array(metadata.p_WG)
+    p_WS, p_WG, geodesic, unflyable = start_and_goal(field, True, ends)
+    background = read_background(scene, metadata)
+    write_scene_folder(
+        out,
+        World(metadata.name, gaussians, field, field, background, p_WS, p_WG),
+        frontier,
+        provenance=f"{metadata.provenance}, scaled by {factor:.6g}",
+        gains=about.gains,
+        vignetting=about.vignetting,
+        representation=metadata.representation,
+        capture=about.capture,
+        capture_settings=about.capture_settings,
+        held_out=about.held_out,
+        image_width=about.image_width,
+    )
+    size = field.upper_W - field.lower_W
+    return RescaleSummary(out, factor, size, geodesic, (*warnings, *unflyable))
+
+
+def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadata, tuple[str, ...]]:
+    """What a scene in another scale says of its capture, and warnings.
+
+    The settings with which the capture is opened again give its poses the same scale. Where they
+    cannot, because its metres are those of measured depth, the scene names no capture any more.
+    """
+    if not metadata.capture:
+        return metadata, ()
+    config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
+    given = complete_config(Path(metadata.capture), config).scale
+    if not metadata.metric:
+        config.scale.factor = factor
+    elif given.factor or given.distance or given.camera_height:
+        for name in ("factor", "distance", "camera_height"):
+            setattr(config.scale, name, factor * getattr(given, name))
+    else:
+        forgotten = replace(
+            metadata, capture="", capture_settings=[], held_out=[], gains=[], image_width=0
+        )
+        warning = (
+            f"{metadata.capture} has metres of its own: the scaled scene is not compared to it"
+        )
+        return forgotten, (warning,)
+    return replace(metadata, capture_settings=config.settings()), ()
+
+
+def _closed(
+    scene: Path, about: SceneMetadata, gaussians: GaussianScene, field: Esdf
+) -> tuple[Esdf, GaussianScene | None]:
+    """The scene closed where nobody looked any further, as its capture tells; `close_frontier`."""
+    capture = read_capture_of(scene, about)
+    factor = shrink_factor(capture.width, about.image_width)
+    threads = ReconstructConfig().renderer_threads
+    depth = render_depth_of(capture, factor, gaussians, about.representation, threads)
+    return close_frontier(field, depth.images(), depth.K, depth.X_WCs)
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} is {value}; it must be positive and finite")
+    return value

@@ -1,0 +1,55 @@
+// A level cut through the grid of a distance field, as a picture that lies in the place.
+"use strict";
+
+class DistanceSlice {
+  // `grid` as `place_page.py` gives it, and its values: x the fastest, then y, then z; 255 where
+  // nobody looked.
+  constructor(grid, values) {
+    const THREE = MeshCat.THREE, [nx, ny] = grid.shape, edge = grid.voxel_size;
+    Object.assign(this, grid, {values});
+    this.texture = new THREE.DataTexture(new Uint8Array(4 * nx * ny), nx, ny);
+    this.texture.colorSpace = THREE.SRGBColorSpace;
+    this.texture.magFilter = THREE.NearestFilter;
+    this.mesh = new THREE.Mesh(
+      new THREE.PlaneGeometry(nx * edge, ny * edge),
+      new THREE.MeshBasicMaterial({
+        map: this.texture, side: THREE.DoubleSide, transparent: true, depthWrite: false}));
+    this.mesh.position.set(grid.lower[0] + nx * edge / 2, grid.lower[1] + ny * edge / 2, 0);
+  }
+
+  set height(z) {
+    const [nx, ny, nz] = this.shape, size = nx * ny;
+    const layer = Math.floor((z - this.lower[2]) / this.voxel_size);
+    const start = size * Math.min(Math.max(layer, 0), nz - 1);
+    const pixels = this.texture.image.data;
+    for (let i = 0; i < size; ++i) {
+      const value = this.values[start + i];
+      const hatched = value === 255 && (i % nx + Math.floor(i / nx)) % 6 < 2;
+      for (let k = 0; k < 3; ++k) pixels[4 * i + k] = this.palette[value][k] * (hatched ? 0.6 : 1);
+      pixels[4 * i + 3] = value === 255 ? 130 : 205;
+    }
+    this.texture.needsUpdate = true;
+    this.mesh.position.z = z;
+  }
+
+  // What the colours mean.
+  drawLegend(canvas, unit) {
+    const context = canvas.getContext("2d"), {width} = canvas, wide = 0.68 * width;
+    context.font = "22px system-ui, sans-serif";
+    for (let x = 0; x < wide; ++x) {
+      context.fillStyle = `rgb(${this.palette[Math.round(254 * x / wide)]})`;
+      context.fillRect(x, 0, 1, 26);
+    }
+    context.fillStyle = `rgb(${this.palette[255]})`;
+    context.fillRect(0.74 * width, 0, 0.26 * width, 26);
+    context.fillStyle = `rgb(${this.palette[255].map((value) => 0.6 * value)})`;
+    for (let x = 0.74 * width; x < width; x += 14) context.fillRect(x, 0, 5, 26);
+    context.fillStyle = "#eee";
+    context.fillText("surface", 0, 50);
+    context.textAlign = "center";
+    context.fillText(`${+(this.reach / 2).toPrecision(3)} ${unit}`, wide / 2, 50);
+    context.textAlign = "right";
+    context.fillText(`${+this.reach.toPrecision(3)} ${unit} +`, wide, 50);
+    context.fillText("never seen", width, 50);
+  }
+}

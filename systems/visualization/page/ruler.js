@@ -1,0 +1,63 @@
+// Two points picked on surfaces, and the length between them.
+"use strict";
+
+class Ruler {
+  // `unit`: of lengths.
+  constructor(viewer, unit) {
+    const THREE = MeshCat.THREE, color = 0xc81e5a;
+    Object.assign(this, {viewer, unit, points: []});
+    // Drawn over everything, so that the ends are seen from wherever one looks.
+    const over = {color, depthTest: false, transparent: true};
+    this.ends = new THREE.Points(
+      new THREE.BufferGeometry(),
+      new THREE.PointsMaterial({...over, size: 11, sizeAttenuation: false}));
+    this.line = new THREE.Mesh(
+      new THREE.CylinderGeometry(1, 1, 1, 8).rotateX(Math.PI / 2),
+      new THREE.MeshBasicMaterial(over));
+    this.group = new THREE.Group();
+    this.group.add(this.ends, this.line);
+    for (const object of this.group.children) {
+      object.frustumCulled = false;
+      object.renderOrder = 9;
+    }
+    this.label = document.body.appendChild(
+      Object.assign(document.createElement("div"), {id: "view-label"}));
+    viewer.scene.add(this.group);
+    this.set([]);
+  }
+
+  // The point after the second begins anew.
+  add(point) {
+    this.set(this.points.length === 2 ? [point] : [...this.points, point]);
+  }
+
+  set(points) {
+    const THREE = MeshCat.THREE, [a, b] = points.map((p) => new THREE.Vector3(...p));
+    this.points = points;
+    this.group.visible = points.length > 0;
+    this.line.visible = points.length === 2;
+    this.label.hidden = points.length < 2;
+    this.ends.geometry.setAttribute(
+      "position", new THREE.Float32BufferAttribute(points.flat(), 3));
+    this.length = b ? a.distanceTo(b) : null;
+    if (b) {
+      this.middle = a.clone().lerp(b, 0.5);
+      this.line.position.copy(this.middle);
+      this.line.scale.set(0.004 * this.length, 0.004 * this.length, this.length);
+      this.line.up.set(0, 0, 1);
+      this.line.quaternion.setFromUnitVectors(
+        new THREE.Vector3(0, 0, 1), b.clone().sub(a).normalize());
+      this.label.textContent = `${this.length.toFixed(2)} ${this.unit}`;
+    }
+    this.viewer.set_dirty();
+  }
+
+  // Keeps the label at the middle of the line.
+  place() {
+    if (!this.line.visible) return;
+    const p = this.viewer.scene.localToWorld(this.middle.clone()).project(this.viewer.camera);
+    this.label.hidden = p.z > 1;
+    this.label.style.left = `${(0.5 + 0.5 * p.x) * window.innerWidth}px`;
+    this.label.style.top = `${(0.5 - 0.5 * p.y) * window.innerHeight}px`;
+  }
+}

@@ -1,0 +1,150 @@
+"""Any place as a page."""
+
+import base64
+import gzip
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatpilot.analysis import view
+from splatpilot.analysis.cli import main
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.splats.gaussian_ply import write_ply
+from splatpilot.training.captures.capture_gaussians import capture_gaussians
+
+
+def data_of(page) -> dict:
+    """What the page shows beside its Gaussians."""
+    found = re.search(r'id="data">([^<]*)<', page.read_text())
+    assert found is not None
+    return json.loads(gzip.decompress(base64.b64decode(found[1])))
+
+
+def grid_of(data) -> np.ndarray:
+    """The bytes of the page's distances, (nx, ny, nz)."""
+    values = gzip.decompress(base64.b64decode(data["grid"]["values"]))
+    return np.frombuffer(values, np.uint8).reshape(data["grid"]["shape"], order="F")
+
+
+def test_generated_world(tmp_path, capsys):
+    """A scenario's world, its seed and changes of it: the page has the grid of its distances to a
+    byte, its bounds, start and goal."""
+    out = tmp_path / "there" / "forest.html"
+    changes = ["world.length=8", "world.width=5", "world.height=3", "world.voxel_size=0.25"]
+    command = ["view", "P02", "--seed", "3", "--out", str(out)]
+    for change in changes:
+        command += ["--set", change]
+    assert main(command) == 0
+    assert str(out) in capsys.readouterr().out
+    data = data_of(out)
+    scenario = load_config(Scenario(), scenario_file("P02"), changes)
+    esdf = make_world(scenario.world, 3).esdf
+    expected = np.clip(esdf.distances, 0, 2) * 127
+    np.testing.assert_allclose(grid_of(data), expected, atol=0.51)
+    np.testing.assert_allclose(data["upper"], esdf.upper_W, atol=1e-4)
+    assert [name for _, name in data["legend"]] == ["bounds", "start", "goal"]
+    assert data["unit"] == "m" and data["scale_command"] == ""
+    assert "seed 3" in data["name"]
+
+
+@pytest.fixture
+def of_room(place, monkeypatch):
+    """The page of a scene of the room, which `view.run` has written."""
+
+    def page(scene, **said):
+        return data_of(view.run(what=str(scene), out=place.folder / "page.html", **said))
+
+    return page
+
+
+def test_scene_with_its_capture(place, of_room):
+    """The poses are those of the capture, each with its image and name; the command that scales
+    names the scene."""
+    scene = place.scene("scene")
+    data = of_room(scene)
+    poses = np.reshape(data["cameras"]["poses"], (-1, 4, 4))
+    truth = [X_WC.GetAsMatrix4() for X_WC in place.capture.X_WCs]
+    np.testing.assert_allclose(poses, truth, atol=1e-9)
+    assert len(data["cameras"]["images"]) == len(data["cameras"]["names"]) == 16
+    assert data["cameras"]["fov_y"] == pytest.approx(2 * np.degrees(np.arctan(24 / 32)))
+    assert data["scale_command"].startswith(f"splatpilot scale {scene} --out ")
+    assert data["size"].startswith("6 x 3 x 2.5 m")
+
+
+def test_scene_without_scale_or_capture_is_shown(place, of_room, monkeypatch):
+    """It says that its unit is unknown and why images are missing, and has no start and goal."""
+
+    def lost(path, metadata):
+        raise FileNotFoundError("room: no such folder")
+
+    monkeypatch.setattr(view, "read_capture_of", lost)
+    scene = place.scene("scene")
+    write_scene_metadata(scene, replace(read_scene_metadata(scene), metric=False))
+    data = of_room(scene)
+    assert data["cameras"] is None
+    assert (data["unit"], data["size"].split(",")[0]) == (
+        "units",
+        "6 x 3 x 2.5 in units of unknown length",
+    )
+    assert any("room: no such folder" in note for note in data["notes"])
+    assert "start" not in [name for _, name in data["legend"]]
+
+
+def test_capture_shows_what_it_measured(place, monkeypatch, tmp_path):
+    """Depth becomes Gaussians on the walls; without depth the points of the registration do."""
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    monkeypatch.setattr(view, "read_capture", lambda path, config: place.capture)
+    data = data_of(view.run(what=str(folder), out=tmp_path / "page.html"))
+    assert data["grid"] is None and len(data["cameras"]["poses"]) == 16
+    gaussians = capture_gaussians(place.capture, range(16))
+    assert gaussians is not None
+    to_wall = np.minimum(np.abs(gaussians.means), np.abs(gaussians.means - [6, 3, 2.5])).min(axis=1)
+    assert np.percentile(to_wall, 95) < 0.1  # The room's Gaussians are balls of 6 cm.
+    bare = replace(place.capture, load_depth=type(place.capture).load_depth)
+    points = capture_gaussians(bare, range(16))
+    assert points is not None
+    np.testing.assert_allclose(points.means, place.capture.points.p_WQ, atol=1e-6)
+
+
+def test_bare_gaussians(place, tmp_path):
+    """A PLY has distances where they can be had, and is shown without where not."""
+    path = tmp_path / "room.ply"
+    write_ply(place.gaussians, path)
+    assert data_of(view.run(what=str(path), out=tmp_path / "a.html"))["grid"] is not None
+    write_ply(place.gaussians.scaled_by(1000.0), path)
+    data = data_of(view.run(what=str(path), out=tmp_path / "b.html"))
+    assert data["grid"] is None and "Without distances" in data["notes"][0]
+
+
+def test_looking_needs_no_extras():
+    """Without torch and pycolmap everything can be looked at."""
+    script = "import sys; from splatpilot.analysis import view\n"
+    script += "sys.exit(bool({'torch', 'pycolmap'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "there is no scenario 'nowhere'"),
+        (["scene", "--seed", "1"], "no generated world"),
+        (["scene", "--set", "world.length=3"], "a finished scene has no settings"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(place, monkeypatch, capsys, words, message):
+    """One sentence says why, and no page is written."""
+    place.scene("scene")
+    monkeypatch.chdir(place.folder)
+    assert main(["view", *words]) == 1
+    assert message in capsys.readouterr().err
+    assert not (place.folder / "out").exists()

@@ -1,0 +1,77 @@
+"""Pages in a real browser where there is one."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+
+class Page:
+    """A page in a browser, with the errors that it reports.
+
+    Args:
+        tab: Playwright's.
+        path: the page.
+        settled: JavaScript that is true when the picture shows what was asked for.
+        hidden: CSS selectors of what is no part of the picture of the scene.
+    """
+
+    def __init__(self, tab, path, settled: str, hidden: str):
+        self.tab, self.settled, self.hidden, self.errors = tab, settled, hidden, []
+        tab.on("console", lambda message: self._note(message.type, message.text))
+        tab.on("pageerror", lambda error: self._note("error", str(error)))
+        tab.goto(path.as_uri())
+        self.settle()
+
+    def _note(self, kind: str, text: str) -> None:
+        if kind in ("error", "warning") and not any(
+            word in text for word in ("GPU stall", "swiftshader", "getImageData")
+        ):
+            self.errors.append(text)
+
+    def settle(self) -> None:
+        """Waits until the picture shows what was asked for."""
+        self.tab.wait_for_function(f"{self.settled} && !viewer.needs_render")
+
+    def run(self, script: str):
+        """The value of an expression in the page, once it has been drawn."""
+        value = self.tab.evaluate(script)
+        self.settle()
+        return value
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) uint8, blue first, of the scene alone."""
+        self.tab.add_style_tag(content=f"{self.hidden}, .dg {{ display: none !important }}")
+        self.settle()
+        return cv2.imdecode(np.frombuffer(self.tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Chromium; skips where there is none on the PATH."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("there is no Chromium on the PATH")
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=chromium, args=flags)
+
+
+@pytest.fixture
+def open_in_browser(browser, tmp_path):
+    """Opens HTML as a `Page` in a window of this width and height [px]."""
+    tabs = []
+
+    def opened(html: str, width: int, height: int, settled: str, hidden: str) -> Page:
+        path = tmp_path / "page.html"
+        path.write_text(html)
+        tabs.append(browser.new_page(viewport={"width": width, "height": height}))
+        tabs[-1].set_default_timeout(120_000)
+        return Page(tabs[-1], path, settled, hidden)
+
+    yield opened
+    for tab in tabs:
+        tab.close()

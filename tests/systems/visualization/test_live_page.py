@@ -1,0 +1,66 @@
+"""A page beside a running Meshcat, in a real browser where there is one."""
+
+import dataclasses
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import Box, InMemoryMesh, Mesh, Meshcat, Rgba
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.visualization.camera_visualizer import picture_gltf
+from splatpilot.systems.visualization.drawing import draw_gaussians
+from splatpilot.systems.visualization.live_page import live_page
+
+SKY = EnvironmentMap(np.full((4, 8, 3), [0.2, 0.9, 0.9], np.float32))
+
+
+def test_page_follows_meshcat(open_in_browser):
+    """The Gaussians are there, and not what Meshcat draws as points; what is drawn in Meshcat after
+    the page has been opened appears, before the Gaussians, and moves; the sky
+    stays; the height hides the Gaussian; a mesh that Meshcat would serve is left out in silence."""
+    meshcat = Meshcat()
+    meshcat.SetCameraPose([-4, 0, 0], [0, 0, 0])
+    for path in ("/Grid", "/Axes"):
+        meshcat.SetProperty(path, "visible", False)
+    red = GaussianScene.from_colors(
+        [[0.0, 0.0, 0.0]], [[1.0, 0, 0, 0]], [[0.6] * 3], [0.99], [[0.9, 0.0, 0.0]]
+    )
+    html = live_page(meshcat, red, SKY, (-2.0, 2.0), cut=1.0)
+    # Nearer than the Gaussian, to be seen if they were drawn.
+    green = dataclasses.replace(red, sh=red.sh[:, :, [1, 0, 2]], means=red.means - [1.0, 0, 0])
+    draw_gaussians(meshcat, "/splatpilot/scene", green, np.full(3, -5.0), np.full(3, 5.0))
+    page = open_in_browser(html, 320, 240, "window.live && live.settled", "#none")
+
+    def middle() -> list[int]:
+        return page.picture()[120, 160].tolist()
+
+    page.tab.wait_for_function(
+        "viewer.scene_tree.find(['splatpilot', 'scene', '<object>']).object.isPoints"
+    )
+    blue, green, bright = middle()
+    assert bright > 180 and blue < 20 and green < 20
+    assert page.picture()[120, 10].tolist() == [230, 230, 51]
+    meshcat.SetObject("/box", Box(0.5, 0.5, 0.5), Rgba(0, 0, 1))
+    meshcat.SetTransform("/box", RigidTransform([-1.5, 0, 0]))
+    page.tab.wait_for_function(
+        "viewer.scene_tree.find(['box']).object.position.x === -1.5"
+        " && viewer.scene_tree.find(['box']).object.children.length > 0"
+    )
+    blue, green, bright = middle()
+    assert blue > 60 and bright < 20
+    meshcat.SetTransform("/box", RigidTransform([3.0, 0, 0]))
+    page.tab.wait_for_function("viewer.scene_tree.find(['box']).object.position.x === 3")
+    assert middle()[2] > 180
+    assert page.picture()[120, 10].tolist() == [230, 230, 51]
+    picture = MemoryFile(
+        picture_gltf(np.zeros((4, 4, 3), np.uint8), np.eye(4, 3)), ".gltf", "picture"
+    )
+    meshcat.SetObject("/picture", Mesh(InMemoryMesh(mesh_file=picture)))
+    page.tab.evaluate(
+        "() => { const s = document.getElementById('live-cut'); s.value = -0.1;"
+        " s.dispatchEvent(new Event('input')); }"
+    )
+    assert middle()[2] < 20  # The box behind it.
+    assert page.errors == []
