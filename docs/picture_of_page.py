@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 SETTLED = "(window.replay || window.view)?.splats.settled && !viewer.needs_render"
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-RATE = 8
+RATE = 5
 """[1/s], pictures of a moving one."""
 
 
