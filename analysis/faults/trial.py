@@ -107,11 +107,9 @@ def fly_trial(scenario: Scenario, world: World, fault: Fault, seed: int) -> dict
             mode, reason = np.asarray(bridge.GetOutputPort("status").Eval(bridge_root))[:2]
             reasons.add(int(reason))
         state = QuadrotorState.of(np.asarray(vehicle.GetOutputPort("state").Eval(root)))
-        w, x, y, z = state.q_WB
-        tilt = float(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0)))
         clearance = float(np.asarray(vehicle.GetOutputPort("clearance").Eval(root))[0])
         measured["most_speed"] = max(measured["most_speed"], float(np.linalg.norm(state.v_WB)))
-        measured["most_tilt"] = max(measured["most_tilt"], tilt)
+        measured["most_tilt"] = max(measured["most_tilt"], float(state.tilt))
         measured["inside"] &= bool(
             ((state.p_WB >= field.lower_W) & (state.p_WB <= field.upper_W)).all()
         )
