@@ -63,13 +63,8 @@ class BridgeStatus(LeafSystem):
         overruns = optional_input(self, "overruns", context)
         counts = [self._read(context, what).sum() for what in ("gaps", "rejected")]
         mode = np.asarray(self.GetInputPort("mode").Eval(context))
-        status = [
-            *mode,
-            ages[0],
-            max(ages[1:], default=0.0),
-            *counts,
-            0.0 if overruns is None else overruns[0],
-        ]
+        late = 0.0 if overruns is None else overruns[0]
+        status = [*mode, ages[0], max(ages[1:], default=0.0), *counts, late]
         output.SetFromVector(np.array(status))
 
     def _calc_observation_age(self, context: Context, output: BasicVector) -> None:
