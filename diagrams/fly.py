@@ -1,7 +1,6 @@
 """`splatpilot fly`: one flight, with everything a person wants to see of it afterwards."""
 
 import contextlib
-import json
 import time
 from pathlib import Path
 from typing import cast
@@ -13,6 +12,7 @@ from tqdm import tqdm
 
 from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight_files import FLIGHT_FILES, write_flight
 from splatpilot.diagrams.flight_page import (
     recorded_frames,
     replayed_flight,
@@ -23,7 +23,6 @@ from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -45,9 +44,7 @@ def run(
 
     - `flight.html`: a page to watch it in, see `replay_page`;
     - `flight.mp4`: what the onboard camera saw, colour beside depth;
-    - `trajectory.npz`: the arrays of `Flight`;
-    - `summary.json`: the summary this function returns;
-    - `scenario.yaml`: the scenario with every field, which gives the same flight again.
+    - what `write_flight` writes.
 
     Args:
         live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
@@ -85,18 +82,13 @@ def run(
     flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
     camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
     summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
-    with written_atomically(out / "trajectory.npz") as path:
-        flight.save(path)
-    with written_atomically(out / "scenario.yaml") as path:
-        path.write_text(dump_config(scenario))
-    with written_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+    write_flight(out, scenario, flight, summary)
     recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
     frames = recorded_frames(recorder, scenario)
     name = f"{world.name}, seed {scenario.seed}"
     shown = replayed_flight(name, flight, frames)
     write_flight_page(out / "flight.html", scenario, world, [shown])
-    written = ["flight.html", "trajectory.npz", "summary.json", "scenario.yaml"]
+    written = ["flight.html", *FLIGHT_FILES]
     if video:
         recorder.save(out / "flight.mp4", scenario.camera.z_far)
         written.insert(1, "flight.mp4")
