@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_files import FLIGHT_FILES, write_flight
+from splatpilot.diagrams.flight_files import FLIGHT_FILES, write_flight, write_summary
 from splatpilot.diagrams.flight_page import (
     recorded_frames,
     replayed_flight,
@@ -23,7 +23,7 @@ from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
@@ -38,27 +38,33 @@ def run(
     live: bool = False,
     video: bool = True,
     graphviz: Path | None = None,
+    overwrite: bool = False,
 ) -> dict[str, float | str]:
     """
     Flies a scenario and leaves in `out`:
 
     - `flight.html`: a page to watch it in, see `replay_page`;
     - `flight.mp4`: what the onboard camera saw, colour beside depth;
-    - what `write_flight` writes.
+    - what `write_flight` and `write_summary` write, the former before any picture is made.
 
     Args:
         live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
             `live.html` in `out` shows it with the world's Gaussians.
         video: whether to write `flight.mp4`.
         graphviz: where to write the diagram as Graphviz source.
+        overwrite: what is there. An earlier flight stays whole until this one has been flown.
 
     Returns:
         `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
 
     Raises:
         ValueError: for a scenario that cannot be flown.
-        OSError: if `out` cannot be written; nothing is flown then.
+        OSError: if `out` holds anything and is not to be overwritten, or cannot be written; nothing
+            is flown then.
     """
+    for path in (out, graphviz):
+        if path is not None:
+            require_unused(path, overwrite)
     scenario.validate()
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
@@ -80,9 +86,12 @@ def run(
         with written_atomically(graphviz) as path:
             path.write_text(diagram.GetGraphvizString())
     flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
+    for name in ("flight.html", "flight.mp4", *FLIGHT_FILES):
+        (out / name).unlink(missing_ok=True)
+    write_flight(out, scenario, flight)
     camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
     summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
-    write_flight(out, scenario, flight, summary)
+    write_summary(out, summary)
     recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
     frames = recorded_frames(recorder, scenario)
     name = f"{world.name}, seed {scenario.seed}"

@@ -16,7 +16,7 @@ from splatpilot.diagrams.flight import (
     record_flight,
     sample_initial_state,
 )
-from splatpilot.diagrams.flight_files import write_flight
+from splatpilot.diagrams.flight_files import write_flight, write_summary
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.real_time import run_in_real_time
@@ -30,8 +30,8 @@ from splatpilot.systems.messaging.open_lcm import open_lcm
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
     """
     Hovers at the scenario's start until commands come, flies by them until the flight ends, hovers
-    and then lands where they cease, and leaves in `out` what `write_flight` writes. Time is counted
-    from the first command.
+    and then lands where they cease, and leaves in `out` what `write_flight` and `write_summary`
+    write. Time is counted from the first command.
 
     Args:
         scenario: the vehicle, its world, its start, and what its policy sees.
@@ -84,8 +84,9 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     diagram.ForcedPublish(root)  # Who flies is to know the last state too.
     outcome = how_it_ended() or Outcome.TIMEOUT
     flight = _since(took_off, record_flight(diagram, root, world, outcome, wall_time))
+    write_flight(out, scenario, flight)
     summary = flight.summary() | {"overruns": overruns}
-    write_flight(out, scenario, flight, summary)
+    write_summary(out, summary)
     print(*(f"{name:<18} {value}" for name, value in summary.items()), sep="\n")
     return summary
 
