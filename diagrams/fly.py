@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 from tqdm import tqdm
 
-from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
+from splatpilot.diagrams.flight import Flight, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight_files import FLIGHT_FILES, write_flight, write_summary
 from splatpilot.diagrams.flight_page import (
@@ -18,6 +18,7 @@ from splatpilot.diagrams.flight_page import (
     replayed_flight,
     write_flight_page,
 )
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.meshcat import open_meshcat
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario

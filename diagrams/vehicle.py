@@ -14,9 +14,9 @@ from splatpilot.diagrams.flight import (
     flight_outcome,
     has_landed,
     record_flight,
-    sample_initial_state,
 )
 from splatpilot.diagrams.flight_files import write_flight, write_summary
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.real_time import run_in_real_time

@@ -10,7 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 
 from splatpilot.analysis.faults.fault import Fault
 from splatpilot.analysis.faults.relay import Relay
-from splatpilot.diagrams.flight import Outcome, flight_outcome, has_landed, sample_initial_state
+from splatpilot.diagrams.flight import Outcome, flight_outcome, has_landed
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram, image_codecs
 from splatpilot.diagrams.pilot import goal_of, make_policy
