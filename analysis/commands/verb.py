@@ -84,8 +84,7 @@ def as_json(value: Any) -> Any:
         return {str(name): as_json(one) for name, one in value.items()}
     if isinstance(value, list | tuple):
         return [as_json(one) for one in value]
-    if hasattr(value, "item"):  # a number of numpy
-        value = value.item()
+    value = getattr(value, "item", lambda: value)()  # of a number of numpy
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, str | int | float | None) else str(value)

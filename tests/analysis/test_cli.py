@@ -246,7 +246,9 @@ def test_signals_end_with_one_line(number, status, tmp_path):
     """A flight that is ended from outside says so in one line, and leaves no half of anything."""
     out = tmp_path / "flight"
     script = (
-        "import sys; from splatpilot.analysis.cli import main\n"
+        "import signal, sys; from splatpilot.analysis.cli import main\n"
+        # Shells have what runs in their background ignore it.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.exit(main(['fly', '--out', {str(out)!r}]))"
     )
     flying = subprocess.Popen(

@@ -36,7 +36,7 @@ def test_every_verb_has_a_description_and_examples_that_are_commands(prog):
     the command line accepts."""
     verb = VERBS[prog]
     assert verb.description and verb.description.rstrip().endswith(".")
-    heading, *examples = verb.epilog.splitlines()
+    heading, *examples = (verb.epilog or "").splitlines()
     assert heading == EXAMPLES and 2 <= len(examples) <= 3
     for example in examples:
         assert example.startswith(f"  {prog}")
@@ -53,7 +53,7 @@ def test_fields_that_help_names_can_be_set(prog):
     configuration, with values that it takes."""
     verb = VERBS[prog]
     (option,) = (action for action in verb._actions if isinstance(action, SetField))
-    named = option.help.partition("for example ")[2].rpartition(" (repeatable)")[0]
+    named = (option.help or "").partition("for example ")[2].rpartition(" (repeatable)")[0]
     options = argparse.Namespace(
         policies=["student_depth"] if prog.endswith("recover") else ["diffaero"],
         **dict.fromkeys(("scenario", "policy", "speed", "scene", "seed")),
