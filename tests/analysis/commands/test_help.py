@@ -55,6 +55,7 @@ def test_fields_that_help_names_can_be_set(prog):
     (option,) = (action for action in verb._actions if isinstance(action, SetField))
     named = (option.help or "").partition("for example ")[2].rpartition(" (repeatable)")[0]
     options = argparse.Namespace(
+        what=None,
         policies=["student_depth"] if prog.endswith("recover") else ["diffaero"],
         **dict.fromkeys(("scenario", "policy", "speed", "scene", "seed")),
         overrides=[],
