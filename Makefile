@@ -10,7 +10,7 @@ NATIVE := $(wildcard native/*.hpp native/*.cpp)
 .PHONY: fly test lint docs stub messages sanitize nightly clean
 
 fly: .venv/flying
-	$(SPLATPILOT) fly --out out/fly
+	$(SPLATPILOT) fly --out out/fly --overwrite
 
 test: lint
 	.venv/bin/python -m pytest

@@ -1,10 +1,18 @@
 """The command line. It stands on the top floor because it may reach every other."""
 
 import argparse
+import contextlib
+import json
+import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
 from typing import Any
 
 from splatpilot.analysis.commands import COMMANDS
+from splatpilot.analysis.commands.verb import FailureWithResultError, as_json
 from splatpilot.systems.extras import missing_extra
 
 
@@ -18,22 +26,33 @@ class _PrintVersion(argparse.Action):
         parser.exit()
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """
-    Runs `splatpilot VERB ...`.
+class _ImportModule(argparse.Action):
+    """Imports a module before the verb is read, whose help may be of what it registers."""
 
-    Args:
-        arguments: the words after `splatpilot`; those of the process when None.
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, value: Any, *_: Any
+    ) -> None:
+        from splatpilot.systems.registry import import_modules
 
-    Returns:
-        The exit status: 0, or 1 after an error that one message on standard error explains.
-    """
+        import_modules([value])
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+
+
+class _TerminatedError(KeyboardInterrupt):
+    """SIGTERM has come: ends everything as Ctrl-C does."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `splatpilot`, with all verbs."""
     parser = argparse.ArgumentParser(
-        prog="splatpilot", description="Fly drones by camera inside Gaussian-splat worlds."
+        prog="splatpilot",
+        description="Fly drones by camera inside Gaussian-splat worlds.",
+        epilog="exit status: 0 done, 1 an error that one message explains, 2 words that make no "
+        "command, 130 and 143 ended by Ctrl-C and SIGTERM",
     )
     parser.add_argument(
         "--import",
-        action="append",
+        action=_ImportModule,
         default=[],
         dest="modules",
         metavar="MODULE",
@@ -45,23 +64,70 @@ def main(arguments: list[str] | None = None) -> int:
     verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb_name")
     for command in COMMANDS:
         command.add_to(verbs)
-    options = parser.parse_args(arguments)
-    try:
-        if options.modules:
-            from splatpilot.systems.registry import import_modules
+    return parser
 
-            import_modules(options.modules)
-        options.verb(options)
+
+def main(arguments: list[str] | None = None) -> int:
+    """
+    Runs `splatpilot VERB ...`.
+
+    Args:
+        arguments: the words after `splatpilot`; those of the process when None.
+
+    Returns:
+        The exit status: 0; 1 after an error that one message on standard error explains; 130 and
+        143 after Ctrl-C and SIGTERM.
+    """
+    parser = build_parser()
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    verb = "splatpilot"
+    try:
+        with _ended_by_sigterm():
+            options = parser.parse_args(arguments)
+            verb = options.verb_name
+            if not getattr(options, "json", False):
+                options.verb(options)
+                return 0
+            try:
+                with contextlib.redirect_stdout(sys.stderr):
+                    result = options.verb(options)
+            except FailureWithResultError as failure:
+                print(json.dumps(as_json(failure.result), indent=2))
+                raise
+            print(json.dumps(as_json(result), indent=2))
+            return 0
     except (ValueError, OSError) as error:
         print(f"splatpilot: {error}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
-        missing = missing_extra(error, options.verb_name)
+        missing = missing_extra(error, verb)
         if missing is None:
             raise
         print(f"splatpilot: {missing}", file=sys.stderr)
         return 1
+    except _TerminatedError:
+        print("splatpilot: terminated", file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print("splatpilot: interrupted", file=sys.stderr)
         return 130
-    return 0
+
+
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Within, SIGTERM ends what runs as Ctrl-C does; signals reach the main thread alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise _TerminatedError
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

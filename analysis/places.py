@@ -6,12 +6,10 @@ from pathlib import Path
 
 from splatpilot.analysis.tour import TourConfig, make_scene
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.environment import DATA
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
-
-DATA = "SPLATPILOT_DATA"
-"""Environment variable that names the folder of captures and meshes."""
 
 
 @dataclass

@@ -45,7 +45,7 @@ def run(
     render_capture.run(world=world, out=capture, config=config.render, seed=seed)
     make_scene(capture, scene, config.reconstruct)
     config.flight.world = SceneConfig(path=str(scene.absolute()))
-    return fly.run(scenario=config.flight, out=out / "flight")
+    return fly.run(scenario=config.flight, out=out / "flight", overwrite=True)
 
 
 def make_scene(capture: Path, scene: Path, config: ReconstructConfig) -> None:

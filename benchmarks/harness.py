@@ -1,4 +1,4 @@
-"""What the benchmarks of the renderer share: timing, memory, and the machine's description."""
+"""What benchmarks share: timing, memory, and the machine's description."""
 
 import os
 import platform
@@ -27,6 +27,11 @@ def milliseconds(call: Callable[[], object], repeats: int = REPEATS) -> tuple[fl
         call()
         durations.append(1e3 * (time.process_time() - start))
     return min(durations), float(np.median(durations))
+
+
+def seconds(call: Callable[[], object], repeats: int) -> float:
+    """Minimum CPU time of the process [s], after one call that does not count."""
+    return 1e-3 * milliseconds(call, repeats)[0]
 
 
 def machine() -> str:

@@ -8,12 +8,11 @@ processor time, the least of a few repeats.
 
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 
 import cv2
 import numpy as np
 import torch
+from harness import seconds
 
 from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
@@ -22,16 +21,6 @@ from splatpilot.training.policies.student import StudentTrainer
 from splatpilot.training.policies.student_config import StudentDepthTraining
 from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.train import step_optimizer
-
-
-def seconds(run: Callable[[], object], repeats: int) -> float:
-    """The least processor time of `repeats` runs [s]."""
-    times = []
-    for _ in range(repeats):
-        started = time.process_time()
-        run()
-        times.append(time.process_time() - started)
-    return min(times)
 
 
 def tick_time(observation: str, width: int, height: int) -> float:

@@ -5,11 +5,9 @@
 Times are processor time, the least of a few repeats.
 """
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 import torch
+from harness import seconds
 
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, decide
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
@@ -20,16 +18,6 @@ from splatpilot.training.policies.differentiable_rollout import DifferentiableRo
 from splatpilot.training.policies.evaluation import render_depth
 from splatpilot.training.policies.train import step_optimizer
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
-
-
-def seconds(run: Callable[[], object], repeats: int) -> float:
-    """The least processor time of `repeats` runs [s]."""
-    times = []
-    for _ in range(repeats):
-        started = time.process_time()
-        run()
-        times.append(time.process_time() - started)
-    return min(times)
 
 
 def main() -> None:
@@ -52,7 +40,6 @@ def main() -> None:
             episodes = rollout.episodes
             render_depth(episodes.vehicle, worlds.geometry, learner.rays, episodes.world)
 
-        learn()
         learning = seconds(learn, 4)
         with torch.no_grad():
             flying = seconds(rollout.losses, 4)

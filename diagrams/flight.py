@@ -12,14 +12,14 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.observation import images_of
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.flight_limits import LEVEL
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 _TOUCH = 0.03  # [m], of clearance, from which on the vehicle stands,
@@ -77,39 +77,6 @@ class Flight:
         )
 
 
-def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
-    """
-    The state (13,) a flight starts in: level, at rest, facing the goal.
-
-    The position is drawn from the scenario's seed, uniformly from the ball of `start_radius` about
-    the start.
-
-    Raises:
-        InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
-            surface than the vehicle's radius; or if the flight would start at its goal.
-    """
-    p_WG = goal_of(scenario, world)
-    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
-    _check_free(world, "start", p_WS)
-    _check_free(world, "goal", p_WG)
-    apart = float(np.linalg.norm(p_WG - p_WS))
-    if apart <= scenario.goal_radius:
-        raise InfeasibleFlightError(
-            f"{world.name} cannot be flown: start and goal are {apart:.2f} m apart, no farther "
-            f"than goal_radius, {scenario.goal_radius} m; name others with start and goal"
-        )
-
-    generator = np.random.default_rng(scenario.seed)
-    p_WB = None
-    # The start itself is free, and so is a neighbourhood of it: the search ends.
-    while p_WB is None or not _is_free(world, p_WB):
-        direction = generator.normal(size=3)
-        distance = scenario.start_radius * generator.uniform() ** (1 / 3)
-        p_WB = p_WS + distance * direction / np.linalg.norm(direction)
-    heading = p_WG - p_WB
-    return hover_state(p_WB, yaw=np.arctan2(heading[1], heading[0]))
-
-
 def fly(
     diagram: Diagram,
     scenario: Scenario,
@@ -125,12 +92,38 @@ def fly(
         progress: called with the simulated time [s] now and then.
         realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
     """
-    simulator = Simulator(diagram)
-    ApplySimulatorConfig(scenario.simulator, simulator)
+    simulator = flight_simulator(diagram, scenario, world, progress)
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
+    # Where a plant that the caller gave starts by default is its own affair.
     plant_context = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant_context.SetContinuousState(sample_initial_state(scenario, world))
+    simulator.Initialize()
+    started = time.perf_counter()
+    simulator.AdvanceTo(scenario.timeout)
+    wall_time = time.perf_counter() - started
+
+    p_WG = goal_of(scenario, world)
+    ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
+    return record_flight(diagram, root, world, ended, wall_time)
+
+
+def flight_simulator(
+    diagram: Diagram,
+    scenario: Scenario,
+    world: World,
+    progress: Callable[[float], object] | None = None,
+) -> Simulator:
+    """
+    A simulator of a diagram made by `BuildFlightDiagram`, as the scenario has it, that ends when
+    the flight does.
+
+    Args:
+        diagram, scenario, world: as built.
+        progress: called with the simulated time [s] now and then.
+    """
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scenario.simulator, simulator)
     p_WG = goal_of(scenario, world)
 
     def monitor(context: Context) -> EventStatus:
@@ -142,13 +135,7 @@ def fly(
         return EventStatus.ReachedTermination(diagram, outcome)
 
     simulator.set_monitor(monitor)
-    simulator.Initialize()
-    started = time.perf_counter()
-    simulator.AdvanceTo(scenario.timeout)
-    wall_time = time.perf_counter() - started
-
-    ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
-    return record_flight(diagram, root, world, ended, wall_time)
+    return simulator
 
 
 def decision_times(
@@ -247,26 +234,3 @@ def _recorded_plans(diagram: Diagram, root: Context) -> np.ndarray:
 
 def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:
     return np.asarray(diagram.GetOutputPort(port).Eval(context))
-
-
-def _is_free(world: World, p_WQ: np.ndarray) -> bool:
-    sample = world.field_at(0.0).query(p_WQ)
-    return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
-
-
-def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
-    """Raises InfeasibleFlightError unless the vehicle fits at p_WQ (3,) [m]."""
-    field = world.field_at(0.0)
-    sample = field.query(p_WQ)
-    where = f"{what} {np.round(p_WQ, 3).tolist()}"
-    if sample.state >= FieldState.UNKNOWN:
-        known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
-        raise InfeasibleFlightError(
-            f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
-            f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
-        )
-    if sample.distance <= VEHICLE_RADIUS:
-        raise InfeasibleFlightError(
-            f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
-            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more room"
-        )

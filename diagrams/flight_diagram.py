@@ -8,6 +8,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.meshcat import AddMeshcat
 from splatpilot.diagrams.observation import (
     AddObservation,
@@ -37,7 +38,9 @@ def BuildFlightDiagram(
     controller: System | None = None,
 ) -> Diagram:
     """
-    Builds the diagram of one flight.
+    Builds the diagram of one flight. Its default Context is the scenario's start, see
+    `sample_initial_state`, which is also what SetRandomContext makes of it: Drake lets no system
+    written in Python draw its state there. Random flights are those of `random_flights`.
 
     Systems, by name: `plant`, `pose`, `collision`, `goal`, `policy`, `controller`, and the loggers
     `state_log`, `command_log`; with a camera `camera`; with a policy that sees `policy_camera`,
@@ -64,7 +67,7 @@ def BuildFlightDiagram(
     output `p` of a sensor `s` is there as `s_p`.
 
     Args:
-        scenario: who flies, how, from where to where; see `sample_initial_state` for its start.
+        scenario: who flies, how, from where to where.
         world: what is flown in.
         meshcat: draws the flight there when given; see `open_meshcat`.
         video: records the camera's images at its rate, for `VideoRecorder.save` to write.
@@ -75,11 +78,13 @@ def BuildFlightDiagram(
             `state` (13), `goal` (3), `depth_image_32f`, `color_image` and `depth_grid` of a camera
             of its own (its attribute `camera`, an `OnboardCamera`), and the outputs of sensors.
         plant: flies instead of `QuadrotorPlant`: any system with the input `command` (4), the
-            output `state` (13), and that state as its continuous state.
+            output `state` (13), and that state as its continuous state; where it is in the default
+            Context is its own affair, but `fly` has it start at the scenario's start.
         controller: flies instead of `FlatnessController`: any system with the input `state`, that
             for the policy's output, and the output `command`.
 
     Raises:
+        InfeasibleFlightError: see `sample_initial_state`.
         ValueError: for a configuration that no policy or sensor has, a system without the ports it
             needs, and Meshcat or video without the camera.
     """
@@ -90,7 +95,10 @@ def BuildFlightDiagram(
         )
     builder = DiagramBuilder()
     sensors = sensors_of(scenario, policy)
-    plant = cast(System, plant or QuadrotorPlant(scenario.vehicle))
+    if plant is None:
+        plant = cast(
+            System, QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, world))
+        )
     builder.AddNamedSystem("plant", plant)
     require_ports("plant", plant, inputs=["command"], outputs=["state"])
     state = plant.GetOutputPort("state")

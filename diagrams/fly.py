@@ -1,7 +1,6 @@
 """`splatpilot fly`: one flight, with everything a person wants to see of it afterwards."""
 
 import contextlib
-import json
 import time
 from pathlib import Path
 from typing import cast
@@ -11,20 +10,21 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 from tqdm import tqdm
 
-from splatpilot.diagrams.flight import Flight, fly, sample_initial_state
+from splatpilot.diagrams.flight import Flight, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight_files import FLIGHT_FILES, write_flight, write_summary
 from splatpilot.diagrams.flight_page import (
     recorded_frames,
     replayed_flight,
     write_flight_page,
 )
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.meshcat import open_meshcat
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.configuration import dump_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
@@ -39,29 +39,33 @@ def run(
     live: bool = False,
     video: bool = True,
     graphviz: Path | None = None,
+    overwrite: bool = False,
 ) -> dict[str, float | str]:
     """
     Flies a scenario and leaves in `out`:
 
     - `flight.html`: a page to watch it in, see `replay_page`;
     - `flight.mp4`: what the onboard camera saw, colour beside depth;
-    - `trajectory.npz`: the arrays of `Flight`;
-    - `summary.json`: the summary this function returns;
-    - `scenario.yaml`: the scenario with every field, which gives the same flight again.
+    - what `write_flight` and `write_summary` write, the former before any picture is made.
 
     Args:
         live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
             `live.html` in `out` shows it with the world's Gaussians.
         video: whether to write `flight.mp4`.
         graphviz: where to write the diagram as Graphviz source.
+        overwrite: what is there. An earlier flight stays whole until this one has been flown.
 
     Returns:
         `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
 
     Raises:
         ValueError: for a scenario that cannot be flown.
-        OSError: if `out` cannot be written; nothing is flown then.
+        OSError: if `out` holds anything and is not to be overwritten, or cannot be written; nothing
+            is flown then.
     """
+    for path in (out, graphviz):
+        if path is not None:
+            require_unused(path, overwrite)
     scenario.validate()
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
@@ -83,20 +87,18 @@ def run(
         with written_atomically(graphviz) as path:
             path.write_text(diagram.GetGraphvizString())
     flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
+    for name in ("flight.html", "flight.mp4", *FLIGHT_FILES):
+        (out / name).unlink(missing_ok=True)
+    write_flight(out, scenario, flight)
     camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
     summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
-    with written_atomically(out / "trajectory.npz") as path:
-        flight.save(path)
-    with written_atomically(out / "scenario.yaml") as path:
-        path.write_text(dump_config(scenario))
-    with written_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+    write_summary(out, summary)
     recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
     frames = recorded_frames(recorder, scenario)
     name = f"{world.name}, seed {scenario.seed}"
     shown = replayed_flight(name, flight, frames)
     write_flight_page(out / "flight.html", scenario, world, [shown])
-    written = ["flight.html", "trajectory.npz", "summary.json", "scenario.yaml"]
+    written = ["flight.html", *FLIGHT_FILES]
     if video:
         recorder.save(out / "flight.mp4", scenario.camera.z_far)
         written.insert(1, "flight.mp4")

@@ -1,7 +1,8 @@
 """All policies: their configurations, their names, and how each becomes a system."""
 
+import operator
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol
 
 from pydrake.systems.framework import System
@@ -20,7 +21,6 @@ from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.reactive_planner import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
 from splatpilot.systems.policies.student import Student, StudentDepthConfig, StudentRgbConfig
-from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
 from splatpilot.systems.registry import Registry
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
@@ -55,8 +55,9 @@ class PolicyKind:
     build: Callable[[Any, World, QuadrotorParams], System]
     """From a configuration, the world (for privileged policies) and what is known of the vehicle
     to a system with the ports that `BuildFlightDiagram` connects."""
-    at_speed: Callable[[float], Any]
-    """The configuration for a nominal speed [m/s]."""
+    speed_field: str
+    """Where in the configuration the nominal speed [m/s] stands, as `speed` or `lattice.speed`;
+    empty if nobody can ask it for one."""
 
 
 POLICIES = Registry("policy", "splatpilot.policies", PolicyKind)
@@ -68,7 +69,7 @@ def register_policy(
     build: Callable[[Any, World, QuadrotorParams], System],
     *,
     name: str = "",
-    at_speed: Callable[[float], Any] | None = None,
+    speed_field: str = "speed",
 ) -> None:
     """
     Makes a policy known, so that scenarios, studies and the command line can name it.
@@ -77,12 +78,15 @@ def register_policy(
         config: the type of its configurations, see `PolicyConfig`; its name is their YAML tag.
         build: see `PolicyKind.build`.
         name: of the policy; that of the type without "Config", in small letters, if empty.
-        at_speed: makes the configuration for a nominal speed [m/s]; `config(speed=speed)` if None.
+        speed_field: see `PolicyKind.speed_field`; a configuration that has no `speed` cannot be
+            asked for one.
 
     Raises:
         ValueError: if another policy has the name.
     """
-    kind = PolicyKind(config, build, at_speed or (lambda speed: config(speed=speed)))
+    if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
+        speed_field = ""
+    kind = PolicyKind(config, build, speed_field)
     POLICIES.add(name or config.__name__.removesuffix("Config").lower(), kind)
 
 
@@ -92,7 +96,7 @@ register_policy(
         world.esdf, config, vehicle, world.moving.balls if world.moving else None
     ),
     name="planner",
-    at_speed=lambda speed: PrivilegedPlannerConfig(lattice=LatticeConfig(speed=speed)),
+    speed_field="lattice.speed",
 )
 register_policy(StraightConfig, lambda config, world, vehicle: Straight(config))
 register_policy(ReactiveConfig, lambda config, world, vehicle: Reactive(config))
@@ -103,6 +107,9 @@ register_policy(
     lambda config, world, vehicle: AgileAutonomy(config),
     name="agile_autonomy",
 )
+
+DEFAULT_SPEED = 2.0
+"""[m/s], nominal, where nobody says another."""
 
 BENCHMARK_POLICIES = tuple(POLICIES.registered())
 """Those that a study flies when nobody says which: our own, whatever else is installed, but for
@@ -115,15 +122,10 @@ register_policy(
 
 # Of these no weights ship.
 for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
-    register_policy(
-        _config,
-        lambda config, world, vehicle: Student(config),
-        name=_name,
-        at_speed=lambda speed, config=_config: config(),
-    )
+    register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
 
 
-def policy_named(name: str, speed: float = 2.0) -> Any:
+def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
     """
     The configuration of a policy for a nominal speed.
 
@@ -139,8 +141,48 @@ def policy_named(name: str, speed: float = 2.0) -> Any:
     """
     weights = name if name.endswith(".npz") else ""
     kind = POLICIES.find(policy_of(weights) if weights else name)
-    config = kind.at_speed(speed)
+    config = kind.config()
+    if kind.speed_field:
+        config = at_speed(config, speed)
     if weights:
         config = replace(config, weights=weights)
     config.validate()
     return config
+
+
+def at_speed(config: Any, speed: float) -> Any:
+    """
+    The configuration of a policy, for another nominal speed [m/s].
+
+    Raises:
+        ValueError: for a policy that cannot be asked for one.
+    """
+    field = POLICIES.kind_of(config).speed_field
+    if not field:
+        raise ValueError(
+            f"the policy {name_of(config)} flies as fast as it has learned and cannot be asked for "
+            f"{speed:g} m/s; leave the speed out"
+        )
+    return _with_field(config, field, speed)
+
+
+def speed_of(config: Any) -> float | None:
+    """The nominal speed [m/s] of a policy; None of one that cannot be asked for one."""
+    field = POLICIES.kind_of(config).speed_field
+    return operator.attrgetter(field)(config) if field else None
+
+
+def name_of(config: Any) -> str:
+    """The name of the policy that a configuration is of.
+
+    Raises:
+        ValueError: if it is of none.
+    """
+    return POLICIES.name_of(POLICIES.kind_of(config))
+
+
+def _with_field(config: Any, field: str, value: float) -> Any:
+    name, _, rest = field.partition(".")
+    return replace(
+        config, **{name: _with_field(getattr(config, name), rest, value) if rest else value}
+    )

@@ -1,7 +1,6 @@
 """`splatpilot vehicle`: a simulated vehicle that is flown by messages."""
 
 import dataclasses
-import json
 import math
 import time
 from pathlib import Path
@@ -15,25 +14,24 @@ from splatpilot.diagrams.flight import (
     flight_outcome,
     has_landed,
     record_flight,
-    sample_initial_state,
 )
+from splatpilot.diagrams.flight_files import write_flight, write_summary
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.real_time import run_in_real_time
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import dump_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.messaging.open_lcm import open_lcm
 
 
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
     """
     Hovers at the scenario's start until commands come, flies by them until the flight ends, hovers
-    and then lands where they cease, and
-    leaves in `out` what `splatpilot fly` does, but for page and video: `trajectory.npz`,
-    `summary.json`, `scenario.yaml`. Time is counted from the first command.
+    and then lands where they cease, and leaves in `out` what `write_flight` and `write_summary`
+    write. Time is counted from the first command.
 
     Args:
         scenario: the vehicle, its world, its start, and what its policy sees.
@@ -86,13 +84,9 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     diagram.ForcedPublish(root)  # Who flies is to know the last state too.
     outcome = how_it_ended() or Outcome.TIMEOUT
     flight = _since(took_off, record_flight(diagram, root, world, outcome, wall_time))
+    write_flight(out, scenario, flight)
     summary = flight.summary() | {"overruns": overruns}
-    with written_atomically(out / "trajectory.npz") as path:
-        flight.save(path)
-    with written_atomically(out / "scenario.yaml") as path:
-        path.write_text(dump_config(scenario))
-    with written_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+    write_summary(out, summary)
     print(*(f"{name:<18} {value}" for name, value in summary.items()), sep="\n")
     return summary
 

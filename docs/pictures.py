@@ -14,8 +14,8 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.diagrams.flight import sample_initial_state
 from splatpilot.diagrams.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.make_world import is_procedural, make_world

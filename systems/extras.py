@@ -27,10 +27,19 @@ def missing_extra(error: ModuleNotFoundError, needed_by: str) -> str | None:
         A sentence with the extra that brings the missing package, as `pyproject.toml` has it; None
         if no extra does.
     """
+    for extra, packages in packages_of_extras().items():
+        if error.name in packages:
+            return f"{needed_by} needs {error.name}; pip install 'splatpilot[{extra}]'"
+    return None
+
+
+def packages_of_extras() -> dict[str, list[str]]:
+    """The packages that each extra for users brings, as `pyproject.toml` has them."""
     from importlib.metadata import requires  # Slow to load, and seldom needed.
 
+    packages: dict[str, list[str]] = {}
     for requirement in requires("splatpilot") or []:
         match = re.fullmatch(r"([\w.-]+).*extra == ['\"](\w+)['\"].*", requirement)
-        if match is not None and match[1] == error.name:
-            return f"{needed_by} needs {error.name}; pip install 'splatpilot[{match[2]}]'"
-    return None
+        if match is not None and match[1] != "splatpilot" and match[2] != "dev":
+            packages.setdefault(match[2], []).append(match[1])
+    return packages

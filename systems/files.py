@@ -24,6 +24,28 @@ def written_atomically(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def require_existing(path: Path, what: str) -> None:
+    """
+    Raises:
+        FileNotFoundError: if nothing is there; the message says that `what` is needed.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file or folder; {what} is needed")
+
+
+def require_unused(path: Path, overwrite: bool) -> None:
+    """
+    Raises:
+        FileExistsError: if there is a file, or a folder that holds anything, and that is not to be
+            overwritten.
+    """
+    used = any(path.iterdir()) if path.is_dir() else path.exists()
+    if used and not overwrite:
+        raise FileExistsError(
+            f"{path} is there already; name another --out, or replace it with --overwrite"
+        )
+
+
 def require_writable_folder(path: Path) -> None:
     """
     Makes the folder `path` if need be.

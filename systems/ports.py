@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from pydrake.systems.framework import InputPort, OutputPort, System
+import numpy as np
+from pydrake.systems.framework import Context, InputPort, OutputPort, System
 
 
 def input_port(name: str) -> Callable[[System], InputPort]:
@@ -23,3 +24,9 @@ def output_port(name: str) -> Callable[[System], OutputPort]:
 
     port.__doc__ = f"The output port `{name}`."
     return port
+
+
+def optional_input(system: System, name: str, context: Context) -> np.ndarray | None:
+    """The vector at the input port of that name; None where nothing is connected."""
+    port = system.GetInputPort(name)
+    return np.asarray(port.Eval(context)) if port.HasValue(context) else None

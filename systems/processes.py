@@ -1,14 +1,21 @@
 """Work in processes, each on a core of its own."""
 
+import functools
+import os
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
+
+_WATCH_PERIOD = 0.5  # [s]
 
 
 def map_processes[Work, Result](
     function: Callable[[Work], Result], work: Iterable[Work], jobs: int
 ) -> Iterator[Result]:
     """
-    Yields `function` of each piece of work as it ends, in any order.
+    Yields `function` of each piece of work as it ends, in any order. The processes end with this
+    one, even where it is killed.
 
     Args:
         function: of the module's level, as processes receive it by name.
@@ -23,6 +30,8 @@ def map_processes[Work, Result](
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
+    if jobs > 1:
+        function = functools.partial(_attended, os.getpid(), function)
     try:
         yield from parallel(map(delayed(function), work))
     except TerminatedWorkerError:
@@ -33,3 +42,20 @@ def map_processes[Work, Result](
     finally:
         if jobs > 1:
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
+
+
+def _attended[Work, Result](parent: int, function: Callable[[Work], Result], work: Work) -> Result:
+    _end_with(parent)
+    return function(work)
+
+
+@functools.cache
+def _end_with(parent: int) -> None:
+    """Ends this process soon after its parent, the process `parent`, has ended."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_PERIOD)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -9,6 +9,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 _OURS = "splatpilot."
+_ATTRIBUTE = re.compile(r"[\w.]+:[\w.]+")
 
 
 class Registry[Kind]:
@@ -76,13 +77,10 @@ class Registry[Kind]:
         for point in self._announced():
             if point.name == name:
                 return self._load(point)
-        if re.fullmatch(r"[\w.]+:[\w.]+", name):
+        if _ATTRIBUTE.fullmatch(name):
             _look_here_too()
             return self._load(EntryPoint(name=name, value=name, group=self.group))
-        raise ValueError(
-            f"there is no {self.what} {name!r}; there are {', '.join(self.names())}, and "
-            "module:attribute of your own"
-        )
+        raise ValueError(_unknown(self.what, name, self.names()))
 
     def kind_of(self, config: Any) -> Kind:
         """
@@ -100,6 +98,10 @@ class Registry[Kind]:
             f"no {self.what} has the configuration {type(config).__name__}; known are {known}, and "
             f"what register_{self.what} is told"
         )
+
+    def name_of(self, kind: Kind) -> str:
+        """The first name that a kind is registered under."""
+        return next(name for name, known in self._kinds.items() if known == kind)
 
     def configs(self, tags: set[str]) -> list[type]:
         """
@@ -147,6 +149,29 @@ class Registry[Kind]:
             f"{point.value} is no {self.what}; it must be a {self._kind.__name__}, or the type of "
             f"the configurations of one that its module registers"
         )
+
+
+def check_name(what: str, group: str, name: str, ours: Sequence[str]) -> None:
+    """
+    Checks a name before the registry that has it is imported, which may take seconds.
+
+    Args:
+        what, group: of the registry.
+        ours: the names that our own code registers there.
+
+    Raises:
+        ValueError: if no kind will have the name; the message lists what there is.
+    """
+    announced = [point.name for point in entry_points(group=group)]
+    if name not in (*ours, *announced) and not _ATTRIBUTE.fullmatch(name):
+        raise ValueError(_unknown(what, name, [*ours, *announced]))
+
+
+def _unknown(what: str, name: str, known: Sequence[str]) -> str:
+    return (
+        f"there is no {what} {name!r}; there are {', '.join(dict.fromkeys(known))}, and "
+        "module:attribute of your own"
+    )
 
 
 def import_modules(names: Sequence[str]) -> None:

@@ -79,6 +79,8 @@ def parse(monkeypatch):
         raise ParsedError
 
     monkeypatch.setattr(ArgumentParser, "parse_args", parse_only)
+    # Modules that pages name for the reader to write are not there.
+    monkeypatch.setattr("splatpilot.systems.registry.import_modules", lambda names: None)
 
     def parse(words: list[str]) -> Namespace:
         with pytest.raises(ParsedError):

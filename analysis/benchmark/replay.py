@@ -18,7 +18,7 @@ from splatpilot.diagrams.flight_page import (
     write_flight_page,
 )
 from splatpilot.diagrams.fly import fly_with_bar
-from splatpilot.systems.files import require_writable_folder
+from splatpilot.systems.files import require_unused, require_writable_folder
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.visualization.replay_page import ReplayedFlight
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
@@ -36,7 +36,13 @@ class Agreement(NamedTuple):
 
 
 def run(
-    *, study: Path, id: str, out: Path | None = None, meshcat: bool = False, video: bool = False
+    *,
+    study: Path,
+    id: str,
+    out: Path | None = None,
+    meshcat: bool = False,
+    video: bool = False,
+    overwrite: bool = False,
 ) -> Agreement:
     """
     Flies one flight of a study again, from the study's folder alone, and compares it with its
@@ -48,8 +54,10 @@ def run(
         out: folder for what is filmed; `replays/ID` in the study by default.
         meshcat: writes `flight.html`, a page to watch it in.
         video: writes `flight.mp4`, what the onboard camera saw.
+        overwrite: what an earlier replay has left in `out`.
 
     Raises:
+        FileExistsError: if that is there and not to be overwritten.
         FileNotFoundError: if there is no study, or the flight is not there yet.
         ValueError: if the study has no such flight, or its file is damaged.
     """
@@ -63,6 +71,7 @@ def run(
     out = out or study / "replays" / id
     filmed = meshcat or video
     if filmed:
+        require_unused(out, overwrite)
         require_writable_folder(out)
     diagram = BuildFlightDiagram(scenario, world, video=filmed, camera=filmed)
     flight = fly_with_bar(diagram, scenario, world)
@@ -91,7 +100,9 @@ def run(
     return result
 
 
-def overlay(*, study: Path, ids: Sequence[str], out: Path | None = None) -> Path:
+def overlay(
+    *, study: Path, ids: Sequence[str], out: Path | None = None, overwrite: bool = False
+) -> Path:
     """
     Writes a page that shows several recorded flights through one world at once, told apart by
     colour. Nothing is flown again, so it has neither plans nor what cameras saw.
@@ -100,11 +111,13 @@ def overlay(*, study: Path, ids: Sequence[str], out: Path | None = None) -> Path
         study: the folder.
         ids: of the flights, as in `rollouts.csv`.
         out: folder for `flights.html`; `replays/FIRST-ID` in the study by default.
+        overwrite: that page, if it is there.
 
     Returns:
         The page.
 
     Raises:
+        FileExistsError: if the page is there and not to be overwritten.
         FileNotFoundError: if there is no study, or a flight is not there yet.
         ValueError: if the study has no such flight, its file is damaged, or two flights are of
             different scenarios or seeds.
@@ -130,8 +143,9 @@ def overlay(*, study: Path, ids: Sequence[str], out: Path | None = None) -> Path
         flights.append(ReplayedFlight(spec.id, row["outcome"], times, states, clearances, no_plans))
     _, scenario = next(kept_flights(folder, [first]))
     out = out or study / "replays" / first.id
-    require_writable_folder(out)
     page = out / "flights.html"
+    require_unused(page, overwrite)
+    require_writable_folder(out)
     write_flight_page(page, scenario, study_world(scenario), flights)
     print(f"Wrote {page}")
     return page

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES, speed_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.systems.configuration import load_config
@@ -27,7 +27,13 @@ class RolloutSpec(NamedTuple):
     @property
     def id(self) -> str:
         """Its name: unique in a study, and good as the name of a file."""
-        return f"{self.scenario}-{self.policy}-{self.speed:g}-{self.seed:03d}"
+        return flight_name(self.scenario, self.policy, self.speed, self.seed)
+
+
+def flight_name(scenario: str, policy: str, speed: float | None, seed: int) -> str:
+    """What a flight is called; `speed` [m/s] is None where the policy flies at its own."""
+    parts = [scenario, policy, *([] if speed is None else [f"{speed:g}"]), f"{seed:03d}"]
+    return "-".join(parts)
 
 
 @dataclass
@@ -128,7 +134,7 @@ class StudyConfig:
             return
         if not has_own_policy(file):
             raise ValueError(f"{file} has no `policy`, which --policies {SCENARIO} would fly")
-        speed = getattr(policy, "speed", getattr(getattr(policy, "lattice", None), "speed", None))
+        speed = speed_of(policy)
         if speed is not None and self.speeds != [speed]:
             raise ValueError(
                 f"the policy of {file} flies at {speed:g} m/s, its own speed; give --speeds "

@@ -7,9 +7,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.systems.configuration import load_config
-
 SCENARIO = "scenario"
 """The policy that is the scenario's own: what stands in its `policy` block."""
 
@@ -45,6 +42,10 @@ class Variant(NamedTuple):
             FileNotFoundError, ValueError: see `policy_named`; or for unknown fields and values out
                 of range.
         """
+        # Here, because the command line reads policies before anything slow is imported.
+        from splatpilot.diagrams.policies import policy_named
+        from splatpilot.systems.configuration import load_config
+
         config = own if self.policy == SCENARIO else policy_named(self.policy, speed)
         if not self.overrides:
             return config
@@ -73,7 +74,7 @@ def parse_variant(text: str) -> Variant:
     for override in overrides:
         field = override.partition("=")[0].rpartition(".")[2]
         remedy = {
-            "speed": "all policies fly at those of --speeds",
+            "speed": "--speeds, and of `fly` --speed, say how fast all policies fly",
             "weights": "give the file of weights as the policy, LABEL=FILE.npz",
         }.get(field)
         if remedy:

@@ -11,6 +11,7 @@ from splatpilot.analysis.commands import (
     capture,
     corpus,
     difficulty,
+    doctor,
     faults,
     fidelity,
     fly,
@@ -47,4 +48,5 @@ COMMANDS = (
     corpus,
     train,
     recover,
+    doctor,
 )

@@ -3,8 +3,12 @@
 import argparse
 import logging
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.benchmark.variants import parse_variant, split_policies, sweep
+from splatpilot.analysis.commands.checks import check_policy, check_scenario
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import FailureWithResultError, add_json, add_verb
 
 QUICK_SCENARIOS = "P02", "P06", "P08"
 QUICK_POLICIES = "planner", "straight", "reactive"
@@ -12,13 +16,20 @@ QUICK_SEEDS = 5
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    benchmark = verbs.add_parser(
+    benchmark = add_verb(
+        verbs,
         "benchmark",
+        _benchmark,
         help="fly policies through scenarios, many times, and report",
         description="Flies scenarios x policies x speeds x seeds, and leaves rollouts.csv, "
-        "table.csv and report.html. Run again, it flies what is missing.",
+        "table.csv and report.html. Run again, it flies what is missing. Ends with status 1 if no "
+        "flight could be flown.",
+        examples=(
+            "benchmark --out out/quick --quick",
+            "benchmark --out out/study --scenarios P02,P03 --policies planner,reactive:margin=0.2",
+            "benchmark --out out/mine --policies mine=out/forests/diffaero.npz --speeds 2,3 --json",
+        ),
     )
-    benchmark.set_defaults(verb=_benchmark)
     benchmark.add_argument("--out", type=Path, required=True, help="folder of the study")
     benchmark.add_argument(
         "--quick",
@@ -60,19 +71,35 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         metavar="I/N",
         help="fly the I-th of N parts, in a folder of its own; `splatpilot merge` joins them",
     )
-    add_overrides(benchmark, "observation.depth_multiplicative=0.03")
+    add_overrides(
+        benchmark, ("observation.depth_multiplicative=0.03", "timeout=90"), _scenario_defaults
+    )
+    add_json(benchmark, "the rows of table.csv")
 
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _benchmark(options: argparse.Namespace) -> None:
+def _scenario_defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.diagrams.scenario import Scenario
+
+    return Scenario()
+
+
+def _benchmark(options: argparse.Namespace) -> Any:
+    for scenario in options.scenarios or ():
+        check_scenario(scenario)
+    named = None
+    if options.policies is not None or options.sweep:
+        swept = [variant for text in options.sweep for variant in sweep(text)]
+        named = [*split_policies(options.policies or ""), *swept]
+        for policy in named:
+            check_policy(parse_variant(policy))
     from splatpilot.analysis.benchmark import run as benchmark
     from splatpilot.analysis.benchmark.external import DODGEDRONE, DODGEDRONE_SPEEDS
     from splatpilot.analysis.benchmark.shard import Shard
     from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
-    from splatpilot.analysis.benchmark.variants import split_policies, sweep
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     config = StudyConfig(overrides=options.overrides)
@@ -85,20 +112,32 @@ def _benchmark(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None:
             setattr(config, name, value)
-    if options.policies is not None or options.sweep:
-        swept = [variant for text in options.sweep for variant in sweep(text)]
-        config.policies = [*split_policies(options.policies or ""), *swept]
+    if named is not None:
+        config.policies = named
     elif not options.quick:
         config.policies = default_policies(config.scenarios)
     if options.speeds is not None:
         config.speeds = [_speed(text) for text in options.speeds]
-    benchmark.run(
+    table = benchmark.run(
         config=config,
         out=options.out,
         jobs=options.jobs,
         cluster=options.cluster,
         shard=None if options.shard is None else Shard.parse(options.shard),
     )
+    require_flown(table)
+    return table
+
+
+def require_flown(table: list[dict[str, Any]]) -> None:
+    """
+    Raises:
+        FailureWithResultError: if a study has flights, and none of them could be flown.
+    """
+    if table and all(row["infeasible"] == row["flights"] for row in table):
+        raise FailureWithResultError(
+            "none of the flights could be flown; rollouts.csv has the reasons", table
+        )
 
 
 def _speed(text: str) -> float:

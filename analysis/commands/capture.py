@@ -2,45 +2,80 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.commands.checks import check_world
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import FailureWithResultError, add_json, add_verb
+from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    capture = verbs.add_parser("capture", help="render a capture, or check one")
+    capture = add_verb(
+        verbs,
+        "capture",
+        None,
+        help="render a capture, or check one",
+        description="Work on captures before they become scenes.",
+        examples=(
+            "capture check data/hospital",
+            "capture render warehouse.gltf --up z --out out/capture",
+        ),
+    )
     actions = capture.add_subparsers(required=True, metavar="ACTION")
     _add_check(actions)
     _add_render(actions)
 
 
 def _add_check(actions: argparse._SubParsersAction) -> None:
-    check = actions.add_parser(
+    check = add_verb(
+        actions,
         "check",
+        _check,
         help="tell whether poses, intrinsics and depth of a capture agree",
         description="Carries depth from frame to frame and compares. Where it does not agree, "
         "tries the usual mistakes, names the most likely one, and ends with status 1.",
+        examples=(
+            "capture check data/hospital",
+            "capture check data/office --set capture.depth_unit=5000 --json",
+        ),
     )
-    check.set_defaults(verb=_check)
     check.add_argument("capture", type=Path, help="folder of a capture")
-    add_overrides(check, "capture.depth_unit=5000")
+    add_overrides(check, ("pairs=30", "capture.depth_unit=5000"), _check_defaults)
+    add_json(check, "what was found")
 
 
-def _check(options: argparse.Namespace) -> None:
+def _check_defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.training.captures.check import CheckConfig
+
+    return CheckConfig()
+
+
+def _check(options: argparse.Namespace) -> Any:
+    require_existing(options.capture, "the folder of a capture")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import check
 
-    config = load_config(check.CheckConfig(), overrides=options.overrides)
-    check.run(capture=options.capture, config=config)
+    config = load_config(_check_defaults(options), overrides=options.overrides)
+    report = check.run(capture=options.capture, config=config)
+    if not report.agrees:
+        raise FailureWithResultError(f"{options.capture}: {report.mistake}", report)
+    return report
 
 
 def _add_render(actions: argparse._SubParsersAction) -> None:
-    render = actions.add_parser(
+    render = add_verb(
+        actions,
         "render",
+        _render,
         help="render a capture of a mesh or a generated world, with exact depth",
         description="Writes a TartanAir V1 sequence. Without --path the camera visits all the "
         "free space between the heights.",
+        examples=(
+            "capture render warehouse.gltf --up z --out out/capture",
+            'capture render P09 --seed 3 --out out/alley --path "0,0,1.5 8,0,1.5 8,6,1.5"',
+        ),
     )
-    render.set_defaults(verb=_render)
     render.add_argument(
         "world", type=Path, help=".gltf or .obj, or a scenario of a generated world: P01 or a file"
     )
@@ -50,15 +85,21 @@ def _add_render(actions: argparse._SubParsersAction) -> None:
     )
     render.add_argument("--up", choices=("y", "z"), help="axis of the mesh file that points up")
     render.add_argument("--seed", type=int, default=0, help="seed of a generated world")
-    add_overrides(render, "offsets=[-0.5,0.5]")
+    add_overrides(render, ("spacing=0.8", "highest=2.0", "offsets=[-0.5,0.5]"), _render_defaults)
+
+
+def _render_defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.training.captures.render_config import RenderConfig
+
+    return RenderConfig()
 
 
 def _render(options: argparse.Namespace) -> None:
+    check_world(options.world)
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import render_capture
-    from splatpilot.training.captures.render_config import RenderConfig
 
-    config = RenderConfig()
+    config = _render_defaults(options)
     if options.up is not None:
         config.up = options.up
     if options.path is not None:

@@ -2,19 +2,34 @@
 
 import argparse
 
+from splatpilot.analysis.commands.checks import SCENARIOS, check_scenario
+from splatpilot.analysis.commands.verb import add_named, add_verb
+
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    difficulty = verbs.add_parser(
-        "difficulty", help="print how hard scenarios are, and whether all seeds are feasible"
+    difficulty = add_verb(
+        verbs,
+        "difficulty",
+        _difficulty,
+        help="print how hard scenarios are, and whether all seeds are feasible",
+        description="Measures worlds before anyone flies: how far obstacles force a flight off the "
+        "straight line, how narrow and how cluttered its way is.",
+        examples=("difficulty", "difficulty P06 P07 --seeds 10"),
     )
-    difficulty.set_defaults(verb=_difficulty)
-    difficulty.add_argument(
-        "scenarios", nargs="*", metavar="SCENARIO", help="P01 to R17 or YAML files (default: all)"
+    add_named(
+        difficulty,
+        "scenarios",
+        names=SCENARIOS,
+        nargs="*",
+        metavar="SCENARIO",
+        help="P01 to R17 or YAML files (default: all)",
     )
     difficulty.add_argument("--seeds", type=int, default=5, help="seeds of each (%(default)s)")
 
 
 def _difficulty(options: argparse.Namespace) -> None:
+    for scenario in options.scenarios:
+        check_scenario(scenario)
     from splatpilot.analysis import difficulty
 
     difficulty.run(scenarios=options.scenarios, seeds=options.seeds)

@@ -3,25 +3,43 @@
 import argparse
 import logging
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.commands.checks import check_config
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    faults = verbs.add_parser("faults", help="fly while messages, clocks and policies fail")
-    faults.set_defaults(verb=_faults)
+    faults = add_verb(
+        verbs,
+        "faults",
+        _faults,
+        help="fly while messages, clocks and policies fail",
+        description="Flies hundreds of short flights through the bridge while messages are lost, "
+        "late or false, clocks jump or policies fail, and counts which ended safely. Interrupted, "
+        "the same command goes on.",
+        examples=("faults --set trials=30", "faults --out out/faults_1 --set seed=1"),
+    )
     faults.add_argument(
         "--out", type=Path, default=Path("out/faults"), help="output folder (%(default)s)"
     )
     faults.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
-    add_overrides(faults, "trials=30")
+    add_overrides(faults, ("trials=30", "seed=1", "scenario.timeout=20"), _defaults)
+
+
+def _defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.analysis.faults.run import FaultsConfig
+
+    return FaultsConfig()
 
 
 def _faults(options: argparse.Namespace) -> None:
-    from splatpilot.analysis.faults.run import FaultsConfig, run
+    check_config(options.config)
+    from splatpilot.analysis.faults.run import run
     from splatpilot.systems.configuration import load_config
 
-    config = load_config(FaultsConfig(), options.config, options.overrides)
+    config = load_config(_defaults(options), options.config, options.overrides)
     # Thousands of packets are refused on purpose.
     loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
     levels = [logger.level for logger in loggers]

@@ -2,26 +2,45 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    fidelity = verbs.add_parser(
-        "fidelity", help="measure how far from its capture's path a scene can be trusted"
+    fidelity = add_verb(
+        verbs,
+        "fidelity",
+        _fidelity,
+        help="measure how far from its capture's path a scene can be trusted",
+        description="Renders scenes from beside their captures' paths, compares with the truth "
+        "where there is one and with other frames elsewhere, and writes how far a camera may "
+        "leave the path into each scene.yaml.",
+        examples=(
+            "fidelity scenes/hospital",
+            "fidelity scenes/hospital scenes/warehouse --out out/fidelity",
+        ),
     )
-    fidelity.set_defaults(verb=_fidelity)
     fidelity.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="scene folder")
     fidelity.add_argument(
         "--out", type=Path, default=Path("out/fidelity"), help="output folder (%(default)s)"
     )
-    add_overrides(fidelity, "max_depth_error=0.03")
+    add_overrides(fidelity, ("max_depth_error=0.03",), _defaults)
+
+
+def _defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.analysis.fidelity.config import FidelityConfig
+
+    return FidelityConfig()
 
 
 def _fidelity(options: argparse.Namespace) -> None:
+    for scene in options.scenes:
+        require_existing(scene, "a scene folder")
     from splatpilot.analysis.fidelity import run as fidelity
-    from splatpilot.analysis.fidelity.config import FidelityConfig
     from splatpilot.systems.configuration import load_config
 
-    config = load_config(FidelityConfig(), overrides=options.overrides)
+    config = load_config(_defaults(options), overrides=options.overrides)
     fidelity.run(options.scenes, options.out, config)

@@ -3,30 +3,58 @@
 import argparse
 import logging
 from pathlib import Path
+from typing import Any
 
-from splatpilot.analysis.commands.scenario_options import add_scenario, read_scenario
+from splatpilot.analysis.commands.scenario_options import (
+    add_scenario,
+    name_of_flight,
+    read_scenario,
+)
+from splatpilot.analysis.commands.verb import add_json, add_overwrite, add_verb
+from splatpilot.systems.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    fly = verbs.add_parser("fly", help="fly to a goal and leave a page, a video and a trajectory")
-    fly.set_defaults(verb=_fly)
+    fly = add_verb(
+        verbs,
+        "fly",
+        _fly,
+        help="fly to a goal and leave a page, a video and a trajectory",
+        description="Flies one scenario, or the default forest, and leaves a page to watch it in, "
+        "the onboard video, the trajectory, its summary, and the scenario with every field.",
+        examples=(
+            "fly --seed 7",
+            "fly --scenario P02 --policy diffaero --speed 3",
+            "fly --scene scenes/hospital --policy reactive:margin=0.2 --no-video --json",
+        ),
+    )
     add_scenario(fly)
     fly.add_argument(
-        "--out", type=Path, default=Path("out/fly"), help="output folder (%(default)s)"
+        "--out",
+        type=Path,
+        help="output folder (default: out/NAME, named by scenario, policy, speed and seed)",
     )
+    add_overwrite(fly)
     fly.add_argument("--live", action="store_true", help="serve Meshcat while flying, in real time")
     fly.add_argument("--no-video", action="store_true", help="leave flight.mp4 out")
     fly.add_argument("--graphviz", type=Path, metavar="FILE", help="write the diagram as Graphviz")
+    add_json(fly, "the summary")
 
 
-def _fly(options: argparse.Namespace) -> None:
+def _fly(options: argparse.Namespace) -> Any:
+    for path in (options.out, options.graphviz):
+        if path is not None:
+            require_unused(path, options.overwrite)
+    scenario = read_scenario(options)
+
     from splatpilot.diagrams import fly
 
     logging.getLogger("drake").setLevel(logging.WARNING)
-    fly.run(
-        scenario=read_scenario(options),
-        out=options.out,
+    return fly.run(
+        scenario=scenario,
+        out=options.out or Path("out") / name_of_flight(options, scenario),
         live=options.live,
         video=not options.no_video,
         graphviz=options.graphviz,
+        overwrite=options.overwrite,
     )

@@ -4,27 +4,62 @@ import argparse
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.commands.checks import check_config
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.scenario_options import add_scenario, read_scenario
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
+from splatpilot.systems.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    vehicle = verbs.add_parser("vehicle", help="simulate a vehicle that is flown by LCM messages")
-    vehicle.set_defaults(verb=_vehicle)
+    vehicle = add_verb(
+        verbs,
+        "vehicle",
+        _vehicle,
+        help="simulate a vehicle that is flown by LCM messages",
+        description="Hovers at the scenario's start until commands come, and flies by them, in "
+        "real time: what `splatpilot bridge` flies where there is no real vehicle.",
+        examples=(
+            "vehicle --scenario P02 --policy diffaero",
+            "vehicle --scenario P02 --policy diffaero --seed 3 --patience 60 --out out/vehicle_3",
+        ),
+    )
     vehicle.add_argument(
         "--out", type=Path, default=Path("out/vehicle"), help="output folder (%(default)s)"
     )
-    bridge = verbs.add_parser("bridge", help="fly a vehicle, real or simulated, by LCM messages")
-    bridge.set_defaults(verb=_bridge)
+    add_overwrite(vehicle)
+    bridge = add_verb(
+        verbs,
+        "bridge",
+        _bridge,
+        help="fly a vehicle, real or simulated, by LCM messages",
+        description="Runs policy, controller and failsafe against a vehicle that sends its state "
+        "and what it sees, and takes commands.",
+        examples=(
+            "bridge --scenario P02 --policy diffaero",
+            "bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
+        ),
+    )
     bridge.add_argument("--log", type=Path, help="write all messages to this file, as lcm-logger")
-    px4 = verbs.add_parser("px4", help="let the bridge fly a vehicle that PX4 flies, by MAVLink")
-    px4.set_defaults(verb=_px4)
+    px4 = add_verb(
+        verbs,
+        "px4",
+        _px4,
+        help="let the bridge fly a vehicle that PX4 flies, by MAVLink",
+        description="Stands where the simulated vehicle stands: sends PX4's estimate on to the "
+        "bridge, and the bridge's commands on to PX4. Arms nothing unless told to.",
+        examples=(
+            "px4 --set vehicle_host=192.168.8.1",
+            "px4 --config px4.yaml --engage",
+        ),
+    )
     px4.add_argument("--config", type=Path, metavar="FILE", help="YAML with fields of Px4Config")
     px4.add_argument("--lcm-url", metavar="URL", help="where the bridge is")
     px4.add_argument("--engage", action="store_true", help="ask for offboard mode")
     px4.add_argument("--arm", action="store_true", help="arm the motors, in offboard mode")
-    add_overrides(px4, "vehicle_host=192.168.8.1")
+    add_overrides(px4, ("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"), _px4_defaults)
     for parser in (vehicle, bridge):
         parser.add_argument(
             "--hardware", type=Path, metavar="FILE", help="YAML with fields of HardwareConfig"
@@ -37,24 +72,35 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _vehicle(options: argparse.Namespace) -> None:
+    require_unused(options.out, options.overwrite)
+    check_config(options.hardware)
+    scenario = read_scenario(options)
     from splatpilot.diagrams import vehicle
 
-    vehicle.run(scenario=read_scenario(options), config=_config(options), out=options.out)
+    vehicle.run(scenario=scenario, config=_config(options), out=options.out)
 
 
 def _bridge(options: argparse.Namespace) -> None:
+    check_config(options.hardware)
+    scenario = read_scenario(options)
     from splatpilot.diagrams import bridge
 
-    bridge.run(scenario=read_scenario(options), config=_config(options), log=options.log)
+    bridge.run(scenario=scenario, config=_config(options), log=options.log)
+
+
+def _px4_defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.diagrams.px4_config import Px4Config
+
+    return Px4Config()
 
 
 def _px4(options: argparse.Namespace) -> None:
+    check_config(options.config)
     from splatpilot.diagrams import px4
-    from splatpilot.diagrams.px4_config import Px4Config
     from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
-    config = load_config(Px4Config(), options.config, options.overrides)
+    config = load_config(_px4_defaults(options), options.config, options.overrides)
     if options.lcm_url is not None:
         config.url = options.lcm_url
     config.commander.engage |= options.engage

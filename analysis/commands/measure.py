@@ -3,16 +3,25 @@
 import argparse
 from pathlib import Path
 
+from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.systems.files import require_existing
+
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    measure = verbs.add_parser(
-        "measure", help="compare a scene with the frames of its capture that were held out"
+    measure = add_verb(
+        verbs,
+        "measure",
+        _measure,
+        help="compare a scene with the frames of its capture that were held out",
+        description="Writes metrics.json (PSNR, SSIM, LPIPS, depth errors, floaters) and views.png "
+        "into a scene folder.",
+        examples=("measure scenes/hospital", "measure out/warehouse/scene"),
     )
-    measure.set_defaults(verb=_measure)
     measure.add_argument("scene", type=Path, help="scene folder")
 
 
 def _measure(options: argparse.Namespace) -> None:
+    require_existing(options.scene, "a scene folder")
     from splatpilot.analysis.reconstruction import measure_scene
 
     measure_scene.run(options.scene)

@@ -2,17 +2,25 @@
 
 import argparse
 import logging
-import os
 from pathlib import Path
+from typing import Any
 
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.systems.environment import data_folder, scenes_folder
+from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    places = verbs.add_parser(
-        "places", help="make the scenes of the benchmark's photorealistic scenarios"
+    places = add_verb(
+        verbs,
+        "places",
+        _places,
+        help="make the scenes of the benchmark's photorealistic scenarios",
+        description="Renders what was not captured, reconstructs it, and leaves scene folders "
+        "where scenarios look for them. Interrupted, the same command goes on.",
+        examples=("places --data data", "places forest_splat --out scenes"),
     )
-    places.set_defaults(verb=_places)
     places.add_argument(
         "names", nargs="*", metavar="NAME", help="hospital, bookstore, ... (default: R13 to R17)"
     )
@@ -22,18 +30,25 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     places.add_argument(
         "--out", type=Path, help="folder of scenes (default: $SPLATPILOT_SCENES, or scenes)"
     )
-    add_overrides(places, "reconstruct.iterations=3000")
+    add_overrides(places, ("reconstruct.iterations=3000", "render.spacing=1"), _defaults)
+
+
+def _defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.analysis.places import PlaceConfig
+
+    return PlaceConfig()
 
 
 def _places(options: argparse.Namespace) -> None:
+    data = options.data or data_folder()
+    if data is not None:
+        require_existing(data, "the folder of captures and meshes")
     from splatpilot.analysis import places
-    from splatpilot.diagrams.worlds.scene import SCENES
 
     logging.getLogger("drake").setLevel(logging.WARNING)
-    data = options.data or (Path(os.environ[places.DATA]) if places.DATA in os.environ else None)
     places.run(
         names=options.names,
         data=data,
-        scenes=options.out or Path(os.environ.get(SCENES, "scenes")),
+        scenes=options.out or scenes_folder(),
         overrides=options.overrides,
     )

@@ -3,15 +3,26 @@
 import argparse
 from pathlib import Path
 
+from splatpilot.analysis.commands.checks import check_config
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.train import trainer_defaults
+from splatpilot.analysis.commands.verb import add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    recover = verbs.add_parser(
+    recover = add_verb(
+        verbs,
         "recover",
+        _recover,
         help="train a student, have it fly, and train it anew with what it should have done",
+        description="Trains a student on corpora, has it fly in their worlds, labels what came "
+        "before its near-misses and crashes, and trains it again. Interrupted, the same command "
+        "goes on.",
+        examples=(
+            "recover student_rgb --out out/rgb --set 'corpora=[out/corpus]'",
+            "recover student_depth --out out/depth --set 'corpora=[out/corpus]' --flights 3",
+        ),
     )
-    recover.set_defaults(verb=_recover)
     recover.add_argument("policy", choices=["student_rgb", "student_depth"])
     recover.add_argument(
         "--out",
@@ -24,17 +35,16 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     )
     recover.add_argument("--jobs", type=int, metavar="N", help="processes that fly; default: cores")
     recover.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
-    add_overrides(recover, "schedule.updates=2000")
+    add_overrides(recover, ("'corpora=[out/corpus]'", "schedule.updates=2000"), trainer_defaults)
 
 
 def _recover(options: argparse.Namespace) -> None:
+    check_config(options.config)
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies import recovery
-    from splatpilot.training.policies.registry import TRAINERS
 
-    defaults = TRAINERS.find(options.policy).config()
-    config = load_config(defaults, options.config, options.overrides)
+    config = load_config(trainer_defaults(options), options.config, options.overrides)
     jobs = available_cores() if options.jobs is None else options.jobs
     ledger = recovery.run(config=config, out=options.out, flights=options.flights, jobs=jobs)
     flown = ", ".join(f"{count} {outcome}" for outcome, count in ledger["flights"].items())

@@ -4,10 +4,23 @@ import argparse
 import logging
 from pathlib import Path
 
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
+from splatpilot.systems.files import require_existing
+
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    replay = verbs.add_parser("replay", help="fly one flight of a study again, and check it")
-    replay.set_defaults(verb=_replay)
+    replay = add_verb(
+        verbs,
+        "replay",
+        _replay,
+        help="fly one flight of a study again, and check it",
+        description="Flies one flight of a study again, from the study's folder alone, and "
+        "compares it with its record; of several flights it draws one page.",
+        examples=(
+            "replay out/study P08-reactive-2-003 --meshcat --video",
+            "replay out/study P08-planner-2-003 P08-reactive-2-003 --overwrite",
+        ),
+    )
     replay.add_argument("study", type=Path, help="folder that `splatpilot benchmark` has written")
     replay.add_argument(
         "ids",
@@ -18,14 +31,18 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     replay.add_argument("--meshcat", action="store_true", help="write flight.html, to watch it in")
     replay.add_argument("--video", action="store_true", help="write flight.mp4, the onboard view")
     replay.add_argument("--out", type=Path, help="folder for these (STUDY/replays/ID)")
+    add_overwrite(replay)
 
 
 def _replay(options: argparse.Namespace) -> None:
+    require_existing(options.study, "the folder of a study")
     from splatpilot.analysis.benchmark import replay
 
     logging.getLogger("drake").setLevel(logging.WARNING)
     if len(options.ids) > 1:
-        replay.overlay(study=options.study, ids=options.ids, out=options.out)
+        replay.overlay(
+            study=options.study, ids=options.ids, out=options.out, overwrite=options.overwrite
+        )
         return
     replay.run(
         study=options.study,
@@ -33,4 +50,5 @@ def _replay(options: argparse.Namespace) -> None:
         out=options.out,
         meshcat=options.meshcat,
         video=options.video,
+        overwrite=options.overwrite,
     )

@@ -5,17 +5,25 @@ import logging
 import re
 from pathlib import Path
 
+from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.systems.files import require_existing
+
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    scale = verbs.add_parser(
+    scale = add_verb(
+        verbs,
         "scale",
+        _scale,
         help="give a scene its size: by a factor, a measured length, or the cameras' height",
         description="Writes the scene anew with all its lengths times one factor. A scene of "
         "photographs alone, whose scale is unknown, can be flown in then.",
+        examples=(
+            "scale scenes/room --out scenes/room_metric --height 1.5",
+            "scale scenes/room --out scenes/room_metric --between 0,0,1 2,0,1 --distance 3.2",
+        ),
     )
     # Points may begin with a minus sign, which argparse takes for an option unless it is a number.
     scale._negative_number_matcher = re.compile(r"-[\d.]")  # pyright: ignore
-    scale.set_defaults(verb=_scale)
     scale.add_argument("scene", type=Path, help="scene folder")
     scale.add_argument("--out", type=Path, required=True, help="scene folder to write")
     by = scale.add_mutually_exclusive_group(required=True)
@@ -36,7 +44,7 @@ def _scale(options: argparse.Namespace) -> None:
     if (options.between is None) != (options.distance is None):
         raise ValueError("--between and --distance belong together: two points and the metres")
     points = [_point(text) for text in options.between or ()]
-
+    require_existing(options.scene, "a scene folder")
     from splatpilot.analysis.reconstruction import rescale
 
     logging.getLogger("drake").setLevel(logging.WARNING)

@@ -4,7 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatpilot.analysis.benchmark.variants import parse_variant
+from splatpilot.analysis.commands.checks import POLICIES, SCENARIOS, check_policy, check_scenario
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_named
+from splatpilot.systems.environment import require_scene
 
 if TYPE_CHECKING:
     from splatpilot.diagrams.scenario import Scenario
@@ -12,16 +16,22 @@ if TYPE_CHECKING:
 
 def add_scenario(parser: argparse.ArgumentParser) -> None:
     """Adds the options that `read_scenario` reads."""
-    parser.add_argument(
+    add_named(
+        parser,
         "--scenario",
+        names=SCENARIOS,
         metavar="P02|FILE.yaml",
         help="the scenario to fly: the benchmark's, or a file",
     )
-    parser.add_argument(
+    add_named(
+        parser,
         "--policy",
-        metavar="NAME",
-        help="who flies, by its name in the benchmark, or a file of weights",
+        names=POLICIES,
+        metavar="NAME[:FIELD=VALUE]",
+        help="who flies, as in the benchmark: planner, straight, reactive, diffaero, depthnav, "
+        "agile_autonomy, ..., a file of weights, or module:Class",
     )
+    parser.add_argument("--speed", type=float, metavar="M/S", help="nominal, of any policy")
     parser.add_argument(
         "--scene",
         type=Path,
@@ -29,7 +39,26 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
         help="fly in this scene folder, or PLY in metres, z up",
     )
     parser.add_argument("--seed", type=int, help="seed of the world and the start")
-    add_overrides(parser, "policy.lattice.speed=3")
+    add_overrides(
+        parser,
+        ("timeout=20", "goal=[12,0,2]", "world.spacing=2.4", "policy.lattice.margin=0.2"),
+        read_scenario,
+    )
+
+
+def check_scenario_options(options: argparse.Namespace) -> None:
+    """
+    Checks, before anything slow is imported, what the options name.
+
+    Raises:
+        OSError, ValueError: for what is not there.
+    """
+    if options.scenario is not None:
+        check_scenario(options.scenario)
+    if options.policy is not None:
+        check_policy(parse_variant(options.policy))
+    if options.scene is not None:
+        require_scene(str(options.scene))
 
 
 def read_scenario(options: argparse.Namespace) -> "Scenario":
@@ -39,7 +68,8 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     Raises:
         OSError, ValueError: for what is not there, or cannot be.
     """
-    from splatpilot.diagrams.policies import policy_named
+    check_scenario_options(options)
+    from splatpilot.diagrams.policies import DEFAULT_SPEED, at_speed
     from splatpilot.diagrams.scenario import Scenario
     from splatpilot.diagrams.scenario_files import scenario_file
     from splatpilot.diagrams.worlds.make_world import SceneConfig
@@ -48,9 +78,25 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     file = None if options.scenario is None else scenario_file(options.scenario)
     scenario = load_config(Scenario(), file)
     if options.policy is not None:
-        scenario.policy = policy_named(options.policy)
+        scenario.policy = parse_variant(options.policy).config(DEFAULT_SPEED, scenario.policy)
+    if options.speed is not None:
+        scenario.policy = at_speed(scenario.policy, options.speed)
     if options.scene is not None:
-        scenario.world = SceneConfig(path=str(options.scene.absolute()))
+        scenario.world = SceneConfig(path=str(require_scene(str(options.scene)).absolute()))
     if options.seed is not None:
         scenario.seed = options.seed
     return load_config(scenario, overrides=options.overrides)
+
+
+def name_of_flight(options: argparse.Namespace, scenario: "Scenario") -> str:
+    """What a flight is called, as in a study: after its scenario, or else its scene or its world,
+    its policy, its speed and its seed."""
+    from splatpilot.analysis.benchmark.study import flight_name
+    from splatpilot.diagrams.policies import name_of, speed_of
+
+    place = options.scene or options.scenario
+    if place is None:
+        place = type(scenario.world).__name__.removesuffix("Config").lower()
+    variant = None if options.policy is None else parse_variant(options.policy)
+    policy = name_of(scenario.policy) if variant is None else variant.label
+    return flight_name(Path(place).stem, policy, speed_of(scenario.policy), scenario.seed)

@@ -3,15 +3,27 @@
 import argparse
 import logging
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.commands.checks import check_world
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    tour = verbs.add_parser(
-        "tour", help="from a mesh to a flight: render a capture, reconstruct it, fly in it"
+    tour = add_verb(
+        verbs,
+        "tour",
+        _tour,
+        help="from a mesh to a flight: render a capture, reconstruct it, fly in it",
+        description="Renders a capture of a mesh or of a generated world, reconstructs it, and "
+        "flies in what came of it. Interrupted, the same command goes on; a flight that is there "
+        "is flown again.",
+        examples=(
+            "tour warehouse.gltf --up z --out out/warehouse",
+            "tour P09 --out out/alley --set reconstruct.iterations=500",
+        ),
     )
-    tour.set_defaults(verb=_tour)
     tour.add_argument(
         "world", type=Path, help=".gltf or .obj, or a scenario of a generated world: P01 or a file"
     )
@@ -19,15 +31,24 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     tour.add_argument("--scene", type=Path, help="scene folder to write (default: OUT/scene)")
     tour.add_argument("--up", choices=("y", "z"), help="axis of the mesh file that points up")
     tour.add_argument("--seed", type=int, default=0, help="seed of a generated world")
-    add_overrides(tour, "render.spacing=1")
+    add_overrides(
+        tour, ("render.spacing=1", "reconstruct.iterations=3000", "flight.timeout=90"), _defaults
+    )
+
+
+def _defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.analysis.tour import TourConfig
+
+    return TourConfig()
 
 
 def _tour(options: argparse.Namespace) -> None:
+    check_world(options.world)
     from splatpilot.analysis import tour
     from splatpilot.systems.configuration import load_config
 
     logging.getLogger("drake").setLevel(logging.WARNING)
-    config = tour.TourConfig()
+    config = _defaults(options)
     if options.up is not None:
         config.render.up = options.up
     config = load_config(config, overrides=options.overrides)

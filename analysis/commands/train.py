@@ -2,15 +2,36 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.commands.checks import (
+    TRAINERS,
+    check_config,
+    check_scenario,
+    check_trainer,
+)
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_named, add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    train = verbs.add_parser("train", help="train policies")
-    train.set_defaults(verb=_train)
-    train.add_argument(
+    train = add_verb(
+        verbs,
+        "train",
+        _train,
+        help="train policies",
+        description="Trains policies, several at a time on several cores, and leaves weights, a "
+        "model card and curves of each. Interrupted, the same command goes on.",
+        examples=(
+            "train diffaero --out out/forests --set 'worlds.kinds=[P02, P03]' --fly P03",
+            "train diffaero depthnav --out out/both --seeds 0 1",
+            "train student_depth --out out/student --set 'corpora=[out/corpus]'",
+        ),
+    )
+    add_named(
+        train,
         "policies",
+        names=TRAINERS,
         metavar="POLICY",
         nargs="+",
         help="name of a trainer, such as diffaero, or module:attribute of one of your own",
@@ -32,23 +53,39 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         metavar="P02,P03",
         help="scenarios of the benchmark to fly when trained, five seeds of each",
     )
-    add_overrides(train, "schedule.updates=2000")
+    add_overrides(train, ("schedule.updates=2000", "seed=1"), trainer_defaults)
+
+
+def trainer_defaults(options: argparse.Namespace) -> Any:
+    """The configuration of the trainer that is named, the first of several, which `--set` changes.
+
+    Raises:
+        ValueError: if none is.
+    """
+    named = getattr(options, "policy", None) or getattr(options, "policies", None)
+    if not named:
+        raise ValueError("fields depend on the policy; name it before --set help")
+    from splatpilot.training.policies.registry import TRAINERS
+
+    return TRAINERS.find(named if isinstance(named, str) else named[0]).config()
 
 
 def _train(options: argparse.Namespace) -> None:
+    if options.jobs is not None and options.jobs < 1:
+        raise ValueError(f"--jobs is {options.jobs}; it must be at least 1")
+    scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
+    for name in scenarios:
+        check_scenario(name)  # before the training, not after it
+    for policy in options.policies:
+        check_trainer(policy)
+    check_config(options.config)
     from splatpilot.analysis.benchmark import run as benchmark
     from splatpilot.analysis.benchmark.study import StudyConfig
-    from splatpilot.diagrams.scenario_files import scenario_file
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies.registry import TRAINERS
     from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
 
-    if options.jobs is not None and options.jobs < 1:
-        raise ValueError(f"--jobs is {options.jobs}; it must be at least 1")
-    scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
-    for name in scenarios:
-        scenario_file(name)  # before the training, not after it
     runs = []
     for policy in options.policies:
         for seed in options.seeds or [None]:

@@ -3,24 +3,39 @@
 import argparse
 import logging
 from pathlib import Path
+from typing import Any
 
+from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.diagrams.scenario_files import scenario_file
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
-    view = verbs.add_parser(
+    view = add_verb(
+        verbs,
         "view",
+        _view,
         help="look at a scene, a PLY, a capture or a generated world, and measure in it",
         description="Writes a page that any browser opens, without a server or a network: the "
         "Gaussians, distances to surfaces, the captured images where they were taken, a ruler.",
+        examples=("view scenes/hospital", "view P02 --seed 3 --set world.spacing=2.4"),
     )
-    view.set_defaults(verb=_view)
     view.add_argument(
         "what", help="scene folder, PLY, folder of a capture, or a scenario: P02 or a file"
     )
     view.add_argument("--out", type=Path, help="page to write (default: out/view/NAME.html)")
     view.add_argument("--seed", type=int, help="seed of a generated world")
-    add_overrides(view, "world.spacing=2.4")
+    add_overrides(view, ("world.spacing=2.4", "world.height=8"), _scenario_defaults)
+
+
+def _scenario_defaults(options: argparse.Namespace) -> Any:
+    """Of the scenario that is named; of a capture other fields are set."""
+    from splatpilot.diagrams.scenario import Scenario
+    from splatpilot.systems.configuration import load_config
+
+    what = getattr(options, "what", None)
+    return load_config(Scenario(), scenario_file(what) if what in SCENARIOS else None)
 
 
 def _view(options: argparse.Namespace) -> None:

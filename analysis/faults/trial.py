@@ -10,7 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 
 from splatpilot.analysis.faults.fault import Fault
 from splatpilot.analysis.faults.relay import Relay
-from splatpilot.diagrams.flight import Outcome, flight_outcome, has_landed, sample_initial_state
+from splatpilot.diagrams.flight import Outcome, flight_outcome, has_landed
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram, image_codecs
 from splatpilot.diagrams.pilot import goal_of, make_policy
@@ -107,11 +108,9 @@ def fly_trial(scenario: Scenario, world: World, fault: Fault, seed: int) -> dict
             mode, reason = np.asarray(bridge.GetOutputPort("status").Eval(bridge_root))[:2]
             reasons.add(int(reason))
         state = QuadrotorState.of(np.asarray(vehicle.GetOutputPort("state").Eval(root)))
-        w, x, y, z = state.q_WB
-        tilt = float(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0)))
         clearance = float(np.asarray(vehicle.GetOutputPort("clearance").Eval(root))[0])
         measured["most_speed"] = max(measured["most_speed"], float(np.linalg.norm(state.v_WB)))
-        measured["most_tilt"] = max(measured["most_tilt"], tilt)
+        measured["most_tilt"] = max(measured["most_tilt"], float(state.tilt))
         measured["inside"] &= bool(
             ((state.p_WB >= field.lower_W) & (state.p_WB <= field.upper_W)).all()
         )

@@ -33,6 +33,7 @@ from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.device import require_renderer
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -78,6 +79,7 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
             or a folder that cannot be written.
     """
     config.validate()
+    require_renderer(config.device)
     if config.hold_out == 0 or config.iterations == 0:
         raise ValueError(
             f"hold_out is {config.hold_out} and iterations {config.iterations}: an ablation "

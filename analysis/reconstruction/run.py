@@ -6,6 +6,7 @@ from splatpilot.analysis.reconstruction.measure_scene import measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target
 from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.device import require_renderer
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, reconstruct
 
@@ -23,6 +24,7 @@ def run(
     """
     # Said at once: photographs are registered for minutes before `reconstruct` could.
     config.validate()
+    require_renderer(config.device)
     check_scene_target(out)
     opened = read_capture(capture, config.capture)
     summary = reconstruct(opened, out, config, restart=restart)

@@ -1,6 +1,8 @@
-from .diagrams.flight import Flight, Outcome, fly, sample_initial_state
+from .diagrams.flight import Flight, Outcome, fly
 from .diagrams.flight_diagram import BuildFlightDiagram, MakeCamera
+from .diagrams.flight_start import sample_initial_state
 from .diagrams.policies import policy_named, register_policy
+from .diagrams.random_flights import random_flights
 from .diagrams.scenario import Scenario
 from .diagrams.sensors import register_sensor
 from .diagrams.worlds.make_world import make_world, register_world
@@ -58,6 +60,7 @@ __all__ = [
     "load_config",
     "make_world",
     "policy_named",
+    "random_flights",
     "rasterize",
     "read_capture",
     "read_ply",

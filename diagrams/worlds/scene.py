@@ -1,17 +1,14 @@
 """Scenes on disk as worlds: found by name, with start and goal drawn from the seed if wanted."""
 
 import math
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene
 from splatpilot.diagrams.worlds.start_and_goal import SHORTEST, draw_start_and_goal
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.environment import require_scene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-
-SCENES = "SPLATPILOT_SCENES"
-"""Environment variable that names the folder of scenes."""
 
 
 @dataclass
@@ -54,15 +51,7 @@ def find_scene(config: SceneSource) -> Path:
             says how to get it.
     """
     config.validate()
-    folder = Path(os.environ.get(SCENES, "scenes"))
-    for path in (Path(config.path), folder / config.path):
-        if path.exists():
-            return path
-    raise FileNotFoundError(
-        f"{config.path}: there is no such scene, neither here nor in {folder} (the environment "
-        f"variable {SCENES} names that folder); "
-        + (config.source or "reconstruct one with `splatpilot reconstruct`").strip()
-    )
+    return require_scene(config.path, config.source)
 
 
 def read_scene_world(config: SceneSource, seed: int) -> World:

@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.ports import input_port, optional_input, output_port
 
 
 class BridgeStatus(LeafSystem):
@@ -60,11 +60,11 @@ class BridgeStatus(LeafSystem):
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
         ages = self._read(context, "age")
-        port = self.GetInputPort("overruns")
-        overruns = np.asarray(port.Eval(context))[0] if port.HasValue(context) else 0.0
+        overruns = optional_input(self, "overruns", context)
         counts = [self._read(context, what).sum() for what in ("gaps", "rejected")]
         mode = np.asarray(self.GetInputPort("mode").Eval(context))
-        status = [*mode, ages[0], max(ages[1:], default=0.0), *counts, overruns]
+        late = 0.0 if overruns is None else overruns[0]
+        status = [*mode, ages[0], max(ages[1:], default=0.0), *counts, late]
         output.SetFromVector(np.array(status))
 
     def _calc_observation_age(self, context: Context, output: BasicVector) -> None:

@@ -1,7 +1,6 @@
 """Failsafe: what is flown where nobody can be trusted to say."""
 
 import math
-import weakref
 from typing import Any, cast
 
 import numpy as np
@@ -15,34 +14,21 @@ from pydrake.systems.framework import (
 )
 
 from splatpilot.systems.collision.distance_field import Distances
-from splatpilot.systems.messaging.failsafe_config import (
-    FailsafeConfig,
-    wrong_with_command,
-    wrong_with_state,
-)
+from splatpilot.systems.messaging.failsafe_checks import Box, Signals, what_is_wrong
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.failsafe_modes import Memory
+from splatpilot.systems.messaging.failsafe_velocity import Surroundings, flown_setpoint
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
-from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.ports import input_port, optional_input, output_port
 from splatpilot.systems.vehicle.flatness_controller import (
     FlatnessControllerConfig,
     flatness_command,
 )
-from splatpilot.systems.vehicle.flight_limits import (
-    LEVEL,
-    limit_ahead,
-    limit_approach,
-    limit_speed,
-    limit_to_box,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-
-_MOVING = 0.3  # [m/s], from which on a position that stands still is none.
-_HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
-_HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
-_FAR = np.full(3, math.inf)
-_PREDICTABLE = 0.1  # [s], how old states can be brought up to date for body rates.
+from splatpilot.systems.vehicle.state_prediction import LONGEST_PREDICTION
+from splatpilot.systems.weakly import weakly
 
 
 class Failsafe(LeafSystem):
@@ -125,7 +111,6 @@ class Failsafe(LeafSystem):
             vehicle: that is flown.
             lower_W, upper_W: (3,) [m] corners of the box in which it stays, unless `config.limits`
                 has one.
-
             field: what is known of the world, for what lies ahead.
 
         Raises:
@@ -136,7 +121,7 @@ class Failsafe(LeafSystem):
         self._field = field
         self._config, self._controller, self._vehicle = config, controller, vehicle
         fence = config.limits.geofence or (lower_W, upper_W)
-        self._lower, self._upper = (np.asarray(corner, dtype=float) for corner in fence)
+        self._box = Box(*(np.asarray(corner, dtype=float) for corner in fence))
         for name, size in (
             *(("state", 13), ("measured_state", 13), ("velocity_setpoint", 4), ("command", 4)),
             *((name, 1) for name in ("state_age", "observation_age", "body_age", "lag")),
@@ -144,12 +129,11 @@ class Failsafe(LeafSystem):
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(Memory()))
-        failsafe = weakref.proxy(self)  # See `EsdfCollision`.
         flown = self.DeclareCacheEntry(
             "velocity setpoint (4), mode and reason",
             ValueProducer(
                 allocate=lambda: AbstractValue.Make(object()),
-                calc=lambda context, value: failsafe._calc_flown(context, value),
+                calc=weakly(self._calc_flown),
             ),
             {self.all_sources_ticket()},
         )
@@ -161,9 +145,8 @@ class Failsafe(LeafSystem):
         self.DeclareVectorOutputPort("in_charge", 1, self._calc_in_charge)
         self.DeclarePeriodicDiscreteUpdateEvent(controller.period, 0.0, self._update)
 
-    def _read(self, context: Context, name: str) -> np.ndarray | None:
-        port = self.GetInputPort(name)
-        return np.asarray(port.Eval(context)) if port.HasValue(context) else None
+    def _state(self, context: Context) -> QuadrotorState:
+        return QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
 
     def _ages(self, context: Context) -> dict[int, float]:
         """[s], by the reasons for not flying by what is older than allowed."""
@@ -172,28 +155,21 @@ class Failsafe(LeafSystem):
             status.OBSERVATION_OLD: "observation_age",
             status.BODY_LOST: "body_age",
         }
-        read = {reason: self._read(context, name) for reason, name in ports.items()}
+        read = {reason: optional_input(self, name, context) for reason, name in ports.items()}
         return {reason: float(age[0]) for reason, age in read.items() if age is not None}
 
     def _wrong(self, context: Context) -> int:
         """The first reason not to fly as the policy decides; NONE where there is none."""
-        config, memory = self._config, _memory(context)
-        for reason, age in self._ages(context).items():
-            if not age <= config.max_age:
-                return reason
-        state = QuadrotorState.of(np.asarray(self._read(context, "state")))
-        frozen = context.get_time() - memory.moved > config.max_age
-        if frozen and np.linalg.norm(state.v_WB) > _MOVING:
-            return status.STATE_FROZEN
-        lag = self._read(context, "lag")
-        if lag is not None and lag[0] > config.max_lag:
-            return status.OVERRUN
-        setpoint = self._read(context, "velocity_setpoint")
-        command = np.asarray(self._read(context, "command"))
-        wrong = wrong_with_command(setpoint, command, self._controller)
-        # Who is told body rates alone is in charge of no place.
-        lower, upper = (self._lower, self._upper) if setpoint is not None else (-_FAR, _FAR)
-        return wrong or wrong_with_state(state, config.limits.max_tilt, lower, upper)
+        lag = optional_input(self, "lag", context)
+        signals = Signals(
+            ages=self._ages(context),
+            still=context.get_time() - _memory(context).moved,
+            lag=0.0 if lag is None else float(lag[0]),
+            state=self._state(context),
+            setpoint=optional_input(self, "velocity_setpoint", context),
+            command=np.asarray(self.GetInputPort("command").Eval(context)),
+        )
+        return what_is_wrong(signals, self._config, self._controller, self._box)
 
     def _mode(self, context: Context) -> tuple[int, int]:
         """Mode and reason at this instant."""
@@ -206,7 +182,7 @@ class Failsafe(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now, memory = context.get_time(), _memory(context)
-        measured = self._read(context, "measured_state")
+        measured = optional_input(self, "measured_state", context)
         if measured is None:
             memory = memory._replace(moved=now)
         else:
@@ -216,8 +192,8 @@ class Failsafe(LeafSystem):
         wrong = status.NONE if idle else self._wrong(context)
         memory = memory.after(wrong, waits, now, self._config)
         if self._known(context):
-            p_WB, v_WB, _, _ = QuadrotorState.of(np.asarray(self._read(context, "state")))
-            memory = memory.holding(p_WB, v_WB)
+            state = self._state(context)
+            memory = memory.holding(state.p_WB, state.v_WB)
         discrete_state.set_value(np.array(memory))
 
     def _known(self, context: Context) -> bool:
@@ -227,60 +203,19 @@ class Failsafe(LeafSystem):
     def _flown(self, context: Context) -> tuple[np.ndarray, int, int]:
         """Velocity setpoint (4,), mode and reason."""
         mode, reason = self._mode(context)
-        landing = mode == status.LANDING
-        descent = np.array([0.0, 0.0, -self._config.descent if landing else 0.0])
-        if not self._known(context):
-            return np.append(descent, math.nan), mode, reason
-        state = QuadrotorState.of(np.asarray(self._read(context, "state")))
-        setpoint = self._read(context, "velocity_setpoint")
-        if mode == status.FLYING:
-            if setpoint is None:
-                return np.full(4, math.nan), mode, reason
-            limited, limit = self._limited(context, setpoint[:3], state, landing=False)
-            return np.append(limited, setpoint[3]), mode, limit
-        back, place = np.zeros(3), _memory(context).place()
-        if place is not None:
-            back = limit_speed(_HOLDING_GAIN * (place - state.p_WB), _HOLDING_SPEED)
-        if landing:
-            back[2] = -self._config.descent
-        limited, _ = self._limited(context, back, state, landing)
-        return np.append(limited, math.nan), mode, reason
-
-    def _limited(
-        self, context: Context, wanted: np.ndarray, state: QuadrotorState, landing: bool
-    ) -> tuple[np.ndarray, int]:
-        """The velocity (3,) within limits, and the reason for what was changed."""
-        limits = self._config.limits
-        slow = limit_speed(wanted, limits.max_speed)
-        away, room = self._room(context, landing)
-        clear = limit_approach(slow, away, room, limits.deceleration)
-        lower, upper = self._lower + VEHICLE_RADIUS, self._upper - VEHICLE_RADIUS
-        if landing:
-            lower[2] = -math.inf
-        inside = limit_to_box(clear, state.p_WB, lower, upper, limits.deceleration)
-        flown = inside
-        # Last, because what leads along a fence or an obstacle may lead into another.
-        if self._field is not None and not landing:
-            flown = limit_ahead(inside, state.p_WB, self._field, limits)
-        for before, after, reason in (
-            (inside, flown, status.LIMITED_CLEARANCE),
-            (clear, inside, status.LIMITED_GEOFENCE),
-            (slow, clear, status.LIMITED_CLEARANCE),
-            (wanted, slow, status.LIMITED_SPEED),
-        ):
-            if not np.array_equal(before, after):
-                return flown, reason
-        return flown, status.NONE
-
-    def _room(self, context: Context, landing: bool) -> tuple[np.ndarray, float]:
-        """The direction (3,) away from the nearest obstacle, and the room towards it [m]."""
-        clearance, gradient = (self._read(context, name) for name in ("clearance", "gradient"))
-        if clearance is None or gradient is None or math.isnan(clearance[0]) or not gradient.any():
-            return np.zeros(3), math.inf
-        away = gradient / np.linalg.norm(gradient)
-        if landing and away[2] > LEVEL:
-            return away, math.inf
-        return away, float(clearance[0]) - self._config.limits.min_clearance
+        clearance, gradient = (
+            optional_input(self, name, context) for name in ("clearance", "gradient")
+        )
+        near = Surroundings(
+            math.nan if clearance is None else float(clearance[0]),
+            np.zeros(3) if gradient is None else gradient,
+            self._box,
+            self._field,
+        )
+        wanted = optional_input(self, "velocity_setpoint", context)
+        p_WB = self._state(context).p_WB if self._known(context) else None
+        setpoint, limit = flown_setpoint(mode, wanted, p_WB, _memory(context), near, self._config)
+        return setpoint, mode, reason or limit
 
     def _calc_flown(self, context: Context, value: Any) -> None:
         value.set_value(self._flown(context))
@@ -294,9 +229,9 @@ class Failsafe(LeafSystem):
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         setpoint, mode, reason = self._cached(context)
         if mode == status.FLYING and reason == status.NONE:
-            output.SetFromVector(np.asarray(self._read(context, "command")))
+            output.SetFromVector(np.asarray(self.GetInputPort("command").Eval(context)))
             return
-        state = np.asarray(self._read(context, "state"))
+        state = np.asarray(self.GetInputPort("state").Eval(context))
         if not np.isfinite(state).all():
             output.SetFromVector(np.array([self._vehicle.gravity, 0.0, 0.0, 0.0]))
             return
@@ -316,7 +251,7 @@ class Failsafe(LeafSystem):
         output[0] = float(_memory(context).mode != status.WAITING)
 
     def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
-        is_recent = self._ages(context)[status.STATE_OLD] <= _PREDICTABLE
+        is_recent = self._ages(context)[status.STATE_OLD] <= LONGEST_PREDICTION
         in_charge = _memory(context).mode != status.WAITING
         output[0] = float(in_charge and is_recent and self._known(context))
 

@@ -1,16 +1,9 @@
-"""When a vehicle is taken from its policy, and what speaks against flying by it."""
+"""When a vehicle is taken from its policy, and what happens then."""
 
 import math
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.flight_limits import FlightLimits
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-
-_SLACK = 1.01  # [-], by which a command may exceed what its controller is limited to.
 
 
 @dataclass
@@ -39,40 +32,3 @@ class FailsafeConfig:
                     f"{getattr(type(self), name)}"
                 )
         self.limits.validate()
-
-
-def wrong_with_command(
-    setpoint: np.ndarray | None, command: np.ndarray, law: FlatnessControllerConfig
-) -> int:
-    """
-    The reason not to send on what a policy and its controller want, or NONE.
-
-    Args:
-        setpoint: (4,) velocity [m/s] and heading [rad], which may be NaN; None where there is none.
-        command: (4,) thrust over mass [m/s^2] and body rates [rad/s].
-        law: whose limits the command must keep.
-    """
-    if not np.isfinite(command).all():
-        return status.NOT_FINITE
-    if setpoint is not None and not (
-        np.isfinite(setpoint[:3]).all() and abs(setpoint[3]) != math.inf
-    ):
-        return status.NOT_FINITE
-    most = np.array([law.max_tilt_rate, law.max_tilt_rate, law.max_yaw_rate])
-    thrust_is_so = 0.0 <= command[0] <= _SLACK * law.max_thrust
-    if not thrust_is_so or (np.abs(command[1:]) > _SLACK * most).any():
-        return status.OUT_OF_BOUNDS
-    return status.NONE
-
-
-def wrong_with_state(
-    state: QuadrotorState, max_tilt: float, lower: np.ndarray, upper: np.ndarray
-) -> int:
-    """The reason not to fly on from a state, or NONE: a tilt beyond `max_tilt` [rad], or a place
-    outside of the box from `lower` to `upper` (3,) [m]."""
-    w, x, y, z = state.q_WB
-    if w * w - x * x - y * y + z * z < math.cos(max_tilt):
-        return status.TILTED
-    if ((state.p_WB < lower) | (state.p_WB > upper)).any():
-        return status.OUTSIDE
-    return status.NONE

@@ -7,8 +7,11 @@ import numpy as np
 
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.vehicle.flight_limits import limit_speed
 
 _STOPPED = 0.3  # [m/s], below which a place is held instead of braking.
+_HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
+_HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
 
 
 class Memory(NamedTuple):
@@ -62,9 +65,12 @@ class Memory(NamedTuple):
         x, y, z = p_WB
         return self._replace(x=x, y=y, z=z)
 
-    def place(self) -> np.ndarray | None:
-        """That is held, (3,) [m]."""
-        return None if math.isnan(self.x) else np.array([self.x, self.y, self.z])
+    def return_velocity(self, p_WB: np.ndarray) -> np.ndarray:
+        """The velocity (3,) [m/s] from p_WB (3,) [m] to the place that is held; 0 without one."""
+        if math.isnan(self.x):
+            return np.zeros(3)
+        place = np.array([self.x, self.y, self.z])
+        return limit_speed(_HOLDING_GAIN * (place - p_WB), _HOLDING_SPEED)
 
     def _begun(self, mode: int, reason: int, now: float) -> "Memory":
         return self._replace(

@@ -10,7 +10,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, LeafSystem
 
 from splatpilot.systems.messaging.codecs import Codec
-from splatpilot.systems.ports import input_port
+from splatpilot.systems.ports import input_port, optional_input
 
 PUBLISH_OFFSET = 1e-6
 """[s] after the updates of an instant at which their results are sent: publish events of that very
@@ -68,8 +68,8 @@ class MessagePublisher(LeafSystem):
         self.DeclareForcedPublishEvent(self._publish)
 
     def _publish(self, context: Context) -> None:
-        enabled = self.GetInputPort("enabled")
-        if enabled.HasValue(context) and not np.asarray(enabled.Eval(context))[0]:
+        enabled = optional_input(self, "enabled", context)
+        if enabled is not None and not enabled[0]:
             return
         unix_time = float(np.asarray(self.GetInputPort("unix_time").Eval(context))[0])
         header = lcmt_header()

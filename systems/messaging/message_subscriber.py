@@ -1,13 +1,11 @@
 """MessageSubscriber: gives what messages brought."""
 
-import logging
 import math
-import struct
 import weakref
 from collections import deque
 from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from lcm import LCM
@@ -15,6 +13,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from splatpilot.systems.messaging.codecs import Codec
+from splatpilot.systems.messaging.received import Received
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.weakly import weakly
 
@@ -24,21 +23,13 @@ MAX_AHEAD = 0.2
 _QUEUE = 1000
 """Messages that wait at most; further ones are lost. LCM's 30 are but half a second of states."""
 
-_log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, eq=False)
-class Received:
-    """The last message that could be used, and what became of the others."""
-
-    value: np.ndarray
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Received(Received):
+    value: np.ndarray  # of the last message that could be used
     utime: int | None = None  # [us], of the last message; None before the first.
     seq: int = 0
     gaps: int = 0
-    rejected: int = 0
-
-    def __deepcopy__(self, memo: dict) -> "Received":
-        return self  # Nothing in it changes: Contexts, which copy it at every update, may share it.
 
 
 class MessageSubscriber(LeafSystem):
@@ -103,17 +94,20 @@ class MessageSubscriber(LeafSystem):
         image = codec.image
         if initial is None:
             initial = np.full(codec.size, np.nan) if image is None else np.asarray(image.data)
-        received = self.DeclareAbstractState(Value(Received(initial.copy())))
+        received = self.DeclareAbstractState(Value(_Received(value=initial.copy())))
         ticket = {self.abstract_state_ticket(received)}
         if image is None:
-            self.DeclareVectorOutputPort(codec.port, codec.size, self._calc_vector, ticket)
+            vector = _Received.output(lambda received, _: received.value)
+            self.DeclareVectorOutputPort(codec.port, codec.size, vector, ticket)
         else:
             self.DeclareAbstractOutputPort(
                 codec.port, lambda: Value(image), weakly(self._calc_image), ticket
             )
         self.DeclareVectorOutputPort("age", 1, self._calc_age)
-        for name in ("gaps", "rejected"):
-            self.DeclareVectorOutputPort(name, 1, self._counter(name), ticket)
+        gaps = _Received.output(lambda received, _: received.gaps)
+        rejected = _Received.output(lambda received, _: received.rejected)
+        self.DeclareVectorOutputPort("gaps", 1, gaps, ticket)
+        self.DeclareVectorOutputPort("rejected", 1, rejected, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._take)
 
     @property
@@ -128,27 +122,19 @@ class MessageSubscriber(LeafSystem):
         return bool(self._inbox)
 
     def _take(self, context: Context, state: State) -> None:
-        received = _received(context)
         if not self.has_message():
             return
         unix_time = self._unix_time(context)
         epoch = unix_time - context.get_time()
-        while self._inbox:
-            data = self._inbox.popleft()
-            try:
-                received = self._after(received, data, unix_time, epoch)
-            except (ValueError, struct.error) as error:
-                received = replace(received, rejected=received.rejected + 1)
-                if received.rejected & (received.rejected - 1) == 0:
-                    _log.warning(
-                        "%s: a message is refused, %d so far: %s",
-                        self.channel,
-                        received.rejected,
-                        error,
-                    )
-        state.get_mutable_abstract_state(0).set_value(received)
+        messages = list(self._inbox)
+        self._inbox.clear()
 
-    def _after(self, last: Received, data: bytes, unix_time: float, epoch: float) -> Received:
+        def after(last: _Received, message: bytes) -> _Received:
+            return self._after(last, message, unix_time, epoch)
+
+        _Received.of(context).taking(messages, 0, self.channel, after).keep(state)
+
+    def _after(self, last: _Received, data: bytes, unix_time: float, epoch: float) -> _Received:
         """What there is after another message; raises ValueError or struct.error to refuse it."""
         rest = BytesIO(data)
         message: Any = self._codec.message.decode(rest)
@@ -169,28 +155,15 @@ class MessageSubscriber(LeafSystem):
             raise ValueError("the message is no newer than the one before")
         value = self._codec.unpack(message, epoch)
         lost = header.seq - last.seq - 1 if last.utime is not None else 0
-        return Received(value, header.utime, header.seq, last.gaps + max(lost, 0), last.rejected)
+        gaps = last.gaps + max(lost, 0)
+        return replace(last, value=value, utime=header.utime, seq=header.seq, gaps=gaps)
 
     def _unix_time(self, context: Context) -> float:
         return float(np.asarray(self.get_input_port().Eval(context))[0])
 
-    def _calc_vector(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(_received(context).value)
-
     def _calc_image(self, context: Context, output) -> None:
-        output.get_mutable_value().mutable_data[:] = _received(context).value
+        output.get_mutable_value().mutable_data[:] = _Received.of(context).value
 
     def _calc_age(self, context: Context, output: BasicVector) -> None:
-        utime = _received(context).utime
+        utime = _Received.of(context).utime
         output[0] = math.inf if utime is None else self._unix_time(context) - utime * 1e-6
-
-    @staticmethod
-    def _counter(name: str):
-        def calc(context: Context, output: BasicVector) -> None:
-            output[0] = getattr(_received(context), name)
-
-        return calc
-
-
-def _received(context: Context) -> Received:
-    return cast(Received, context.get_abstract_state(0).get_value())

@@ -1,23 +1,20 @@
 """TimeOfFlightReceiver: the grid that a time-of-flight sensor streams by UDP."""
 
-import logging
 import math
 import weakref
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import Context, LeafSystem, State
 
+from splatpilot.systems.messaging.received import Received
 from splatpilot.systems.messaging.udp_inbox import Datagrams, UdpConfig, UdpInbox
 from splatpilot.systems.ports import output_port
 from splatpilot.systems.sensing.time_of_flight import TimeOfFlight
 from splatpilot.systems.sensing.time_of_flight_packets import Stream, after_packet
 
 _RESTART = 1.0  # [s], after which a stream that fell silent may be another.
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -37,16 +34,10 @@ class TimeOfFlightStream:
             raise ValueError(f"time_of_flight.latency is {self.latency} s; it must be 0 to 1")
 
 
-@dataclass(frozen=True, eq=False)
-class _Received:
-    """What has come. Nothing in it changes: Contexts may share it."""
-
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Received(Received):
     stream: Stream = field(default_factory=Stream)
     time: float = -math.inf  # [s], of the Context, when the newest grid came.
-    rejected: int = 0
-
-    def __deepcopy__(self, memo: dict) -> "_Received":
-        return self
 
 
 class TimeOfFlightReceiver(LeafSystem):
@@ -99,10 +90,17 @@ class TimeOfFlightReceiver(LeafSystem):
         state = self.DeclareAbstractState(Value(_Received()))
         ticket = {self.abstract_state_ticket(state)}
         size = config.sensor.rows * config.sensor.columns
-        self.DeclareVectorOutputPort("depth_grid", size, self._calc_grid, ticket)
-        self.DeclareVectorOutputPort("age", 1, self._calc_age)
-        self.DeclareVectorOutputPort("gaps", 1, self._calc_gaps, ticket)
-        self.DeclareVectorOutputPort("rejected", 1, self._calc_rejected, ticket)
+        nothing, latency = np.zeros(size), config.latency
+        grid = _Received.output(
+            lambda got, _: nothing if got.stream.grid is None else got.stream.grid.ravel()
+        )
+        age = _Received.output(lambda got, now: now - got.time + latency)
+        gaps = _Received.output(lambda got, _: got.stream.gaps)
+        rejected = _Received.output(lambda got, _: got.rejected)
+        self.DeclareVectorOutputPort("depth_grid", size, grid, ticket)
+        self.DeclareVectorOutputPort("age", 1, age)
+        self.DeclareVectorOutputPort("gaps", 1, gaps, ticket)
+        self.DeclareVectorOutputPort("rejected", 1, rejected, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._take)
 
     @property
@@ -121,43 +119,18 @@ class TimeOfFlightReceiver(LeafSystem):
         return any(datagrams.packets for datagrams in self._waiting)
 
     def _take(self, context: Context, state: State) -> None:
-        received, now = _received(context), context.get_time()
-        for packets, strangers in (*self._waiting, self._inbox.receive()):
-            if strangers:
-                received = _rejected(received, strangers, self.channel, "its sender is not named")
-            for packet in packets:
-                if now - received.time > _RESTART:  # Its clock may begin anew.
-                    received = replace(received, stream=received.stream.restarted())
-                try:
-                    stream = after_packet(received.stream, packet, self._config.sensor)
-                except ValueError as error:
-                    received = _rejected(received, 1, self.channel, str(error))
-                    continue
-                time = now if stream.time_ns > received.stream.time_ns else received.time
-                received = replace(received, stream=stream, time=time)
+        now = context.get_time()
+
+        def after(received: _Received, packet: bytes) -> _Received:
+            last = received.stream
+            if now - received.time > _RESTART:  # Its clock may begin anew.
+                last = last.restarted()
+            stream = after_packet(last, packet, self._config.sensor)
+            time = now if stream.time_ns > last.time_ns else received.time
+            return replace(received, stream=stream, time=time)
+
+        received = _Received.of(context)
+        for datagrams in (*self._waiting, self._inbox.receive()):
+            received = received.taking(*datagrams, self.channel, after)
         self._waiting.clear()
-        state.get_mutable_abstract_state(0).set_value(received)
-
-    def _calc_grid(self, context: Context, output: BasicVector) -> None:
-        grid = _received(context).stream.grid
-        output.SetFromVector(np.zeros(output.size()) if grid is None else grid.ravel())
-
-    def _calc_age(self, context: Context, output: BasicVector) -> None:
-        output[0] = context.get_time() - _received(context).time + self._config.latency
-
-    def _calc_gaps(self, context: Context, output: BasicVector) -> None:
-        output[0] = _received(context).stream.gaps
-
-    def _calc_rejected(self, context: Context, output: BasicVector) -> None:
-        output[0] = _received(context).rejected
-
-
-def _rejected(received: _Received, count: int, channel: str, why: str) -> _Received:
-    total = received.rejected + count
-    if total.bit_length() != received.rejected.bit_length():
-        _log.warning("%s: a packet is refused, %d so far: %s", channel, total, why)
-    return replace(received, rejected=total)
-
-
-def _received(context: Context) -> _Received:
-    return cast(_Received, context.get_abstract_state(0).get_value())
+        received.keep(state)

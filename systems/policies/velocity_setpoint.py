@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
-from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.ports import input_port, optional_input, output_port
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
@@ -58,14 +58,12 @@ class VelocitySetpoint(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
-        waypoint, heading = self.GetInputPort("waypoint"), self.GetInputPort("heading")
-        wanted = self.GetInputPort("velocity")
-        if wanted.HasValue(context):
-            velocity = np.asarray(wanted.Eval(context))
-        elif waypoint.HasValue(context):
-            velocity = (np.asarray(waypoint.Eval(context)) - state.p_WB) / self._lookahead
-        else:
+        velocity, waypoint, heading = (
+            optional_input(self, name, context) for name in ("velocity", "waypoint", "heading")
+        )
+        if velocity is None and waypoint is not None:
+            velocity = (waypoint - state.p_WB) / self._lookahead
+        elif velocity is None:
             a_WB = np.asarray(self.GetInputPort("acceleration").Eval(context))
             velocity = state.v_WB + RESPONSE_TIME * a_WB
-        looks = np.asarray(heading.Eval(context)) if heading.HasValue(context) else [math.nan]
-        output.SetFromVector(np.concatenate([velocity, looks]))
+        output.SetFromVector(np.append(velocity, math.nan if heading is None else heading))

@@ -1,23 +1,21 @@
 """MotionCaptureReceiver: where OptiTrack sees the vehicle."""
 
-import logging
 import math
 import weakref
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import Context, LeafSystem, State
 
 from splatpilot.systems.extras import import_extra
+from splatpilot.systems.messaging.received import Received
 from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
 from splatpilot.systems.ports import output_port
 from splatpilot.systems.px4.frames import attitude_from_optitrack, from_optitrack
 
 _FRAME_OF_DATA = 7  # NatNet's number of the messages that carry poses.
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -40,16 +38,10 @@ class MotionCaptureConfig:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """The last sight. Nothing in it changes: Contexts may share it."""
-
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Seen(Received):
     pose: np.ndarray = field(default_factory=lambda: np.full(7, math.nan))
-    time: float = -math.inf
-    rejected: int = 0
-
-    def __deepcopy__(self, memo: dict) -> "_Seen":
-        return self
+    time: float = -math.inf  # [s], of the last sight.
 
 
 class MotionCaptureReceiver(LeafSystem):
@@ -88,9 +80,12 @@ class MotionCaptureReceiver(LeafSystem):
         weakref.finalize(self, self._inbox.close)
         state = self.DeclareAbstractState(Value(_Seen()))
         ticket = {self.abstract_state_ticket(state)}
-        self.DeclareVectorOutputPort("motion_capture_pose", 7, self._calc_pose, ticket)
-        self.DeclareVectorOutputPort("age", 1, self._calc_age)
-        self.DeclareVectorOutputPort("rejected", 1, self._calc_rejected, ticket)
+        pose = _Seen.output(lambda seen, _: seen.pose)
+        age = _Seen.output(lambda seen, now: now - seen.time)
+        rejected = _Seen.output(lambda seen, _: seen.rejected)
+        self.DeclareVectorOutputPort("motion_capture_pose", 7, pose, ticket)
+        self.DeclareVectorOutputPort("age", 1, age)
+        self.DeclareVectorOutputPort("rejected", 1, rejected, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._take)
 
     @property
@@ -99,20 +94,18 @@ class MotionCaptureReceiver(LeafSystem):
         return self._inbox.port
 
     def _take(self, context: Context, state: State) -> None:
-        seen, now = _seen(context), context.get_time()
-        packets, strangers = self._inbox.receive()
-        if strangers:
-            seen = _refused(seen, strangers, "its sender is not named")
-        for packet in packets:
+        def after(seen: _Seen, packet: bytes) -> _Seen:
             try:
                 pose = self._pose(packet)
             except Exception as error:  # natnet raises whatever comes of bytes that are no frame.
-                seen = _refused(seen, 1, f"it is no frame of data ({error})")
-                continue
-            if pose is not None:
-                time = now if np.isfinite(pose).all() else seen.time
-                seen = replace(seen, pose=pose, time=time)
-        state.get_mutable_abstract_state(0).set_value(seen)
+                raise ValueError(f"it is no frame of data ({error})") from None
+            if pose is None:
+                return seen
+            time = context.get_time() if np.isfinite(pose).all() else seen.time
+            return replace(seen, pose=pose, time=time)
+
+        seen = _Seen.of(context).taking(*self._inbox.receive(), "motion capture", after)
+        seen.keep(state)
 
     def _pose(self, packet: bytes) -> np.ndarray | None:
         """The body's pose (7,), NaN where it is not seen; None of other messages and bodies."""
@@ -130,23 +123,3 @@ class MotionCaptureReceiver(LeafSystem):
                     return np.full(7, math.nan)
                 return np.append(from_optitrack(np.array(body.pos)), attitude_from_optitrack(q))
         return None
-
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(_seen(context).pose)
-
-    def _calc_age(self, context: Context, output: BasicVector) -> None:
-        output[0] = context.get_time() - _seen(context).time
-
-    def _calc_rejected(self, context: Context, output: BasicVector) -> None:
-        output[0] = _seen(context).rejected
-
-
-def _refused(seen: _Seen, count: int, why: str) -> _Seen:
-    total = seen.rejected + count
-    if total.bit_length() != seen.rejected.bit_length():
-        _log.warning("motion capture: a packet is refused, %d so far: %s", total, why)
-    return replace(seen, rejected=total)
-
-
-def _seen(context: Context) -> _Seen:
-    return cast(_Seen, context.get_abstract_state(0).get_value())

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, EventStatus, Leaf
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
-from splatpilot.systems.ports import input_port
+from splatpilot.systems.ports import input_port, optional_input
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 
 _HEARTBEAT_PERIOD = 1.0  # [s], and of commands that are said again until they are obeyed.
@@ -141,30 +141,26 @@ class Px4Commander(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
 
-    def _read(self, context: Context, name: str) -> np.ndarray | None:
-        port = self.GetInputPort(name)
-        return np.asarray(port.Eval(context)) if port.HasValue(context) else None
-
     def _is_fresh(self, context: Context, name: str) -> bool:
-        age = self._read(context, name)
+        age = optional_input(self, name, context)
         return age is not None and bool(age[0] <= self._config.max_age)
 
     def _is_in(self, context: Context, mode: tuple[int, int]) -> bool:
-        now = self._read(context, "mode")
+        now = optional_input(self, "mode", context)
         assert now is not None
         return now[0] == mode[0] and (mode == OFFBOARD or now[1] == mode[1])
 
     def _request(self, context: Context) -> bytes | None:
         """What PX4 is to be asked for; None where it does it, or nobody asks for it."""
         memory, config = _memory(context), self._config
-        armed = self._read(context, "armed")
+        armed = optional_input(self, "armed", context)
         assert armed is not None
         if memory.left:
             mode = (HOLD[0], int(memory.left))
             taken = memory.left == _TAKEN or self._is_in(context, mode) or not armed[0]
             return None if taken else self._mavlink.set_mode(mode)
         streamed = context.get_time() - memory.streaming >= config.streaming
-        bridge = self._read(context, "bridge_mode")
+        bridge = optional_input(self, "bridge_mode", context)
         flies = bridge is None or bridge[0] == status.FLYING
         if not (config.engage and streamed and flies):
             return None
@@ -174,9 +170,12 @@ class Px4Commander(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now, memory = context.get_time(), _memory(context)
-        fresh, armed = self._is_fresh(context, "setpoint_age"), self._read(context, "armed")
+        fresh, armed = (
+            self._is_fresh(context, "setpoint_age"),
+            optional_input(self, "armed", context),
+        )
         assert armed is not None
-        mode = self._read(context, "bridge_mode")
+        mode = optional_input(self, "bridge_mode", context)
         if not fresh:
             memory = memory._replace(streaming=math.nan)
         elif math.isnan(memory.streaming):
@@ -200,7 +199,9 @@ class Px4Commander(LeafSystem):
         tick = round(now / self._period)
         if tick % round(_HEARTBEAT_PERIOD / self._period) == 0:
             self._send(mavlink.heartbeat())
-        setpoint, pose = (self._read(context, name) for name in ("setpoint", "motion_capture_pose"))
+        setpoint, pose = (
+            optional_input(self, name, context) for name in ("setpoint", "motion_capture_pose")
+        )
         assert setpoint is not None
         if self._is_fresh(context, "setpoint_age") and not memory.left:
             if self._config.setpoints == "velocity":
@@ -211,7 +212,7 @@ class Px4Commander(LeafSystem):
                 )
         if pose is not None and self._is_fresh(context, "motion_capture_age"):
             unix_time, age = (
-                self._read(context, name) for name in ("unix_time", "motion_capture_age")
+                optional_input(self, name, context) for name in ("unix_time", "motion_capture_age")
             )
             assert unix_time is not None and age is not None
             self._send(mavlink.odometry(pose, round((unix_time[0] - age[0]) * 1e6)))

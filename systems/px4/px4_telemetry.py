@@ -1,27 +1,25 @@
 """Px4Telemetry: what PX4 says of itself."""
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import Context, LeafSystem, State
 
+from splatpilot.systems.messaging.received import Received
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.ports import output_port
 from splatpilot.systems.px4.mavlink import Attitude, Heartbeat, Mavlink, Position
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
-_log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, eq=False)
-class _Said:
-    """What has come, and when [s]. Nothing in it changes: Contexts may share it."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Said(Received):
+    """What has come, and when [s]."""
 
     heartbeat: Heartbeat = field(default_factory=lambda: Heartbeat(False, (0, 0)))
     heard: float = -math.inf
@@ -29,10 +27,6 @@ class _Said:
     placed: float = -math.inf
     attitude: Attitude | None = None
     turned: float = -math.inf
-    rejected: int = 0
-
-    def __deepcopy__(self, memo: dict) -> "_Said":
-        return self
 
 
 class Px4Telemetry(LeafSystem):
@@ -85,49 +79,26 @@ class Px4Telemetry(LeafSystem):
             "rejected": (1, lambda said, now: said.rejected),
         }
         for name, (size, value) in outputs.items():
-            self.DeclareVectorOutputPort(name, size, _calc(value))
+            self.DeclareVectorOutputPort(name, size, _Said.output(value))
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._take)
 
     def _take(self, context: Context, state: State) -> None:
-        said, now = _said(context), context.get_time()
-        packets, strangers = self._inbox.receive()
-        if strangers:
-            said = _refused(said, strangers, "its sender is not named")
-        for packet in packets:
-            try:
-                messages = self._mavlink.read(packet)
-            except ValueError as error:
-                said = _refused(said, 1, str(error))
-                continue
-            for message in messages:
+        now = context.get_time()
+
+        def after(said: _Said, packet: bytes) -> _Said:
+            for message in self._mavlink.read(packet):
                 if isinstance(message, Heartbeat):
                     said = replace(said, heartbeat=message, heard=now)
                 elif isinstance(message, Position):
                     said = replace(said, position=message, placed=now)
                 else:
                     said = replace(said, attitude=message, turned=now)
-        state.get_mutable_abstract_state(0).set_value(said)
+            return said
 
-
-def _calc(value: Callable[[_Said, float], Any]) -> Callable[[Context, BasicVector], None]:
-    def calc(context: Context, output: BasicVector) -> None:
-        output.SetFromVector(np.atleast_1d(value(_said(context), context.get_time())).astype(float))
-
-    return calc
+        _Said.of(context).taking(*self._inbox.receive(), "PX4", after).keep(state)
 
 
 def _state(said: _Said) -> np.ndarray:
     if said.position is None or said.attitude is None:
         return hover_state(np.zeros(3))
     return QuadrotorState(*said.position, *said.attitude).to_vector()
-
-
-def _refused(said: _Said, count: int, why: str) -> _Said:
-    total = said.rejected + count
-    if total.bit_length() != said.rejected.bit_length():
-        _log.warning("PX4: a packet is refused, %d so far: %s", total, why)
-    return replace(said, rejected=total)
-
-
-def _said(context: Context) -> _Said:
-    return cast(_Said, context.get_abstract_state(0).get_value())

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.ports import input_port, optional_input, output_port
 from splatpilot.systems.vehicle.flatness import (
     attitude_error,
     attitude_from_thrust,
@@ -214,8 +214,8 @@ class FlatnessController(LeafSystem):
 
     def _heading(self, context: Context) -> float:
         """The heading asked for [rad], or NaN."""
-        port = self.GetInputPort("heading")
-        return float(np.asarray(port.Eval(context))[0]) if port.HasValue(context) else math.nan
+        heading = optional_input(self, "heading", context)
+        return math.nan if heading is None else float(heading[0])
 
     def _eval_finite(self, name: str, context: Context) -> np.ndarray:
         value = np.asarray(self.GetInputPort(name).Eval(context))

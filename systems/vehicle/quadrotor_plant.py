@@ -16,6 +16,7 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import (
     component_derivatives,
     hover_state,
 )
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 
 @TemplateSystem.define("QuadrotorPlant_")
@@ -34,7 +35,8 @@ def QuadrotorPlant_(T):
         - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, c the thrust over mass along
           body +z.
         - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``,
-          continuous; at the default Context a level hover at the world's origin.
+          continuous; at the default Context ``initial_state``, a level hover at the world's
+          origin where none is given.
         - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
 
         The equations are those of
@@ -44,24 +46,33 @@ def QuadrotorPlant_(T):
         the solution and ``runge_kutta5``, at twice the cost, within 0.2 mm.
 
         Raises:
-            ValueError: if a parameter is out of range, see :class:`QuadrotorParams`.
+            ValueError: if a parameter is out of range, see :class:`QuadrotorParams`, or the initial
+                state has another shape.
         """
 
         command_input_port = input_port("command")
         state_output_port = output_port("state")
 
-        def _construct(self, params: QuadrotorParams | None = None, converter=None):
+        def _construct(
+            self,
+            params: QuadrotorParams | None = None,
+            initial_state: np.ndarray | None = None,
+            converter=None,
+        ):
             super().__init__(converter=converter)
             params = params or QuadrotorParams()
             params.validate()
             self._defaults = astuple(params)
             self.DeclareNumericParameter(BasicVector_[T](list(self._defaults)))
             self.DeclareVectorInputPort("command", 4)
-            index = self.DeclareContinuousState(BasicVector_[T](hover_state([0.0, 0.0, 0.0])))
+            start = hover_state([0.0, 0.0, 0.0]) if initial_state is None else initial_state
+            self._start = QuadrotorState.of(np.asarray(start, dtype=float)).to_vector()
+            index = self.DeclareContinuousState(BasicVector_[T](self._start))
             self.DeclareStateOutputPort("state", index)
 
         def _construct_copy(self, other, converter=None):
-            Impl._construct(self, QuadrotorParams(*other._defaults), converter=converter)
+            params = QuadrotorParams(*other._defaults)
+            Impl._construct(self, params, other._start, converter=converter)
 
         def DoCalcTimeDerivatives(self, context, derivatives):
             # Lists, because arithmetic on Python floats is several times faster than on numpy's.

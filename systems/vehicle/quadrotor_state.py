@@ -29,6 +29,12 @@ class QuadrotorState(NamedTuple):
             raise ValueError(f"a state has shape {tuple(x.shape)}; it must be (..., 13)")
         return cls(x[..., 0:3], x[..., 3:6], x[..., 6:10], x[..., 10:13])
 
+    @property
+    def tilt(self) -> np.ndarray:
+        """(...) [rad], between body z and vertical, of parts that are numpy arrays of float."""
+        w, x, y, z = np.moveaxis(self.q_WB, -1, 0)
+        return np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))
+
     def to_vector(self) -> np.ndarray:
         """The states (..., 13) of these parts, numpy arrays."""
         return np.concatenate(self, axis=-1)

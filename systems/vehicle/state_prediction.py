@@ -8,6 +8,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
+LONGEST_PREDICTION = 0.1
+"""[s], how old states can be brought up to date."""
+
 
 def predict_state(state: np.ndarray, duration: float) -> np.ndarray:
     """The state (13,) `duration` [s] later, if neither velocity nor body rates change meanwhile."""
@@ -44,7 +47,7 @@ class StatePredictor(LeafSystem):
     age_input_port = input_port("age")
     state_output_port = output_port("state")
 
-    def __init__(self, longest: float = 0.1):
+    def __init__(self, longest: float = LONGEST_PREDICTION):
         """Constructs the system; `longest` is how far it predicts [s]."""
         super().__init__()
         self._longest = longest

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -73,18 +74,47 @@ def test_written_scenario_gives_the_same_flight_again(tmp_path):
     assert trajectories[0] == trajectories[1]
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"], ["fly", "--help"]])
-def test_help_imports_nothing_heavy(words):
-    """Help and version come at once: no package that takes long to load is imported for them."""
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ("--help", 0),
+        ("--version", 0),
+        ("fly --help", 0),
+        ("fly --nonsense", 2),
+        ("fly --policy nobody", 1),
+        ("fly --policy nobody.npz", 1),
+        ("fly --scenario P99", 1),
+        ("fly --scene nowhere", 1),
+        ("bridge --hardware nowhere.yaml", 1),
+        ("benchmark --out study --policies planner,nobody", 1),
+        ("benchmark --out study --scenarios P02,nowhere.yaml", 1),
+        ("replay nowhere id", 1),
+        ("reconstruct nowhere --out scene", 1),
+        ("capture check nowhere", 1),
+        ("capture render nowhere.gltf --out capture", 1),
+        ("tour nowhere.gltf --out tour", 1),
+        ("measure nowhere", 1),
+        ("train nobody --out run", 1),
+        ("corpus inspect nowhere --out sheet.png", 1),
+    ],
+)
+def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path):
+    """Help and version come at once, and so does the answer to a wrong name or path: no package
+    that takes long to load is imported for them, and nothing is written."""
     script = (
         "import sys; from splatpilot.analysis.cli import main\n"
-        f"try: main({words})\n"
-        "except SystemExit: print(*{name.partition('.')[0] for name in sys.modules})"
+        f"try: status = main({words.split()})\n"
+        "except SystemExit as ended: status = ended.code\n"
+        "print(status, *{name.partition('.')[0] for name in sys.modules})"
     )
-    printed = subprocess.run(
-        [sys.executable, "-c", script], check=True, capture_output=True, text=True
-    ).stdout
-    loaded = set(printed.splitlines()[-1].split())
+    ended = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True, cwd=tmp_path
+    )
+    found, *loaded = ended.stdout.splitlines()[-1].split()
+    assert int(found) == status
+    assert status == 0 or "splatpilot" in ended.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+    loaded = set(loaded)
     assert "splatpilot" in loaded
     assert not loaded & {"numpy", "pydrake", "scipy", "torch", "matplotlib", "cv2", "yaml", "tqdm"}
 
@@ -209,3 +239,25 @@ def test_fly_by_the_names_of_the_benchmark(tmp_path):
     scenario = load_config(Scenario(), out / "scenario.yaml")
     assert scenario.policy == StraightConfig(speed=1.5)
     assert np.load(out / "trajectory.npz")["hypotheses"].shape == (0, 0)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signals_end_with_one_line(number, status, tmp_path):
+    """A flight that is ended from outside says so in one line, and leaves no half of anything."""
+    out = tmp_path / "flight"
+    script = (
+        "import signal, sys; from splatpilot.analysis.cli import main\n"
+        # Shells have what runs in their background ignore it.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"sys.exit(main(['fly', '--out', {str(out)!r}]))"
+    )
+    flying = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert flying.stdout is not None and flying.stderr is not None
+    assert flying.stdout.readline().startswith("Building the world")
+    flying.send_signal(number)
+    said = flying.stderr.read()
+    assert flying.wait(60) == status
+    assert said.splitlines()[-1].startswith("splatpilot: ") and "Traceback" not in said
+    assert not out.exists() or not list(out.iterdir())

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.flight import Outcome, flight_outcome, fly, sample_initial_state
+from splatpilot.diagrams.flight import Outcome, flight_outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world

@@ -12,8 +12,9 @@ import pytest
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from splatpilot.diagrams.flight import fly, sample_initial_state
+from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
 from splatpilot.diagrams.policies import policy_named

@@ -6,7 +6,14 @@ from pydrake.geometry import Meshcat
 
 from splatpilot.diagrams.flight import Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES, policy_named
+from splatpilot.diagrams.policies import (
+    BENCHMARK_POLICIES,
+    POLICIES,
+    at_speed,
+    name_of,
+    policy_named,
+    speed_of,
+)
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.policies.depthnav import DepthNavConfig
 from splatpilot.systems.policies.depthnav_inference import DEPTHNAV_NETWORK
@@ -70,3 +77,18 @@ def test_file_of_weights_is_a_policy(tmp_path):
     (tmp_path / "text.npz").write_text("nothing")
     with pytest.raises(ValueError, match=r"text.npz holds no weights"):
         policy_named(str(tmp_path / "text.npz"))
+
+
+@pytest.mark.parametrize("name", POLICIES.registered())
+def test_speed_is_set_where_the_configuration_keeps_it(name):
+    """Every policy that can be asked for a speed says the one that it was asked for, and nothing
+    else of it changes; the others, which fly as they have learned, refuse."""
+    config = policy_named(name)
+    assert name_of(config) == name
+    if speed_of(config) is None:
+        with pytest.raises(ValueError, match=rf"{name} flies as fast as it has learned"):
+            at_speed(config, 3.0)
+        return
+    faster = at_speed(config, 3.0)
+    assert (speed_of(config), speed_of(faster)) == (2.0, 3.0)
+    assert at_speed(faster, 2.0) == config

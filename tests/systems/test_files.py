@@ -4,6 +4,8 @@ import pytest
 
 from splatpilot.systems.files import (
     folder_written_atomically,
+    require_existing,
+    require_unused,
     require_writable_folder,
     written_atomically,
 )
@@ -69,3 +71,22 @@ def test_folders_that_fail_are_not_there_and_others_stay(tmp_path):
         (path / "file").write_text("theirs")
     assert (path / "file").read_text() == "theirs"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_there_is_used_only_if_it_may_be_overwritten(tmp_path):
+    """Files, and folders that hold anything, are refused with the remedy; empty folders are not."""
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    for unused in ("empty", "nothing"):
+        require_unused(tmp_path / unused, overwrite=False)
+    for used in (tmp_path / "file", tmp_path):
+        with pytest.raises(FileExistsError, match=r"is there already; .* --overwrite"):
+            require_unused(used, overwrite=False)
+        require_unused(used, overwrite=True)
+
+
+def test_what_must_be_there_is_named(tmp_path):
+    """A path that leads nowhere is said with what is needed."""
+    require_existing(tmp_path, "a folder")
+    with pytest.raises(FileNotFoundError, match=r"nowhere: there is no .*; a scene is needed"):
+        require_existing(tmp_path / "nowhere", "a scene")

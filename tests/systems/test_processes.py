@@ -1,5 +1,8 @@
 import os
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -34,3 +37,35 @@ def test_killed_process_is_named_and_the_next_call_works(tmp_path):
     with pytest.raises(OSError, match=r"was killed.*run the same command again, with fewer --jobs"):
         list(map_processes(_killed, [tmp_path] * 3, jobs=2))
     assert list(map_processes(_killed, [tmp_path] * 3, jobs=2)) == ["ended"] * 3
+
+
+def _is_running(pid: int) -> bool:
+    """Whether there is such a process that has not ended; Linux's /proc tells."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
+def test_processes_end_with_a_parent_that_is_killed(tmp_path):
+    """Neither one at work nor one that waits for more outlives a parent that could not tell it."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, pathlib, time\n"
+        "from splatpilot.systems.processes import map_processes\n"
+        "def work(seconds):\n"
+        f"    (pathlib.Path({str(tmp_path)!r}) / f'{{os.getpid()}}.worker').touch()\n"
+        "    time.sleep(seconds)\n"
+        "list(map_processes(work, [600.0, 0.2, 0.2], jobs=2))\n"
+    )
+    parent = subprocess.Popen([sys.executable, script])
+    deadline = time.monotonic() + 120.0
+    while len(workers := [int(p.stem) for p in tmp_path.glob("*.worker")]) < 2:
+        assert parent.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    parent.kill()
+    parent.wait()
+    while any(map(_is_running, workers)):
+        assert time.monotonic() < deadline, "a worker outlived its parent"
+        time.sleep(0.1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from splatpilot.systems.registry import Registry, import_modules
+from splatpilot.systems.registry import Registry, check_name, import_modules
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,10 @@ def test_announced_kinds_are_there(registry, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "test_registry_doubles", sys.modules[Kind.__module__])
     monkeypatch.syspath_prepend(tmp_path)
     assert registry.names() == ["one", "far"]
+    for name in ("one", "far", "module:Class"):
+        check_name("thing", "splatpilot.test_things", name, ["one"])
+    with pytest.raises(ValueError, match=r"no thing 'two'; there are one, far, and module:attr"):
+        check_name("thing", "splatpilot.test_things", "two", ["one"])
     assert "announcer" not in sys.modules
     assert [config.__name__ for config in registry.configs({"FarConfig"})] == [
         "OneConfig",

@@ -86,14 +86,11 @@ def run(*, capture: str | Path, config: CheckConfig) -> CheckReport:
 
     Raises:
         FileNotFoundError, OSError: if files are missing.
-        ValueError: if the capture is damaged, cannot be compared, or does not agree; the message
-            is then the most likely mistake.
+        ValueError: if the capture is damaged or cannot be compared.
     """
     config.validate()
     report = check_capture(read_capture(capture, config.capture), config.pairs)
     print(report)
-    if not report.agrees:
-        raise ValueError(f"{capture}: {report.mistake}")
     return report
 
 

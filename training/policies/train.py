@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.torch_threads import one_torch_thread
+from splatpilot.training.device import require_device
 from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
 from splatpilot.training.policies.trainer import FLIGHTS, Trainer, TrainingConfig
@@ -60,6 +61,7 @@ def run[Config: TrainingConfig](
         OSError: if `out` cannot be written.
     """
     config.validate()
+    require_device(config.device)
     folder = RunFolder.claim(out, config)
     schedule = config.schedule
     started = time.process_time()

@@ -1,5 +1,6 @@
 """Flights that fail, and faults that are no failures of flights."""
 
+import json
 from dataclasses import dataclass, replace
 
 import pytest
@@ -33,6 +34,12 @@ def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys,
     table = benchmark.run(config=config, out=tmp_path / "far", jobs=1)
     assert [row["infeasible"] for row in table] == [1, 1]
     assert "short-straight-2-000 could not be flown: goal" in capsys.readouterr().out
+    words = ["--scenarios", str(short_scenario), "--policies", "straight,planner", "--seeds", "1"]
+    words += ["--out", str(tmp_path / "far"), "--set", *config.overrides, "--json"]
+    assert main(["benchmark", *words]) == 1  # No flight is no success,
+    printed = capsys.readouterr()
+    assert "none of the flights could be flown" in printed.err
+    assert [row["infeasible"] for row in json.loads(printed.out)] == [1, 1]  # but a result.
     with pytest.raises(ValueError, match=r"could not be flown .* is outside the world"):
         replay.run(study=tmp_path / "far", id="short-straight-2-000")
 

@@ -43,8 +43,8 @@ def test_variants_are_read(text, variant):
         (".=reactive", "labelled '.'"),
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),
-        ("a=reactive:speed=3", "all policies fly at those of --speeds"),
-        ("a=planner:lattice.speed=3", "all policies fly at those of --speeds"),
+        ("a=reactive:speed=3", "say how fast all policies fly"),
+        ("a=planner:lattice.speed=3", "say how fast all policies fly"),
         ("a=diffaero:weights=x.npz", "LABEL=FILE.npz"),
     ],
 )

@@ -81,7 +81,7 @@ def test_what_is_no_frame_is_counted(caplog):
     pose, _, rejected = stream.after(0.02)
     np.testing.assert_array_equal(pose, before)
     assert rejected == 5
-    assert "motion capture: a packet is refused, 1 so far" in caplog.text
+    assert "motion capture: a message is refused, 1 so far" in caplog.text
 
 
 def test_a_multicast_group_is_joined_where_one_is_named():

@@ -62,4 +62,4 @@ def test_state_needs_position_and_attitude(inbox, caplog):
     simulator.AdvanceTo(0.3)
     np.testing.assert_array_equal(out("state"), before)
     assert out("rejected")[0] == 3
-    assert "PX4: a packet is refused" in caplog.text
+    assert "PX4: a message is refused" in caplog.text

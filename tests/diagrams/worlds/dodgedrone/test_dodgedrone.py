@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.flight import sample_initial_state
+from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import scenario_file
 from splatpilot.diagrams.sensors import make_camera

@@ -1,0 +1,85 @@
+"""What a machine is said to have and to lack."""
+
+import shutil
+from importlib.metadata import PackageNotFoundError
+
+import pytest
+
+from splatpilot.analysis import doctor
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.systems import opengl
+from splatpilot.systems.extras import packages_of_extras
+from splatpilot.systems.messaging import open_lcm
+
+
+def only(findings: list[doctor.Finding]) -> doctor.Finding:
+    (finding,) = findings
+    return finding
+
+
+def test_what_is_there_needs_no_remedy(monkeypatch):
+    """Where drivers and routes answer, they are listed as found."""
+    monkeypatch.setattr(opengl, "require_opengl", lambda: None)
+    monkeypatch.setattr(open_lcm, "open_lcm", lambda: None)
+    for check in (doctor._program, doctor._processor, doctor._opengl, doctor._messages):
+        assert only(check()).remedy == ""
+    assert "SIMD levels v" in only(doctor._processor()).found
+    assert only(doctor._video()).found.startswith("H.264")
+
+
+def test_what_lacks_has_one_remedy(monkeypatch):
+    """Each error's remedy, and the extra or package to install, is said with what it is for."""
+
+    def fails() -> None:
+        raise OSError("there is no route; ip route add 224.0.0.0/4 dev lo")
+
+    def absent(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(opengl, "require_opengl", fails)
+    monkeypatch.setattr(open_lcm, "open_lcm", fails)
+    for check in (doctor._opengl, doctor._messages):
+        finding = only(check())
+        assert finding.found == "there is no route" and finding.serves
+        assert finding.remedy == "ip route add 224.0.0.0/4 dev lo"
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert only(doctor._browser()).remedy == "apt install chromium"
+    monkeypatch.setattr(doctor, "version", absent)
+    remedies = {finding.what: finding.remedy for finding in doctor._extras()}
+    assert remedies == {
+        f"extra {extra}": f"pip install 'splatpilot[{extra}]'"
+        for extra in packages_of_extras()
+        if extra != "cuda"
+    }
+
+
+def test_folders_are_found_through_their_variables(tmp_path, monkeypatch):
+    """Scenes are told by the scenarios that they serve; data by what lies in their folder."""
+    (tmp_path / "hospital").mkdir()
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
+    scenes = only(doctor._scenes())
+    there = [name for name in benchmark_scenarios() if name in scenes.found]
+    assert there == ["R13"] and "R13" not in scenes.serves
+    assert "R14" in scenes.serves and "SPLATPILOT_SCENES" in scenes.remedy
+    monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
+    assert only(doctor._data()) == doctor.Finding("data", f"{tmp_path}: hospital")
+    monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path / "nowhere"))
+    assert "is no folder" in only(doctor._data()).found
+    monkeypatch.delenv("SPLATPILOT_DATA")
+    assert "is not set" in only(doctor._data()).found
+
+
+@pytest.mark.parametrize("driver", [False, True])
+def test_a_gpu_that_pytorch_cannot_use_is_told_from_none(driver, monkeypatch, tmp_path):
+    """With a driver another PyTorch is needed, without one the driver is."""
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(doctor, "_DRIVER", tmp_path if driver else tmp_path / "nowhere")
+    assert ("PyTorch" in only(doctor._gpu()).remedy) == driver
+
+
+def test_each_finding_is_a_line_and_each_remedy_another():
+    """What is there begins with a plus, what lacks with a minus."""
+    findings = [doctor.Finding("a", "there"), doctor.Finding("long", "no", "do this", "that")]
+    lines = doctor.format_findings(findings).splitlines()
+    assert lines == ["+ a     there", "- long  no", "        for that: do this"]
