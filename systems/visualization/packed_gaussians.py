@@ -23,7 +23,9 @@ def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
     words[:, 3] = np.round(255 * shades).astype(np.uint8).view(np.uint32)[:, 0]
     axes = scene.rotations * scene.scales[:, None, :]
     covariances = _COVARIANCE_SCALE * axes @ axes.transpose(0, 2, 1)
-    rows, columns = np.triu_indices(3)
-    halves = np.minimum(covariances[:, rows, columns], np.finfo(np.float16).max)
+    # What is larger than a half holds shrinks as a whole, and stays an ellipsoid.
+    largest = np.abs(covariances).max(axis=(1, 2), keepdims=True)
+    covariances *= np.minimum(1, np.finfo(np.float16).max / np.maximum(largest, 1e-30))
+    halves = covariances[(slice(None), *np.triu_indices(3))]
     words[:, 4:7] = np.ascontiguousarray(halves, np.float16).view(np.uint32)
     return words

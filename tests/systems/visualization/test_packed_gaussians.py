@@ -33,3 +33,18 @@ def test_words_hold_centres_shades_and_covariances():
         packed = covariance[np.triu_indices(3)]
         np.testing.assert_allclose(row, packed, atol=2**-11 * np.abs(packed).max() + 1e-9)
     assert (words[:, 7] == 0).all()
+
+
+def test_what_no_half_holds_shrinks_as_a_whole():
+    """A disc of 60 m, turned so that its covariance has large negative entries, keeps its shape."""
+    scene = GaussianScene.from_colors(
+        means=np.zeros((1, 3)),
+        quats=[[np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)]],  # -45 degrees about z
+        scales=[[60.0, 30.0, 1.0]],
+        opacities=[0.5],
+        colors=[[0.5, 0.5, 0.5]],
+    )
+    xx, xy, _, yy, _, zz = pack_gaussians(scene)[0, 4:7].copy().view(np.float16).astype(float)
+    assert xx == yy == np.finfo(np.float16).max
+    # (3600 - 900) / (3600 + 900) is 3/5, with the sign of the turn; 1 / 2250 is left of z.
+    np.testing.assert_allclose([xy / xx, zz / xx], [-0.6, 1 / 2250], rtol=2e-3)
