@@ -108,6 +108,8 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
     for module in (capture_of_scene, ablation):
         monkeypatch.setattr(module, "read_capture", read_capture)
     monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
+    (tmp_path / "captures" / "room").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "captures")
     return Place(gaussians, capture, tmp_path)
 
 

@@ -146,7 +146,8 @@ def test_withheld_stretches(place):
 )
 def test_bad_settings(place, capsys, setting, message):
     """Settings that make no sense are refused before any work."""
-    assert main(["fidelity", "scene", "--out", str(place.folder / "out"), "--set", setting]) == 1
+    scene, out = place.scene("scene"), place.folder / "out"
+    assert main(["fidelity", str(scene), "--out", str(out), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 

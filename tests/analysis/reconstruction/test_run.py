@@ -98,6 +98,6 @@ def test_refusals(tmp_path, config, capsys):
         run(capture=tmp_path, out=tmp_path / "scene", config=config)
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
         run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=config)
-    words = ["reconstruct", "nowhere", "--out", str(tmp_path / "scene"), "--iterations", "5"]
+    words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "scene"), "--iterations", "5"]
     assert main([*words, "--set", "iterations=6"]) == 1
     assert "iterations are given by --iterations and by --set" in capsys.readouterr().err
