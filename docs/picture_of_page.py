@@ -1,8 +1,7 @@
-"""A picture of a page: two views side by side, or a moving one that follows the vehicle.
+"""A picture of a page: two views side by side.
 
     splatpilot fly --seed 7 --out out/fly
     python docs/picture_of_page.py out/fly/flight.html docs/page.jpg
-    python docs/picture_of_page.py out/fly/flight.html docs/flight.webp
     splatpilot view scenes/bookstore --out out/bookstore.html
     python docs/picture_of_page.py out/bookstore.html docs/place.jpg
 
@@ -19,12 +18,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
-from tqdm import tqdm
 
 SETTLED = "(window.replay || window.view)?.splats.settled && !viewer.needs_render"
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-RATE = 5
-"""[1/s], pictures of a moving one."""
 
 
 @contextmanager
@@ -57,7 +53,7 @@ def photograph_place(tab: Page, distances: bool) -> Image.Image:
     return Image.open(BytesIO(tab.screenshot())).convert("RGB")
 
 
-def write_still(page: Path, out: Path, time: float) -> None:
+def write(page: Path, out: Path, time: float) -> None:
     """Two views of the page at a time [s], side by side; of a place, with and without distances."""
     with opened(page, 1000, 620) as tab:
         if tab.evaluate("() => 'view' in window"):
@@ -68,23 +64,10 @@ def write_still(page: Path, out: Path, time: float) -> None:
     picture.resize((1600, 496), Image.Resampling.LANCZOS).save(out, quality=82)
 
 
-def write_moving(page: Path, out: Path) -> None:
-    """The whole flight, following the vehicle."""
-    with opened(page, 720, 450) as tab:
-        times = np.arange(0, tab.evaluate("replay.duration"), 1 / RATE)
-        pictures = [photograph(tab, "chase", time) for time in tqdm(times, unit="picture")]
-    pictures[0].save(
-        out, save_all=True, append_images=pictures[1:], duration=1000 // RATE, loop=0, quality=60
-    )
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("page", type=Path)
-    parser.add_argument("out", type=Path, help=".webp for a moving picture")
-    parser.add_argument("--time", type=float, default=6.0, help="[s] of the still (%(default)s)")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--time", type=float, default=6.0, help="[s] (%(default)s)")
     options = parser.parse_args()
-    if options.out.suffix == ".webp":
-        write_moving(options.page, options.out)
-    else:
-        write_still(options.page, options.out, options.time)
+    write(options.page, options.out, options.time)

@@ -1,6 +1,6 @@
 """Makes the pictures of the documentation of what the program leaves; `pictures.md` has commands.
 
-python docs/pictures.py moments out/fly/flight.mp4 docs/flight.jpg
+python docs/pictures.py moving out/fly/flight.mp4 docs/flight.webp
 """
 
 import argparse
@@ -42,6 +42,13 @@ def moments(video: Path, out: Path) -> None:
         np.vstack(np.hsplit(shown[round(part * (len(shown) - 1))], 2)) for part in (0.25, 0.5, 0.75)
     ]
     save(np.hstack(columns), out)
+
+
+def moving(video: Path, out: Path) -> None:
+    """A whole flight, colour beside depth, in every third of its pictures."""
+    rate = cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FPS) / 3
+    first, *others = [Image.fromarray(shrunk(frame, 800)) for frame in frames(video)[::3]]
+    first.save(out, save_all=True, append_images=others, duration=1000 / rate, loop=0, quality=50)
 
 
 def worlds(out: Path) -> None:
@@ -108,6 +115,7 @@ def save(picture: Picture, out: Path) -> None:
 
 KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
     "moments": (moments, ["video"]),
+    "moving": (moving, ["video"]),
     "worlds": (worlds, []),
     "row": (row, ["left", "right"]),
     "column": (column, ["upper", "lower"]),
@@ -118,7 +126,7 @@ KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
 
 
 def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     kinds = parser.add_subparsers(dest="kind", required=True)
     for name, (make, files) in KINDS.items():
         kind = kinds.add_parser(name, help=make.__doc__)
