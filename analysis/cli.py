@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import logging
 import os
 import signal
 import sys
@@ -83,6 +84,7 @@ def main(arguments: list[str] | None = None) -> int:
         import argcomplete
 
         argcomplete.autocomplete(parser)
+    logging.getLogger("drake").setLevel(logging.WARNING)
     verb = "splatpilot"
     try:
         with _ended_by_sigterm():

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 from tqdm import tqdm
 
@@ -17,18 +16,16 @@ from splatpilot.diagrams.flight_page import (
     recorded_frames,
     replayed_flight,
     write_flight_page,
+    write_live_page,
 )
 from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.meshcat import open_meshcat
-from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.systems.visualization.live_page import live_page
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
 
@@ -77,8 +74,7 @@ def run(
     meshcat = open_meshcat(scenario, world) if live else None
     if meshcat is not None:
         page = out / "live.html"
-        with written_atomically(page) as path:
-            path.write_text(_live_page(meshcat, scenario, world))
+        write_live_page(page, meshcat, scenario, world)
         print(
             f"Watch the flight: open {page}, or {meshcat.web_url()} without Gaussians", flush=True
         )
@@ -140,16 +136,6 @@ def format_summary(summary: dict[str, float | str]) -> str:
         ("render", "render_ms", "{:.1f} ms"),
     )
     return "\n".join(f"{title:<18} {form.format(summary[key])}" for title, key, form in rows)
-
-
-def _live_page(meshcat: Meshcat, scenario: Scenario, world: World) -> str:
-    """The page of a flight that goes on, seen from above at first as the page of a finished one."""
-    field = world.distance_field
-    lower, upper = (float(np.asarray(corner)[2]) for corner in (field.lower_W, field.upper_W))
-    start = world.p_WS if scenario.start is None else scenario.start
-    cut = max(start[2], goal_of(scenario, world)[2]) + 2 * VEHICLE_RADIUS
-    heights = lower, upper
-    return live_page(meshcat, world.gaussians, world.background, heights, min(cut, upper))
 
 
 def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:

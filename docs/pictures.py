@@ -1,17 +1,21 @@
 """Makes the pictures of the documentation of what the program leaves; `pictures.md` has commands.
 
 python docs/pictures.py moving out/fly/flight.mp4 docs/flight.webp
+
+Pages need a Chromium on the PATH, without a display.
 """
 
 import argparse
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 from pydrake.systems.sensors import CameraConfig
 
 from splatpilot.diagrams.flight_diagram import MakeCamera
@@ -88,18 +92,52 @@ def sheet(picture: Path, out: Path) -> None:
 
 
 def report(html: Path, out: Path) -> None:
-    """The whole of a report, in Debian's Chromium."""
+    """The whole of a report."""
+    with opened(html, 1000, 800) as tab:
+        tab.screenshot(path=out, full_page=True, type="jpeg", quality=80)
+
+
+def flight(html: Path, out: Path) -> None:
+    """The page of a flight 6 s after its start, from above and following the vehicle."""
+    scripts = [f"replay.look('{view}'); replay.seek(6)" for view in ("overview", "chase")]
+    save(splat_page(html, scripts), out)
+
+
+def place(html: Path, out: Path) -> None:
+    """The page of a place, with a captured image, and with distances."""
+    save(splat_page(html, ["view.choose(27)", "view.switches.slice(true)"]), out)
+
+
+def splat_page(html: Path, scripts: list[str]) -> Picture:
+    """A page of Gaussians after each of the scripts, side by side."""
+    settled = "(window.replay || window.view)?.splats.settled && !viewer.needs_render"
+    views = []
+    with opened(html, 1000, 620) as tab:
+        tab.wait_for_function(settled)
+        for script in scripts:
+            tab.evaluate(f"() => {{ {script}; }}")
+            tab.wait_for_timeout(1000)
+            tab.wait_for_function(settled)
+            views.append(load(BytesIO(tab.screenshot())))
+    return shrunk(np.hstack(views), 1600)
+
+
+@contextmanager
+def opened(html: Path, width: int, height: int) -> Iterator[Page]:
+    """A page in a browser of that size [px]."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
-            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+            executable_path=shutil.which("chromium"),
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
         )
-        tab = browser.new_page(viewport={"width": 1000, "height": 800})
+        tab = browser.new_page(viewport={"width": width, "height": height})
+        tab.set_default_timeout(300_000)
         tab.goto(html.resolve().as_uri())
-        tab.screenshot(path=out, full_page=True, type="jpeg", quality=80)
+        yield tab
         browser.close()
 
 
-def load(path: Path) -> Picture:
+def load(path: Path | BytesIO) -> Picture:
     return np.array(Image.open(path).convert("RGB"))
 
 
@@ -121,6 +159,8 @@ KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
     "column": (column, ["upper", "lower"]),
     "sheet": (sheet, ["picture"]),
     "report": (report, ["html"]),
+    "flight": (flight, ["html"]),
+    "place": (place, ["html"]),
 }
 """What is made, and of which files."""
 

@@ -2,9 +2,9 @@
 
     python examples/splats_behind_drake.py --out out/ball.png
 
-A ball of Drake's MultibodyPlant falls in a forest of Gaussians, and an RgbdSensor looks at both.
-What is particular to splats is the line `AddRenderer`; the rest is a simulation like any other.
-Shapes are drawn by RenderEngineVtk, which needs OpenGL (see the README) but no display.
+A ball of Drake's MultibodyPlant is thrown through a forest of Gaussians, and an RgbdSensor looks at
+both: trunks hide the ball, and the ball hides trunks. What is particular to splats is the line
+`AddRenderer`. Shapes are drawn by RenderEngineVtk, which needs OpenGL (see the README).
 """
 
 import argparse
@@ -21,6 +21,7 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
@@ -39,8 +40,6 @@ def main(out: Path, width: int, seconds: float) -> None:
     ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.2))
     red = np.array([0.8, 0.1, 0.1, 1.0])
     plant.RegisterVisualGeometry(ball, RigidTransform(), Sphere(0.2), "ball", red)
-    p_WB = world.p_WS + np.array([2.5, 0.0, 0.5])
-    plant.SetDefaultFloatingBaseBodyPose(ball, RigidTransform(p_WB))
     plant.Finalize()
 
     splats = sp.SplatRenderEngine(world.baked, background=world.background)
@@ -56,6 +55,10 @@ def main(out: Path, width: int, seconds: float) -> None:
     builder.Connect(scene_graph.get_query_output_port(), camera.query_object_input_port())
     simulator = Simulator(builder.Build())
 
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    p_WB, v_WB = world.p_WS + np.array([4.0, 2.5, -0.5]), [0.0, -3.0, 4.0]
+    plant.SetFloatingBaseBodyPoseInWorldFrame(context, ball, RigidTransform(p_WB))
+    plant.SetFreeBodySpatialVelocity(context, ball, SpatialVelocity(np.zeros(3), v_WB))
     simulator.AdvanceTo(seconds)
     context = camera.GetMyContextFromRoot(simulator.get_context())
     image = camera.color_image_output_port().Eval(context).data
@@ -68,5 +71,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("ball.png"))
     parser.add_argument("--width", type=int, default=640, help="of the image [px]")
-    parser.add_argument("--seconds", type=float, default=0.3, help="until it is taken")
+    parser.add_argument("--seconds", type=float, default=0.5, help="until it is taken")
     main(**vars(parser.parse_args()))

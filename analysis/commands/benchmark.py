@@ -1,7 +1,6 @@
 """`splatpilot benchmark`."""
 
 import argparse
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +100,6 @@ def _benchmark(options: argparse.Namespace) -> Any:
     from splatpilot.analysis.benchmark.shard import Shard
     from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     config = StudyConfig(overrides=options.overrides)
     if options.quick:
         config.scenarios, config.policies = list(QUICK_SCENARIOS), list(QUICK_POLICIES)

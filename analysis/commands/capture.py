@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_world
+from splatpilot.analysis.commands.checks import check_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import FailureWithResultError, add_json, add_verb
 from splatpilot.systems.files import require_existing
@@ -95,7 +95,7 @@ def _render_defaults(options: argparse.Namespace) -> Any:
 
 
 def _render(options: argparse.Namespace) -> None:
-    check_world(options.world)
+    check_place(options.world, "a .gltf, an .obj or a scenario")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import render_capture
 

@@ -86,10 +86,11 @@ def check_config(path: Path | None) -> None:
         require_existing(path, "a YAML file of a configuration")
 
 
-def check_world(world: Path) -> None:
+def check_place(place: Path, what: str) -> None:
     """
     Raises:
-        FileNotFoundError: unless it is a file, or the name of a scenario.
+        FileNotFoundError: unless it is a file, a folder or the name of a scenario; the message says
+            that `what` is needed.
     """
-    if str(world) not in benchmark_scenarios():
-        require_existing(world, "a .gltf, an .obj or a scenario")
+    if str(place) not in SCENARIOS:
+        require_existing(place, what)

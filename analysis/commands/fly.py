@@ -1,7 +1,6 @@
 """`splatpilot fly`."""
 
 import argparse
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,6 @@ def _fly(options: argparse.Namespace) -> Any:
 
     from splatpilot.diagrams import fly
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     return fly.run(
         scenario=scenario,
         out=options.out or Path("out") / name_of_flight(options, scenario),

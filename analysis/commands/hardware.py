@@ -1,7 +1,6 @@
 """`splatpilot vehicle`, `splatpilot bridge` and `splatpilot px4`."""
 
 import argparse
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -99,7 +98,6 @@ def _px4(options: argparse.Namespace) -> None:
     from splatpilot.diagrams import px4
     from splatpilot.systems.configuration import load_config
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     config = load_config(_px4_defaults(options), options.config, options.overrides)
     if options.lcm_url is not None:
         config.url = options.lcm_url
@@ -112,7 +110,6 @@ def _config(options: argparse.Namespace):
     from splatpilot.diagrams.hardware_config import HardwareConfig
     from splatpilot.systems.configuration import load_config
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     given = {"url": options.lcm_url, "patience": options.patience}
     given = {name: value for name, value in given.items() if value is not None}
     return replace(load_config(HardwareConfig(), options.hardware), **given)

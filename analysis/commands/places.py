@@ -1,7 +1,6 @@
 """`splatpilot places`."""
 
 import argparse
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,6 @@ def _places(options: argparse.Namespace) -> None:
         require_existing(data, "the folder of captures and meshes")
     from splatpilot.analysis import places
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     places.run(
         names=options.names,
         data=data,

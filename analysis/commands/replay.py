@@ -1,7 +1,6 @@
 """`splatpilot replay`."""
 
 import argparse
-import logging
 from pathlib import Path
 
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
@@ -38,7 +37,6 @@ def _replay(options: argparse.Namespace) -> None:
     require_existing(options.study, "the folder of a study")
     from splatpilot.analysis.benchmark import replay
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     if len(options.ids) > 1:
         replay.overlay(
             study=options.study, ids=options.ids, out=options.out, overwrite=options.overwrite

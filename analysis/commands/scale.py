@@ -1,7 +1,6 @@
 """`splatpilot scale`."""
 
 import argparse
-import logging
 import re
 from pathlib import Path
 
@@ -47,7 +46,6 @@ def _scale(options: argparse.Namespace) -> None:
     require_existing(options.scene, "a scene folder")
     from splatpilot.analysis.reconstruction import rescale
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     rescale.run(
         scene=options.scene,
         out=options.out,

@@ -1,11 +1,10 @@
 """`splatpilot tour`."""
 
 import argparse
-import logging
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_world
+from splatpilot.analysis.commands.checks import check_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_verb
 
@@ -43,11 +42,10 @@ def _defaults(options: argparse.Namespace) -> Any:
 
 
 def _tour(options: argparse.Namespace) -> None:
-    check_world(options.world)
+    check_place(options.world, "a .gltf, an .obj or a scenario")
     from splatpilot.analysis import tour
     from splatpilot.systems.configuration import load_config
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     config = _defaults(options)
     if options.up is not None:
         config.render.up = options.up

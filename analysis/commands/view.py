@@ -1,11 +1,10 @@
 """`splatpilot view`."""
 
 import argparse
-import logging
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import SCENARIOS
+from splatpilot.analysis.commands.checks import SCENARIOS, check_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_verb
 from splatpilot.diagrams.scenario_files import scenario_file
@@ -39,9 +38,9 @@ def _scenario_defaults(options: argparse.Namespace) -> Any:
 
 
 def _view(options: argparse.Namespace) -> None:
+    check_place(Path(options.what), "a scene folder, a PLY, a capture or a scenario")
     from splatpilot.analysis import view
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
     view.run(
         what=options.what, out=options.out, seed=options.seed, overrides=list(options.overrides)
     )

@@ -200,8 +200,7 @@ class Failsafe(LeafSystem):
         memory, age = _memory(context), self._ages(context)[status.STATE_OLD]
         return age <= self._config.max_age and memory.reason != status.STATE_FROZEN
 
-    def _flown(self, context: Context) -> tuple[np.ndarray, int, int]:
-        """Velocity setpoint (4,), mode and reason."""
+    def _calc_flown(self, context: Context, value: Any) -> None:
         mode, reason = self._mode(context)
         clearance, gradient = (
             optional_input(self, name, context) for name in ("clearance", "gradient")
@@ -215,19 +214,17 @@ class Failsafe(LeafSystem):
         wanted = optional_input(self, "velocity_setpoint", context)
         p_WB = self._state(context).p_WB if self._known(context) else None
         setpoint, limit = flown_setpoint(mode, wanted, p_WB, _memory(context), near, self._config)
-        return setpoint, mode, reason or limit
+        value.set_value((setpoint, mode, reason or limit))
 
-    def _calc_flown(self, context: Context, value: Any) -> None:
-        value.set_value(self._flown(context))
-
-    def _cached(self, context: Context) -> tuple[np.ndarray, int, int]:
+    def _flown(self, context: Context) -> tuple[np.ndarray, int, int]:
+        """Velocity setpoint (4,), mode and reason."""
         return cast(Any, self.get_cache_entry(self._cache).Eval(context))
 
     def _calc_velocity_setpoint(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._cached(context)[0])
+        output.SetFromVector(self._flown(context)[0])
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        setpoint, mode, reason = self._cached(context)
+        setpoint, mode, reason = self._flown(context)
         if mode == status.FLYING and reason == status.NONE:
             output.SetFromVector(np.asarray(self.GetInputPort("command").Eval(context)))
             return
@@ -241,11 +238,10 @@ class Failsafe(LeafSystem):
         output.SetFromVector(flatness_command(state, a_WB, motion, setpoint[3], law, vehicle))
 
     def _calc_mode(self, context: Context, output: BasicVector) -> None:
-        waiting = _memory(context).mode == status.WAITING
-        if waiting:
+        if _memory(context).mode == status.WAITING:
             output.SetFromVector(np.array([status.WAITING, status.NONE], dtype=float))
         else:
-            output.SetFromVector(np.array(self._cached(context)[1:], dtype=float))
+            output.SetFromVector(np.array(self._flown(context)[1:], dtype=float))
 
     def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
         output[0] = float(_memory(context).mode != status.WAITING)

@@ -136,7 +136,7 @@ def test_looking_needs_no_extras():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nowhere"], "there is no scenario 'nowhere'"),
+        (["nowhere"], "nowhere: there is no such file or folder"),
         (["scene", "--seed", "1"], "no generated world"),
         (["scene", "--set", "world.length=3"], "a finished scene has no settings"),
     ],

@@ -58,13 +58,17 @@ def test_flight_by_hand(tmp_path):
 
 
 def test_splats_behind_drake(opengl, tmp_path):
-    """The ball is seen before the forest: a tenth of the image is red, the rest has its colours;
-    and nothing is nearer than the nearest trunk."""
-    run("splats_behind_drake.py", "--width", 160, "--out", tmp_path / "b.png", cwd=tmp_path)
-    image = np.array(cv2.imread(str(tmp_path / "b.png")), dtype=int)
-    red = image[..., 2] > 100 + image[..., :2].max(axis=-1)
-    assert 0.005 < red.mean() < 0.1
-    assert image[~red].std() > 20
+    """A trunk hides the ball, wholly on its way, and then the ball hides a trunk; the rest of the
+    image has the forest's colours."""
+    red = []
+    for seconds in (0.0, 0.2, 0.5):
+        words = "--width", 240, "--seconds", seconds, "--out", tmp_path / "ball.png"
+        run("splats_behind_drake.py", *words, cwd=tmp_path)
+        image = np.array(cv2.imread(str(tmp_path / "ball.png")), dtype=int)
+        is_red = image[..., 2] > 100 + image[..., :2].max(axis=-1)
+        assert image[~is_red].std() > 20
+        red.append(int(is_red.sum()))
+    assert red[1] == 0 and 0 < red[0] < 0.6 * red[2]
 
 
 def test_own_policy(tmp_path):

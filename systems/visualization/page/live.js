@@ -21,13 +21,11 @@ function showLive(splats, {url, lower, upper, cut}) {
   viewer.connection = connection;
 
   const bar = Object.assign(document.createElement("div"), {className: "bar"});
-  const slider = Object.assign(document.createElement("input"), {
-    type: "range", min: lower, max: upper, step: "any", value: cut, id: "live-cut"});
-  slider.oninput = () => {
-    splats.cut = Number(slider.value);
+  const slider = addHeightSlider(bar, "live-cut", lower, upper, (z) => {
+    splats.cut = z;
     viewer.set_dirty();
-  };
+  });
+  slider.value = cut;
   slider.oninput();
-  bar.append("hide above", slider);
   document.body.append(bar);
 }

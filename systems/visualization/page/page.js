@@ -35,6 +35,15 @@ function placeCamera(viewer, pose) {
     .decompose(camera.position, camera.quaternion, camera.scale);
 }
 
+// Adds a slider of heights from `lower` to `upper` [m]; what is above one is to be hidden.
+function addHeightSlider(bar, id, lower, upper, change) {
+  const slider = Object.assign(document.createElement("input"), {
+    type: "range", id, min: lower, max: upper, step: "any"});
+  slider.oninput = () => change(Number(slider.value));
+  bar.append("hide above", slider);
+  return slider;
+}
+
 // Shows the Gaussians and the sky; returns the former and the page's other data.
 async function openPage() {
   const splats = new Splats(viewer, new Uint32Array(await unpack("gaussians")));

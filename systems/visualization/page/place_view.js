@@ -108,10 +108,8 @@ class PlaceView {
         this.splats.shown = this.splats.count - (on ? 0 : data.unknown);
       });
     }
-    add(bar, "span", {textContent: "hide above"});
-    this.slider = add(bar, "input", {
-      type: "range", id: "view-height", min: data.lower[2], max: data.upper[2], step: "any"});
-    this.slider.oninput = () => this.setHeight(Number(this.slider.value));
+    this.slider = addHeightSlider(
+      bar, "view-height", data.lower[2], data.upper[2], (z) => this.setHeight(z));
     this.heightText = add(bar, "span");
     document.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;

@@ -70,10 +70,8 @@ class Replay {
     this.clock = add(bar, "span");
     this.viewButtons = ["overview", "chase", "onboard"].map((name, k) => add(bar, "button", {
       textContent: `${name} (${k + 1})`, id: `replay-${name}`, onclick: () => this.look(name)}));
-    add(bar, "span", {textContent: "hide above"});
-    this.cutSlider = add(bar, "input", {
-      type: "range", id: "replay-cut", min: this.lower, max: this.upper, step: 0.05});
-    this.cutSlider.oninput = () => this.setCut(Number(this.cutSlider.value));
+    this.cutSlider = addHeightSlider(
+      bar, "replay-cut", this.lower, this.upper, (z) => this.setCut(z));
     document.addEventListener("keydown", (event) => this.key(event));
     this.play(false);
   }
