@@ -61,7 +61,7 @@ class DepthNavLoss:
 class DepthNavTraining(RolloutTraining):
     """A training run."""
 
-    schedule: Schedule = field(default_factory=lambda: Schedule(updates=4000, validate_every=500))
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=12000, validate_every=500))
     rollout: RolloutConfig = field(
         default_factory=lambda: RolloutConfig(environments=32, steps=40, averaging=0.5)
     )
