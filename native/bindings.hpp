@@ -143,11 +143,12 @@ inline int32_t radius_of(float extent) {
 }
 
 // Add to the module: the backward pass of Gaussians, the renderer of surfels, the rendering of
-// projected Gaussians, the losses, worlds of shapes, worlds of grids.
+// projected Gaussians, the losses, what fits Gaussians, worlds of shapes, worlds of grids.
 void bind_gradients(nb::module_& m);
 void bind_surfels(nb::module_& m);
 void bind_projected(nb::module_& m);
 void bind_losses(nb::module_& m);
+void bind_fitting(nb::module_& m);
 void bind_shape_worlds(nb::module_& m);
 void bind_grid_worlds(nb::module_& m);
 

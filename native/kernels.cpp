@@ -63,6 +63,7 @@ static float multiply_add(size_t rounds) {
 extern const SurfelKernels kSurfelKernels;
 extern const LossKernels kLossKernels;
 extern const CastingKernels kCastingKernels;
+extern const FittingKernels kFittingKernels;
 
 #define SP_STRING_OF(name) #name
 #define SP_STRING(name) SP_STRING_OF(name)
@@ -71,6 +72,7 @@ const Kernels kKernels = {SP_STRING(SIMD_LEVEL),
                           &kSurfelKernels,
                           &kLossKernels,
                           &kCastingKernels,
+                          &kFittingKernels,
                           project_arrays,
                           project_baked,
                           bin_footprints<SplatFootprint>,

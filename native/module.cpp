@@ -194,6 +194,7 @@ NB_MODULE(_native, m) {
         "Writes colour, median depth and alpha of the scene and of Gaussians among it.");
 
   bind_losses(m);
+  bind_fitting(m);
   bind_shape_worlds(m);
   bind_grid_worlds(m);
   bind_gradients(m);

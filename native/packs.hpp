@@ -78,6 +78,21 @@ SP_INLINE void store(float* p, const F16& a) {
   SP_EACH_REGISTER(k) std::memcpy(p + k * kRegisterLanes, &a.r[k], kRegisterBytes);
 }
 
+// The first `count` values at p, zeros after them.
+SP_INLINE F16 load_first(const float* p, size_t count) {
+  if (count >= kLanes) return load(p);
+  float values[kLanes] = {};
+  for (size_t k = 0; k < count; ++k) values[k] = p[k];
+  return load(values);
+}
+
+SP_INLINE void store_first(float* p, const F16& a, size_t count) {
+  if (count >= kLanes) return store(p, a);
+  float values[kLanes];
+  store(values, a);
+  for (size_t k = 0; k < count; ++k) p[k] = values[k];
+}
+
 SP_ARITHMETIC(F16, SP_EACH_REGISTER)
 
 SP_INLINE F16 operator-(const F16& a) {

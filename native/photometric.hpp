@@ -49,21 +49,6 @@ SP_INLINE F16 first_lanes(const F16& a, size_t count) {
   return load(values);
 }
 
-// The first `count` values at p, zeros after them.
-SP_INLINE F16 load_first(const float* p, size_t count) {
-  if (count >= kLanes) return load(p);
-  float values[kLanes] = {};
-  for (size_t k = 0; k < count; ++k) values[k] = p[k];
-  return load(values);
-}
-
-SP_INLINE void store_first(float* p, const F16& a, size_t count) {
-  if (count >= kLanes) return store(p, a);
-  float values[kLanes];
-  store(values, a);
-  for (size_t k = 0; k < count; ++k) p[k] = values[k];
-}
-
 SP_INLINE double sum_of(const F16& a) {
   float values[kLanes];
   store(values, a);

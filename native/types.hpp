@@ -202,6 +202,7 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
 struct SurfelKernels;
 struct LossKernels;
 struct CastingKernels;
+struct FittingKernels;
 
 // Of one SIMD level.
 struct Kernels {
@@ -209,6 +210,7 @@ struct Kernels {
   const SurfelKernels* surfels;
   const LossKernels* losses;
   const CastingKernels* casting;
+  const FittingKernels* fitting;
   // Projects Gaussians [begin, end); writes visible ones, their planes if these are not null, and
   // the bits of their depths in input order; returns how many.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,

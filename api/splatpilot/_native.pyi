@@ -94,6 +94,22 @@ def log_depth_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(No
     Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.
     """
 
+def adam_step(*, parameters: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], means: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], squares: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], rate: float, step: int, mean_decay: float, square_decay: float, epsilon: float, simd: str = '') -> None:
+    """Moves parameters, and the averages of gradients and of their squares."""
+
+def splat_shapes(*, log_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], logit_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], smallest: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], simd: str = '') -> None:
+    """
+    Writes sqrt(exp(2 log_scales) + smallest^2) and sigmoid(logit_opacities).
+    """
+
+def splat_shapes_backward(*, scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], smallest: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], v_log_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_logit_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], simd: str = '') -> None:
+    """Writes the gradients of the inputs of splat_shapes."""
+
+def surface_loss(*, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], seen: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], draws: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float32], dict(shape=(4, 4), order='C', device='cpu', writable=False)], K: Annotated[NDArray[numpy.float32], dict(shape=(3, 3), order='C', device='cpu', writable=False)], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], reach: float, nearest: float, far: float, v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')]) -> float:
+    """
+    Mean |log(z / depth)| of points drawn from the Gaussians that are seen; adds gradients.
+    """
+
 class ShapeWorlds:
     """The analytic shapes of several worlds."""
 

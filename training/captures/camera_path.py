@@ -25,8 +25,9 @@ def visiting_path(
     """Returns a path (N, 3) [m] that visits all the free space of a box.
 
     In the largest connected part of the space with `clearance` [m], places are chosen each farthest
-    from those before, as paths go, until none is farther than `apart` [m] from one. From the first,
-    an end of the space, the path goes on to the nearest place not visited yet, by shortest paths.
+    from those before, as paths go, until none is farther than `apart` [m] from one. The path begins
+    at the one in the middle, whose farthest is nearest, so that what lies before the first camera
+    is seen by later ones too, and goes on to the nearest place not visited yet, by shortest paths.
 
     Raises:
         ValueError: if no space has that much clearance.
@@ -62,7 +63,8 @@ def visiting_path(
         tables.append(lengths_from(places[-1]))
         np.minimum(nearest, tables[-1][0], out=nearest)
 
-    path, here, left = [places[0]], 0, set(range(1, len(places)))
+    here = min(range(len(places)), key=lambda k: tables[k][0].max())
+    path, left = [places[here]], set(range(len(places))) - {here}
     while left:
         lengths, before = tables[here]
         here = min(left, key=lambda k: (lengths[places[k]], k))

@@ -12,7 +12,7 @@ from splatpilot.systems.files import written_atomically
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-VERSION = 1
+VERSION = 2
 # What may differ when an interrupted run goes on, for it changes nothing that is computed.
 _INDIFFERENT = (
     "threads",

@@ -77,9 +77,8 @@ class Objective:
             rng = np.random.default_rng([config.seed, step, 2])
             seen = rendering.meta["gaussian_ids"]
             seen = seen[torch.from_numpy(rng.random(len(seen)) < _HELD).to(device)]
-            means, quats, scales = (values.index_select(0, seen) for values in gaussians[:3])
             viewmat, K = self._views.camera(k, device)
-            on_surface = surface_loss(means, quats, scales, viewmat[0], K[0], depth, rng)
+            on_surface = surface_loss(*gaussians[:3], seen, viewmat[0], K[0], depth, rng)
             loss = loss + config.surface_weight * on_surface
         return loss + self._surfel_loss(rendering, step)
 

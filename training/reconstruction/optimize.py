@@ -199,7 +199,7 @@ class Optimization:
 
     def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         splats = self.splats
-        return splats["means"], splats["quats"], splats.scales, splats.opacities, splats.sh
+        return splats["means"], splats["quats"], *splats.shapes(), splats.sh
 
     @torch.no_grad()
     def _fit_gains(self) -> None:

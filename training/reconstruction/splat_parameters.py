@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.training.reconstruction.adam import adam_step
 from splatpilot.training.reconstruction.scale_limits import ScaleLimits
+from splatpilot.training.reconstruction.splat_shapes import splat_shapes
 
 # Opacities at the ends of [0, 1] have infinite logits, which no gradient moves.
 _OPACITIES = (1e-4, 1 - 1e-4)
@@ -30,20 +32,23 @@ class SplatParameters:
         self,
         tensors: Mapping[str, Tensor],
         rates: Mapping[str, float],
-        state: Mapping[str, Mapping[str, Tensor]] | None = None,
+        memory: Mapping[str, Sequence[Tensor]] | None = None,
+        steps: int = 0,
         limits: Sequence[Tensor] | None = None,
     ):
-        groups = [
-            {"params": [tensor.clone().requires_grad_()], "lr": rates[name], "name": name}
+        self._tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
+        self._rates = {name: rates[name] for name in tensors}
+        # Of each parameter Adam's moving averages of gradients and of their squares.
+        self._memory = {
+            name: tuple(
+                values.clone()
+                for values in (memory[name] if memory else [torch.zeros_like(tensor)] * 2)
+            )
             for name, tensor in tensors.items()
-        ]
-        # The epsilon of 3D Gaussian splatting: gradients of single Gaussians are tiny.
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self._groups = {group["name"]: group for group in self.optimizer.param_groups}
-        for name, parameter_state in (state or {}).items():
-            self.optimizer.state[self[name]] = {k: v.clone() for k, v in parameter_state.items()}
+        }
+        self._steps = steps
         none = ScaleLimits.none(tensors["logit_opacities"])
-        self._limits = none if limits is None else ScaleLimits(*limits)
+        self.limit_scales(none if limits is None else ScaleLimits(*limits))
 
     @classmethod
     def of_scene(
@@ -66,82 +71,84 @@ class SplatParameters:
         return cls({name: tensor.to(device) for name, tensor in tensors.items()}, rates)
 
     def __getitem__(self, name: str) -> Tensor:
-        return self._groups[name]["params"][0]
+        return self._tensors[name]
 
     def __len__(self) -> int:
         return len(self["means"])
 
     @property
     def names(self) -> list[str]:
-        return list(self._groups)
+        return list(self._tensors)
 
     @property
     def sh(self) -> Tensor:
         """(N, K, 3)."""
-        if "sh_rest" not in self._groups:
+        if "sh_rest" not in self._tensors:
             return self["sh_0"]
         return torch.cat([self["sh_0"], self["sh_rest"]], dim=1)
 
+    def shapes(self) -> tuple[Tensor, Tensor]:
+        """Scales (N, 3) [m], to which the smallest are added, and opacities (N,) in (0, 1)."""
+        smallest = self._limits.smallest
+        return splat_shapes(self["log_scales"], self["logit_opacities"], smallest)
+
     @property
     def scales(self) -> Tensor:
-        """(N, 3) [m], to which the smallest are added."""
-        smallest = self._limits.smallest[:, None]
-        return torch.sqrt(torch.exp(2 * self["log_scales"]) + smallest**2)
+        """(N, 3) [m], see `shapes`."""
+        return self.shapes()[0]
+
+    @property
+    def opacities(self) -> Tensor:
+        """(N,), see `shapes`."""
+        return self.shapes()[1]
 
     def limit_scales(self, limits: ScaleLimits) -> None:
         """Sets the limits; what is beyond the largest comes back to it, now and after each step."""
         self._limits = limits
+        self._log_largest = torch.log(limits.largest)[:, None]
         self._clamp_scales()
 
-    @property
-    def opacities(self) -> Tensor:
-        """(N,) in (0, 1)."""
-        return torch.sigmoid(self["logit_opacities"])
-
     def set_rate(self, name: str, rate: float) -> None:
-        self._groups[name]["lr"] = rate
+        self._rates[name] = rate
 
     def rate(self, name: str) -> float:
-        return self._groups[name]["lr"]
+        return self._rates[name]
 
     def step(self) -> None:
         """Moves all parameters along their gradients, and forgets these."""
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        self._steps += 1
+        for name, tensor in self._tensors.items():
+            if tensor.grad is not None:
+                adam_step(tensor, tensor.grad, *self._memory[name], self._rates[name], self._steps)
+                tensor.grad = None
         self._clamp_scales()
 
     @torch.no_grad()
     def rebuild(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
         """Keeps the Gaussians `rows` (indices), in that order, and appends those `added`, of which
         Adam remembers nothing and whose scales have no limits."""
-        self._limits = self._limits.rebuild(rows, 0 if added is None else len(added["means"]))
         for name in self.names:
             old = self[name]
             extra = old[:0] if added is None else added[name]
-            new = torch.cat([old[rows], extra]).requires_grad_()
-            memory = self.optimizer.state.pop(old, {})
-            for key, value in memory.items():
-                if value.shape == old.shape:
-                    memory[key] = torch.cat([value[rows], torch.zeros_like(extra)])
-            self._groups[name]["params"][0] = new
-            self.optimizer.state[new] = memory
+            self._tensors[name] = torch.cat([old[rows], extra]).requires_grad_()
+            self._memory[name] = tuple(
+                torch.cat([values[rows], torch.zeros_like(extra)]) for values in self._memory[name]
+            )
+        self.limit_scales(self._limits.rebuild(rows, 0 if added is None else len(added["means"])))
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor, rows: Tensor | slice = slice(None)) -> None:
         """Sets a parameter of the Gaussians `rows`, of which Adam then remembers nothing."""
         self[name][rows] = values
-        for key, value in self.optimizer.state[self[name]].items():
-            if key != "step":
-                value[rows] = 0
+        for average in self._memory[name]:
+            average[rows] = 0
 
     def state(self) -> dict[str, Any]:
         """Returns all that makes these parameters and their Adam again, see `__init__`."""
         return {
             "tensors": {name: self[name].detach().clone() for name in self.names},
-            "state": {
-                name: {k: v.clone() for k, v in self.optimizer.state[self[name]].items()}
-                for name in self.names
-            },
+            "memory": {name: [v.clone() for v in self._memory[name]] for name in self.names},
+            "steps": self._steps,
             "limits": list(self._limits),
         }
 
@@ -149,9 +156,8 @@ class SplatParameters:
     def scene(self, flat: bool) -> GaussianScene:
         """Returns those Gaussians that can be seen, `flat` ones with a third scale of next to
         nothing."""
-        opacities = self.opacities
+        scales, opacities = self.shapes()
         visible = opacities >= _INVISIBLE
-        scales = self.scales.clone()
         if flat:
             scales[:, 2] = _FLAT
         arrays = (self["means"], self["quats"], scales, opacities, self.sh)
@@ -160,4 +166,4 @@ class SplatParameters:
     @torch.no_grad()
     def _clamp_scales(self) -> None:
         # The parameters themselves: the gradient of a clamped function would end at the limit.
-        self["log_scales"].clamp_(max=torch.log(self._limits.largest)[:, None])
+        self["log_scales"].clamp_(max=self._log_largest)

@@ -1,9 +1,13 @@
 """What holds Gaussians to the surfaces that depth shows, and these to their outlines."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from splatpilot import _native
 from splatpilot.systems.splats.background import FAR
 from splatpilot.training.reconstruction.quaternions import rotate
 
@@ -17,13 +21,14 @@ def surface_loss(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
+    seen: Tensor,
     viewmat: Tensor,
     K: Tensor,
     depth: Tensor,
     rng: np.random.Generator,
 ) -> Tensor:
-    """Returns the mean of |log z - log depth| over a point drawn from each Gaussian, of those
-    points that belong to what is seen.
+    """Returns the mean of |log z - log depth| over a point drawn from each Gaussian of `seen`, of
+    those points that belong to what is seen.
 
     Expected depth is right already where some layers of a surface stand before it and others
     behind, and where Gaussians are thick or askew; then the median is wrong. So the mass of each
@@ -31,16 +36,40 @@ def surface_loss(
     pixel is drawn to that depth, and none across the edge of a thing. Centres move, thick ones
     flatten, and those askew turn.
 
+    float32 tensors on the CPU go through native code, which makes value and gradient at once.
+
     Args:
-        means, quats, scales: (N, 3) [m], (N, 4) and (N, 3) [m], of Gaussians that may be seen.
+        means, quats, scales: (N, 3) [m], (N, 4) and (N, 3) [m], of all Gaussians.
+        seen: (M,) numbers of those that may be seen.
         viewmat: (4, 4) world to camera.
         K: (3, 3) [px].
         depth: (H, W) [m], the truth.
         rng: draws the points.
     """
-    drawn = rng.standard_normal(means.shape, np.float32)
-    offset = torch.from_numpy(drawn).to(means.device) * scales
-    p_WQ = means + rotate(quats, offset)
+    draws = torch.from_numpy(rng.standard_normal((len(seen), 3), np.float32))
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        found = _NativeSurfaceLoss.apply(means, quats, scales, seen, draws, viewmat, K, depth)
+        return found  # pyright: ignore[reportReturnType]
+    return surface_loss_torch(means, quats, scales, seen, draws, viewmat, K, depth)
+
+
+def surface_loss_torch(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    seen: Tensor,
+    draws: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    depth: Tensor,
+) -> Tensor:
+    """`surface_loss` by torch alone, on any device and dtype.
+
+    Args:
+        draws: (M, 3), standard normal: where the points are, in standard deviations.
+    """
+    means, quats, scales = (values.index_select(0, seen) for values in (means, quats, scales))
+    p_WQ = means + rotate(quats, draws.to(means) * scales)
     p_CQ = p_WQ @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = p_CQ[:, 2]
     height, width = depth.shape
@@ -51,6 +80,42 @@ def surface_loss(
         known = inside & (truth > 0) & (truth < FAR)
         near = known & ((z - truth).abs() < _REACH * truth)
     return (z[near] / truth[near]).log().abs().sum() / near.sum().clamp(min=1)
+
+
+class _NativeSurfaceLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        seen: Tensor,
+        draws: Tensor,
+        viewmat: Tensor,
+        K: Tensor,
+        depth: Tensor,
+    ) -> Tensor:
+        gaussians = [values.detach().contiguous() for values in (means, quats, scales)]
+        ctx.gradients = [torch.zeros_like(values) for values in gaussians]
+        arrays = [values.numpy() for values in (*gaussians, *ctx.gradients)]
+        names = ("means", "quats", "scales", "v_means", "v_quats", "v_scales")
+        loss = _native.surface_loss(
+            **dict(zip(names, arrays, strict=True)),
+            seen=seen.long().contiguous().numpy(),
+            draws=draws.numpy(),
+            X_CW=viewmat.contiguous().numpy(),
+            K=K.contiguous().numpy(),
+            depth=depth.contiguous().numpy(),
+            reach=_REACH,
+            nearest=_NEAREST,
+            far=FAR,
+        )
+        return means.new_tensor(loss)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_loss: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return *(values * v_loss for values in ctx.gradients), *(None for _ in range(5))
 
 
 def outline_loss(alpha: Tensor, depth: Tensor, weights: Tensor) -> Tensor:

@@ -27,7 +27,8 @@ def divided_hall() -> Esdf:
 
 def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
     """Every free place of the band lies near the path, on both sides of a wall that the path goes
-    around without coming nearer than the clearance asked for."""
+    around without coming nearer than the clearance asked for. It begins in the middle, near the
+    gap."""
     clearance, apart = 0.5, 2.5
     lower_W, upper_W = np.array([0, 0, 1.0]), np.array([12, 8, 2.0])
     path = visiting_path(divided_hall, lower_W, upper_W, clearance, apart)
@@ -39,6 +40,7 @@ def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
     places = places[divided_hall.distance(places) > 0.8]
     nearest = np.linalg.norm(places[:, None] - path[None], axis=2).min(axis=1)
     assert nearest.max() < apart
+    assert np.linalg.norm(path[0] - [6.0, 7.0, 1.5]) < apart
 
 
 def test_path_names_the_room_there_is(divided_hall):

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.training.reconstruction.surface_loss import outline_loss, surface_loss
 
@@ -13,7 +14,9 @@ UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def loss_of(means, quats, scales, depth, seed=0):
-    return surface_loss(means, quats, scales, VIEWMAT, K, depth, np.random.default_rng(seed))
+    everyone = torch.arange(len(means))
+    rng = np.random.default_rng(seed)
+    return surface_loss(means, quats, scales, everyone, VIEWMAT, K, depth, rng)
 
 
 def test_gaussians_are_drawn_to_the_surface_they_belong_to():
@@ -52,7 +55,9 @@ def test_thick_gaussians_flatten_and_those_askew_turn():
 
     def tilted(angle):
         quats = torch.stack([torch.cos(angle / 2), torch.sin(angle / 2), 0 * angle, 0 * angle])
-        return loss_of(means, quats.expand(n, 4), torch.tensor([[0.1, 0.1, 1e-4]]), depth)
+        return loss_of(
+            means, quats.expand(n, 4), torch.tensor([0.1, 0.1, 1e-4]).expand(n, 3), depth
+        )
 
     angle = torch.tensor(0.1, requires_grad=True)
     tilted(angle).backward()
@@ -93,3 +98,35 @@ def test_outlines_are_those_of_what_is_solid():
     assert alpha.grad is not None
     np.testing.assert_allclose(alpha.grad, [[-1 / 3, 5 / 3, 0, 1 / 3]], rtol=1e-5)
     assert outline_loss(alpha, 0 * weights, weights).item() == 0
+
+
+def test_native_code_and_formulas_agree():
+    """The loss of many Gaussians of any size and orientation, some seen and some not, before a
+    camera askew and a depth with holes, is that of torch in float64; so are its gradients."""
+    rng = np.random.default_rng(5)
+    n = 2000
+    X_WC = RigidTransform(RollPitchYaw(0.1, -0.2, 0.3), [0.1, 0.2, -0.5])
+    viewmat = torch.from_numpy(X_WC.inverse().GetAsMatrix4())
+    depth = torch.from_numpy(rng.uniform(1.5, 2.5, (HEIGHT, WIDTH)))
+    depth[:5], depth[5:10] = 0, torch.inf
+    means = torch.from_numpy(rng.uniform([-3, -2, 1], [3, 2, 2.5], (n, 3)))
+    quats = torch.from_numpy(rng.normal(size=(n, 4)))
+    scales = torch.from_numpy(rng.uniform(0.001, 0.1, (n, 3)))
+    seen = torch.from_numpy(rng.permutation(n)[: n // 2])
+    draws = torch.from_numpy(rng.normal(size=(n // 2, 3)).astype(np.float32))
+
+    class Draws:  # in place of a generator
+        def standard_normal(self, *_):
+            return draws.numpy()
+
+    def found(dtype):
+        leaves = [x.detach().to(dtype, copy=True).requires_grad_() for x in (means, quats, scales)]
+        rest = (viewmat.to(dtype), K.to(dtype), depth.to(dtype), Draws())
+        loss = surface_loss(*leaves, seen, *rest)
+        (3 * loss).backward()
+        return [loss.detach(), *(leaf.grad for leaf in leaves)]
+
+    exact = found(torch.float64)
+    assert (exact[1] != 0).any(dim=1).sum() > 20
+    for native, reference in zip(found(torch.float32), exact, strict=True):
+        np.testing.assert_allclose(native, reference, rtol=1e-4, atol=1e-7)
