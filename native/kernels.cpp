@@ -68,21 +68,10 @@ extern const FittingKernels kFittingKernels;
 #define SP_STRING_OF(name) #name
 #define SP_STRING(name) SP_STRING_OF(name)
 extern const Kernels kKernels;
-const Kernels kKernels = {SP_STRING(SIMD_LEVEL),
-                          &kSurfelKernels,
-                          &kLossKernels,
-                          &kCastingKernels,
-                          &kFittingKernels,
-                          project_arrays,
-                          project_baked,
-                          bin_footprints<SplatFootprint>,
-                          raster_tile,
-                          raster_tile_backward,
-                          gather_gradients,
-                          project_backward,
-                          first_nonfinite,
-                          all_within,
-                          all_normalisable,
-                          multiply_add};
+const Kernels kKernels = {
+    SP_STRING(SIMD_LEVEL), &kSurfelKernels,      &kLossKernels,    &kCastingKernels,
+    &kFittingKernels,      project_arrays,       project_baked,    bin_footprints<SplatFootprint>,
+    raster_tile,           raster_tile_backward, gather_gradients, project_backward,
+    first_nonfinite,       all_within,           all_normalisable, multiply_add};
 
 }  // namespace splatpilot::SIMD_LEVEL

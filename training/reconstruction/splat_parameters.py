@@ -39,13 +39,10 @@ class SplatParameters:
         self._tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
         self._rates = {name: rates[name] for name in tensors}
         # Of each parameter Adam's moving averages of gradients and of their squares.
-        self._memory = {
-            name: tuple(
-                values.clone()
-                for values in (memory[name] if memory else [torch.zeros_like(tensor)] * 2)
-            )
-            for name, tensor in tensors.items()
-        }
+        self._memory: dict[str, tuple[Tensor, Tensor]] = {}
+        for name, tensor in tensors.items():
+            mean, square = memory[name] if memory else [torch.zeros_like(tensor)] * 2
+            self._memory[name] = mean.clone(), square.clone()
         self._steps = steps
         none = ScaleLimits.none(tensors["logit_opacities"])
         self.limit_scales(none if limits is None else ScaleLimits(*limits))
@@ -131,9 +128,10 @@ class SplatParameters:
             old = self[name]
             extra = old[:0] if added is None else added[name]
             self._tensors[name] = torch.cat([old[rows], extra]).requires_grad_()
-            self._memory[name] = tuple(
+            mean, square = (
                 torch.cat([values[rows], torch.zeros_like(extra)]) for values in self._memory[name]
             )
+            self._memory[name] = mean, square
         self.limit_scales(self._limits.rebuild(rows, 0 if added is None else len(added["means"])))
 
     @torch.no_grad()

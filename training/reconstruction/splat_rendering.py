@@ -66,7 +66,8 @@ def render(
         image, alpha, meta = rasterize(
             *scene, **options, render_mode=f"RGB+{depth_mode}", eps2d=eps2d, absgrad=absgrad
         )
-        return Rendering(image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0], meta)
+        color, depth = image[0].split((3, 1), dim=-1)
+        return Rendering(color, depth.reshape(height, width), alpha.reshape(height, width), meta)
     is_median = depth_mode == "MD"
     image, alpha, normals, surface_normals, distort, median, meta = rasterize_surfels(
         *scene,

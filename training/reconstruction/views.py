@@ -146,5 +146,6 @@ class ReconstructionViews:
     def target(self, k: int, gain: Tensor, backdrop: Tensor) -> Tensor:
         """(H, W, 3), what the scene should look like before a `backdrop` (3,): the image freed of
         its gain and vignetting, about 0 to 1, and nothing where it shows the infinitely far."""
-        color = self.images[k].float() * (1 / (255 * gain * self.vignette))[..., None]
-        return torch.where(self.depths[k][..., None] >= FAR, backdrop, color)
+        color = self.images[k].float().mul_((1 / (255 * gain * self.vignette))[..., None])
+        color[self.depths[k] >= FAR] = backdrop
+        return color

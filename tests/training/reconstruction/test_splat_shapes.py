@@ -22,6 +22,7 @@ def shapes_and_gradients(dtype):
     scales, opacities = splat_shapes(log_scales, logits, smallest)
     weights = torch.linspace(-1, 2, N, dtype=dtype)
     ((scales * weights[:, None]).sum() + (opacities * weights).sum()).backward()
+    assert log_scales.grad is not None and logits.grad is not None
     return [x.detach().numpy() for x in (scales, opacities, log_scales.grad, logits.grad)]
 
 
