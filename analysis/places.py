@@ -31,7 +31,7 @@ class Place:
 PLACES = {
     "hospital": Place(
         "tartanair/hospital",
-        ("reconstruct.initial_gaussians=60000", "reconstruct.voxel_size=0.05"),
+        ("reconstruct.voxel_size=0.05",),
     ),
     "bookstore": Place(
         "worlds/bookstore.gltf", ("render.up=z", "reconstruct.initial_gaussians=160000")

@@ -23,7 +23,7 @@ class TourConfig:
     # Places through which one flies are larger than those that one looks at: more Gaussians, and
     # voxels of which the planner can search a whole hall in seconds.
     reconstruct: ReconstructConfig = field(
-        default_factory=lambda: ReconstructConfig(initial_gaussians=120_000, voxel_size=0.1)
+        default_factory=lambda: ReconstructConfig(voxel_size=0.1)
     )
     flight: Scenario = field(default_factory=Scenario)  # its world is the reconstruction
 

@@ -35,6 +35,7 @@ from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
 from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.initialization import MOST_STEPS
 from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 from splatpilot.training.reconstruction.triangulation import triangulate
@@ -85,6 +86,8 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
             f"hold_out is {config.hold_out} and iterations {config.iterations}: an ablation "
             "optimises, and measures on held-out frames; neither may be 0"
         )
+    if config.iterations < 0:  # all arms take the same
+        config = replace(config, iterations=MOST_STEPS)
     opened = [(path, _open(path, config.capture)) for path in captures]
     names = [capture.name for _, capture in opened]
     for path, capture in opened:

@@ -20,14 +20,16 @@ class ReconstructConfig:
 
     capture: CaptureConfig = field(default_factory=CaptureConfig)
     """What the capture's files leave open."""
-    iterations: int = 7000
-    """Steps of optimisation, an image each; 0 takes depth and colours as they are."""
+    iterations: int = -1
+    """Steps of optimisation, an image each; 0 takes depth and colours as they are. -1 takes as many
+    as the capture needs: 32 for each image that is fitted, at least 2000 and at most 7000, where
+    Gaussians start from depth; 7000 elsewhere."""
     representation: str = "3dgs"
     """What is optimised: "3dgs", Gaussians, or "2dgs", flat ones (Huang et al. 2024)."""
     initialization: str = "auto"
     """Where Gaussians start: on the surfaces that "depth" shows, on the "points" of structure from
     motion, or at "random" in what the cameras see; "auto" takes the first that the capture has."""
-    initial_gaussians: int = 60_000
+    initial_gaussians: int = 120_000
     """At most as many are there at first."""
     max_gaussians: int = 180_000
     """At most as many are there at last. Without iterations, texture is resolved as finely as they
@@ -87,8 +89,9 @@ class ReconstructConfig:
     """mcmc: strength of the random walk, relative to the learning rate of the means."""
 
     means_rate: float = 1.6e-4
-    """Learning rate of the means relative to the extent of the scene; falls to a hundredth. A
-    quarter of it where they start on surfaces that depth shows."""
+    """Learning rate of the means relative to the extent of the scene; falls to a hundredth. These
+    rates are for Gaussians that start anywhere; those that start on surfaces that depth shows have
+    others by fixed factors, see `learning_rates`."""
     scales_rate: float = 5e-3
     """Learning rate of the logarithms of the scales."""
     quats_rate: float = 1e-3
@@ -150,7 +153,7 @@ class ReconstructConfig:
                     f"{name} is {getattr(self, name)!r}; choose {' or '.join(allowed)}"
                 )
         least = {
-            "iterations": 0,
+            "iterations": -1,
             "initial_gaussians": 1,
             "max_gaussians": 1,
             "image_width": 0,

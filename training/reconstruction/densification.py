@@ -5,6 +5,8 @@ if small and split if large, faint and huge ones are removed, and opacities are 
 so that what is not needed fades.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -59,7 +61,7 @@ class DefaultStrategy:
         self.counts.index_add_(0, rows, torch.ones_like(rows, dtype=torch.float32))
 
     @torch.no_grad()
-    def refine(self, step: int, splats: SplatParameters) -> None:
+    def refine(self, step: int, splats: SplatParameters, rates: Mapping[str, float]) -> None:
         """Changes the Gaussians if it is time to, after step number `step` (from 1)."""
         config = self._config
         if step > config.refine_fraction * config.iterations:

@@ -16,6 +16,8 @@ from splatpilot.training.reconstruction.overlap import STRIDE, ThinnedFrame, fin
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
+# Steps where -1 are asked for.
+_STEPS_OF_IMAGE, _LEAST_STEPS, MOST_STEPS = 32, 2000, 7000
 # One in so many frames is tried first.
 _SOME = 4
 # Opacity and size, in distances to the third neighbour, of Gaussians about points.
@@ -45,13 +47,18 @@ def _starts(capture: Capture) -> dict[str, bool]:
 
 
 def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructConfig:
-    """Returns the config with what "auto" means for this capture."""
+    """Returns the config with what "auto" and -1 iterations mean for this capture."""
     kind, strategy = config.initialization, config.strategy
     if kind == "auto":
         kind = next(name for name, there in _starts(capture).items() if there)
     if strategy == "auto":
         strategy = "none" if kind == "depth" else "default"
-    return replace(config, initialization=kind, strategy=strategy)
+    iterations = config.iterations
+    if iterations < 0:
+        withheld = len(range(0, len(capture), config.hold_out)) if config.hold_out else 0
+        fitting = max(_STEPS_OF_IMAGE * (len(capture) - withheld), _LEAST_STEPS)
+        iterations = min(fitting, MOST_STEPS) if kind == "depth" else MOST_STEPS
+    return replace(config, initialization=kind, strategy=strategy, iterations=iterations)
 
 
 def make_initial_gaussians(

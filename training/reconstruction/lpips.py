@@ -9,7 +9,6 @@ from pickle import UnpicklingError
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
-from torchvision.models import squeezenet1_1
 
 # ImageNet's, which LPIPS applies as a shift and a scale of images in [-1, 1].
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -107,6 +106,8 @@ def _find(weights: Path | None) -> tuple[Path, ...]:
 @cache
 def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential, list[Tensor]]:
     """Returns the layers of the backbone and the weights of the linear layers, (1, C, 1, 1)."""
+    from torchvision.models import squeezenet1_1  # slow to import
+
     try:
         files = [torch.load(file, map_location="cpu", weights_only=True) for file in source]
         backbone, linear = (

@@ -3,6 +3,8 @@
 Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", 2024.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -35,8 +37,9 @@ class McmcStrategy:
         """Needs nothing of the gradients."""
 
     @torch.no_grad()
-    def refine(self, step: int, splats: SplatParameters) -> None:
-        """Changes the Gaussians after step number `step` (from 1)."""
+    def refine(self, step: int, splats: SplatParameters, rates: Mapping[str, float]) -> None:
+        """Changes the Gaussians after step number `step` (from 1), which had these learning
+        rates."""
         config = self._config
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
         is_time = step >= config.refine_start and step % config.refine_every == 0
@@ -44,10 +47,9 @@ class McmcStrategy:
             self._relocate(splats, generator)
             wanted = min(int(_GROWTH * len(splats)), config.max_gaussians)
             self._add(splats, wanted - len(splats), generator)
-        rate = splats.rate("means")
         damping = torch.sigmoid(-_NOISE_STEEPNESS * (splats.opacities - _NOISE_OPACITY))
         noise = torch.randn((len(splats), 3), generator=generator).to(splats["means"].device)
-        noise *= (config.noise * rate * damping)[:, None]
+        noise *= (config.noise * rates["means"] * damping)[:, None]
         # Covariance times noise, in the Gaussian's own axes.
         q = splats["quats"]
         inverse = q * q.new_tensor([1.0, -1.0, -1.0, -1.0])

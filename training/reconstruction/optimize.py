@@ -17,6 +17,7 @@ from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.densification import DefaultStrategy
+from splatpilot.training.reconstruction.learning_rates import learning_rates
 from splatpilot.training.reconstruction.mcmc import McmcStrategy
 from splatpilot.training.reconstruction.measures import HeldOutMeasures, measure_view
 from splatpilot.training.reconstruction.objective import Objective
@@ -27,10 +28,6 @@ from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-# The learning rate of the means falls to this fraction.
-_LAST_RATE = 0.01
-# Where they start from depth, it is this part of the learning rate from the beginning.
-_ON_SURFACE = 0.25
 # Unknown gains are fitted after these parts of all steps.
 _GAIN_FITS = (0.1, 0.2, 0.4)
 # Steps from one time that the limits of the scales are found to the next.
@@ -77,27 +74,15 @@ class Optimization:
         self._outlined = both.tolist() if config.outline_weight > 0 else [False] * len(views)
         self._objective = Objective(config, views, perceptual)
         self.center, self.extent = views.extent()
-        near = _ON_SURFACE if config.initialization == "depth" else 1.0
-        self._means_rate = near * config.means_rate * self.extent
-        rates = {
-            "means": self._means_rate,
-            "quats": config.quats_rate,
-            "log_scales": config.scales_rate,
-            "logit_opacities": config.opacities_rate,
-            "sh_0": config.colors_rate,
-            "sh_rest": config.colors_rate / 20,
-        }
         kept = checkpoint.load()
         if kept is None:
             self.step = 0
             self.gains = views.gains
-            self.splats = SplatParameters.of_scene(
-                initial(), config.sh_degree, rates, config.device
-            )
+            self.splats = SplatParameters.of_scene(initial(), config.sh_degree, config.device)
             self._limit_scales()
         else:
             self.step = kept["step"]
-            self.splats = SplatParameters(**kept["splats"], rates=rates)
+            self.splats = SplatParameters(**kept["splats"])
             self.gains = kept["gains"]
         self._strategy = self._make_strategy()
         if kept is not None and self._strategy is not None:
@@ -137,8 +122,6 @@ class Optimization:
         instead of colours, drawn as depth cameras see it: without the blur of colour cameras.
         """
         config, splats, count = self._config, self.splats, len(self.splats)
-        decay = _LAST_RATE ** (self.step / config.iterations)
-        splats.set_rate("means", self._means_rate * decay)
         k = self._image_of_step(self.step)
         viewmat, K = self._views.camera(k, config.device)
         backdrop = self._backdrop_of_step(self.step)
@@ -168,12 +151,13 @@ class Optimization:
         loss.backward()
         if self._strategy is not None:
             self._strategy.observe(rendering, splats, viewmat, K)
-        splats.step()
+        rates = learning_rates(config, self.extent, self.step / config.iterations)
+        splats.step(rates)
         self.step += 1
         if self.step in self._gain_steps:
             self._fit_gains()
         if self._strategy is not None:
-            self._strategy.refine(self.step, splats)
+            self._strategy.refine(self.step, splats, rates)
         if self.step % _LIMIT_EVERY == 0 or len(splats) != count:
             self._limit_scales()
 

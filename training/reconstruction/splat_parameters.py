@@ -31,13 +31,11 @@ class SplatParameters:
     def __init__(
         self,
         tensors: Mapping[str, Tensor],
-        rates: Mapping[str, float],
         memory: Mapping[str, Sequence[Tensor]] | None = None,
         steps: int = 0,
         limits: Sequence[Tensor] | None = None,
     ):
         self._tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
-        self._rates = {name: rates[name] for name in tensors}
         # Of each parameter Adam's moving averages of gradients and of their squares.
         self._memory: dict[str, tuple[Tensor, Tensor]] = {}
         for name, tensor in tensors.items():
@@ -48,9 +46,7 @@ class SplatParameters:
         self.limit_scales(none if limits is None else ScaleLimits(*limits))
 
     @classmethod
-    def of_scene(
-        cls, scene: GaussianScene, sh_degree: int, rates: Mapping[str, float], device: str
-    ) -> "SplatParameters":
+    def of_scene(cls, scene: GaussianScene, sh_degree: int, device: str) -> "SplatParameters":
         """Starts from `scene`, its spherical harmonics cut or filled up to the degree."""
         coefficients = (sh_degree + 1) ** 2
         sh = np.zeros((len(scene), coefficients, 3), dtype=np.float32)
@@ -65,7 +61,7 @@ class SplatParameters:
         }
         if sh_degree:
             tensors["sh_rest"] = torch.from_numpy(sh[:, 1:].copy())
-        return cls({name: tensor.to(device) for name, tensor in tensors.items()}, rates)
+        return cls({name: tensor.to(device) for name, tensor in tensors.items()})
 
     def __getitem__(self, name: str) -> Tensor:
         return self._tensors[name]
@@ -105,18 +101,13 @@ class SplatParameters:
         self._log_largest = torch.log(limits.largest)[:, None]
         self._clamp_scales()
 
-    def set_rate(self, name: str, rate: float) -> None:
-        self._rates[name] = rate
-
-    def rate(self, name: str) -> float:
-        return self._rates[name]
-
-    def step(self) -> None:
-        """Moves all parameters along their gradients, and forgets these."""
+    def step(self, rates: Mapping[str, float]) -> None:
+        """Moves all parameters along their gradients, each kind by its learning rate, and forgets
+        the gradients."""
         self._steps += 1
         for name, tensor in self._tensors.items():
             if tensor.grad is not None:
-                adam_step(tensor, tensor.grad, *self._memory[name], self._rates[name], self._steps)
+                adam_step(tensor, tensor.grad, *self._memory[name], rates[name], self._steps)
                 tensor.grad = None
         self._clamp_scales()
 

@@ -28,7 +28,7 @@ def three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.9)) -> Sp
         opacities,
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     )
-    return SplatParameters.of_scene(scene, 0, RATES, "cpu")
+    return SplatParameters.of_scene(scene, 0, "cpu")
 
 
 def strategy_for(splats: SplatParameters, **changes) -> DefaultStrategy:
@@ -47,7 +47,7 @@ def test_large_gradients_double_small_gaussians_and_split_large_ones():
     strategy = strategy_for(splats)
     strategy.gradients, strategy.counts = torch.tensor([1.0, 1.0, 0.0]), torch.ones(3)
     small, large, other = splats["means"].detach().clone()
-    strategy.refine(1, splats)
+    strategy.refine(1, splats, RATES)
     assert len(splats) == 5
     means, scales = splats["means"], splats.scales[:, 0]
     assert (means == small).all(dim=1).sum() == 2 and (means == other).all(dim=1).sum() == 1
@@ -64,7 +64,7 @@ def test_only_the_strongest_grow_up_to_the_limit():
     strategy = strategy_for(splats, max_gaussians=4)
     strategy.gradients, strategy.counts = torch.tensor([1.0, 3.0, 2.0]), torch.ones(3)
     strongest = splats["means"][1].detach().clone()
-    strategy.refine(1, splats)
+    strategy.refine(1, splats, RATES)
     assert len(splats) == 4
     assert (splats["means"] == strongest).all(dim=1).sum() == 2
 
@@ -73,11 +73,11 @@ def test_faint_and_huge_gaussians_are_removed_and_opacities_reset():
     """Faint Gaussians go at once, huge ones after the first reset, which dims all the others."""
     splats = three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.004))
     strategy = strategy_for(splats, reset_every=2)
-    strategy.refine(1, splats)
+    strategy.refine(1, splats, RATES)
     assert len(splats) == 2
-    strategy.refine(2, splats)
+    strategy.refine(2, splats, RATES)
     np.testing.assert_allclose(splats.opacities.detach(), [0.01, 0.01], rtol=1e-4)
-    strategy.refine(3, splats)
+    strategy.refine(3, splats, RATES)
     assert splats.scales.max() < 0.01
 
 

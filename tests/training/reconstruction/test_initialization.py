@@ -4,16 +4,49 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.initialization import (
     Detail,
     gaussians_from_depth,
     gaussians_from_points,
     random_points,
+    resolve_config,
 )
 from splatpilot.training.reconstruction.overlap import ThinnedFrame
 from splatpilot.training.reconstruction.photometry import estimate_photometry
 
 COARSE = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
+
+
+class Frames:
+    """A capture of so many frames, as far as settings depend on it."""
+
+    points = None
+
+    def __init__(self, count, has_depth):
+        self.count, self.has_depth = count, has_depth
+
+    def __len__(self):
+        return self.count
+
+
+@pytest.mark.parametrize(
+    ("count", "has_depth", "asked", "expected"),
+    [
+        (71, True, -1, 2000),  # 62 of them are fitted: 1984 would be too few
+        (160, True, -1, 140 * 32),
+        (700, True, -1, 7000),
+        (71, False, -1, 7000),
+        (700, True, 123, 123),
+        (71, True, 0, 0),
+    ],
+)
+def test_steps_follow_the_images_that_are_fitted(count, has_depth, asked, expected):
+    """32 for each from 2000 to 7000 where Gaussians start from depth, unless a number is given."""
+    config = ReconstructConfig(iterations=asked)
+    resolved = resolve_config(config, Frames(count, has_depth))  # pyright: ignore[reportArgumentType]
+    assert resolved.iterations == expected
+    assert resolved.initialization == ("depth" if has_depth else "random")
 
 
 def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):

@@ -49,31 +49,31 @@ def test_dead_gaussians_move_to_living_ones():
     """After a change none is dead, those that were stand where living ones do, and the number
     grows by a twentieth up to the limit."""
     opacities = np.where(np.arange(200) % 4 == 0, 0.001, 0.9)
-    splats = SplatParameters.of_scene(scene(200, opacities), 0, RATES, "cpu")
+    splats = SplatParameters.of_scene(scene(200, opacities), 0, "cpu")
     living = splats["means"][torch.arange(200) % 4 != 0].detach().clone()
     config = ReconstructConfig(
         strategy="mcmc", refine_start=1, refine_every=1, iterations=10, noise=0.0,
         max_gaussians=215,
     )  # fmt: skip
     strategy = McmcStrategy(config)
-    strategy.refine(1, splats)
+    strategy.refine(1, splats, RATES)
     assert len(splats) == 210
     assert splats.opacities.min() > 0.005
     same = (splats["means"].detach()[:, None] == living).all(dim=2)  # (210, 150)
     assert same.any(dim=1).all()
-    strategy.refine(2, splats)
+    strategy.refine(2, splats, RATES)
     assert len(splats) == 215
 
 
 def test_what_is_added_to_scales_is_added_once():
     """Gaussians whose smallest scale is far above their own share out their own alone."""
-    splats = SplatParameters.of_scene(scene(50, np.full(50, 0.9)), 0, RATES, "cpu")
+    splats = SplatParameters.of_scene(scene(50, np.full(50, 0.9)), 0, "cpu")
     largest = splats["log_scales"].max().item()
     splats.limit_scales(ScaleLimits(torch.full((50,), 5.0), torch.full((50,), torch.inf)))
     config = ReconstructConfig(
         strategy="mcmc", refine_start=1, refine_every=1, iterations=10, noise=0.0
     )
-    McmcStrategy(config).refine(1, splats)
+    McmcStrategy(config).refine(1, splats, RATES)
     assert len(splats) == 52
     assert splats["log_scales"].max().item() <= largest
 
@@ -90,10 +90,10 @@ def test_noise_moves_faint_gaussians_along_their_own_axes():
         flat.opacities,
         flat.sh,
     )
-    splats = SplatParameters.of_scene(flat, 0, RATES, "cpu")
+    splats = SplatParameters.of_scene(flat, 0, "cpu")
     before = splats["means"].detach().clone()
     config = ReconstructConfig(strategy="mcmc", refine_start=100, iterations=10, noise=1e3)
-    McmcStrategy(config).refine(1, splats)
+    McmcStrategy(config).refine(1, splats, RATES)
     step = (splats["means"] - before).detach().numpy()
     faint = np.arange(count) % 2 == 1
     assert np.abs(step[~faint]).max() < 1e-6

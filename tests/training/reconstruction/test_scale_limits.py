@@ -71,14 +71,13 @@ def test_scales_keep_their_limits():
         "logit_opacities": torch.zeros(3),
         "sh_0": torch.zeros(3, 1, 3),
     }
-    rates = dict.fromkeys(tensors, 1e-3)
-    splats = SplatParameters(tensors, rates)
+    splats = SplatParameters(tensors)
     assert splats.scales.flatten().tolist() == pytest.approx([3e-3] * 9)
     limits = ScaleLimits(torch.tensor([0.0, 4e-3, 0.0]), torch.tensor([torch.inf, 1.0, 2e-3]))
     splats.limit_scales(limits)
     assert splats.scales[:, 0].tolist() == pytest.approx([3e-3, 5e-3, 2e-3])
     assert splats["log_scales"][2].exp().tolist() == pytest.approx([2e-3] * 3)
-    again = SplatParameters(**splats.state(), rates=rates)
+    again = SplatParameters(**splats.state())
     assert torch.equal(again.scales, splats.scales)
     splats.rebuild(torch.tensor([1]), {name: tensor[:1] for name, tensor in tensors.items()})
     assert splats.scales[:, 0].tolist() == pytest.approx([5e-3, 3e-3])
@@ -89,13 +88,13 @@ def test_gaussians_at_their_largest_can_shrink_again():
     where the gradient of what is rendered says so."""
     tensors = {"means": torch.zeros(1, 3), "log_scales": torch.full((1, 3), 0.5).log()}
     tensors["logit_opacities"] = torch.zeros(1)
-    splats = SplatParameters(tensors, dict.fromkeys(tensors, 0.1))
+    splats, rates = SplatParameters(tensors), dict.fromkeys(tensors, 0.1)
     splats.limit_scales(ScaleLimits(torch.zeros(1), torch.tensor([0.2])))
     for sign, expected in ((-1, 0.2), (-1, 0.2), (1, 0.19)):
         (sign * splats.scales.sum()).backward()
-        splats.step()
+        splats.step(rates)
         assert splats.scales[0].tolist() == pytest.approx([expected] * 3, rel=0.1)
     for _ in range(20):
         splats.scales.sum().backward()
-        splats.step()
+        splats.step(rates)
     assert splats.scales.max() < 0.15
