@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
+from splatpilot.analysis.bug_report import write_report
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.verb import FailureWithResultError, as_json
 from splatpilot.systems.extras import missing_extra
@@ -49,7 +50,8 @@ def build_parser() -> argparse.ArgumentParser:
         prog="splatpilot",
         description="Fly drones by camera inside Gaussian-splat worlds.",
         epilog="exit status: 0 done, 1 an error that one message explains, 2 words that make no "
-        "command, 130 and 143 ended by Ctrl-C and SIGTERM",
+        "command, 70 a mistake of the program, which leaves a report, 130 and 143 ended by Ctrl-C "
+        "and SIGTERM",
     )
     parser.add_argument(
         "--import",
@@ -76,8 +78,9 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: the words after `splatpilot`; those of the process when None.
 
     Returns:
-        The exit status: 0; 1 after an error that one message on standard error explains; 130 and
-        143 after Ctrl-C and SIGTERM.
+        The exit status: 0; 1 after an error that one line on standard error explains; 70 after a
+        mistake of this program, with a line that says which file has a report of it; 130 and 143
+        after Ctrl-C and SIGTERM.
     """
     parser = build_parser()
     if "_ARGCOMPLETE" in os.environ:
@@ -101,21 +104,37 @@ def main(arguments: list[str] | None = None) -> int:
                 raise
             print(json.dumps(as_json(result), indent=2))
             return 0
+    except BrokenPipeError:  # who read what is printed has had enough, as `head` does
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _say("what it prints was not read to its end", 1)
     except (ValueError, OSError) as error:
-        print(f"splatpilot: {error}", file=sys.stderr)
-        return 1
-    except ModuleNotFoundError as error:
-        missing = missing_extra(error, verb)
-        if missing is None:
-            raise
-        print(f"splatpilot: {missing}", file=sys.stderr)
-        return 1
+        return _say(str(error), 1)
+    except MemoryError as error:
+        needed = f" ({error})" if str(error) else ""
+        return _say(
+            f"{verb} needs more memory than there is{needed}; make the world, the images or the "
+            "voxels of a smaller size, or use fewer --jobs",
+            1,
+        )
+    except OverflowError as error:
+        return _say(f"a number given to {verb} is too large ({error}); give a smaller one", 1)
     except _TerminatedError:
-        print("splatpilot: terminated", file=sys.stderr)
-        return 143
+        return _say("terminated", 143)
     except KeyboardInterrupt:
-        print("splatpilot: interrupted", file=sys.stderr)
-        return 130
+        return _say("interrupted", 130)
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error, verb)):
+            return _say(missing, 1)
+        report = write_report(error, sys.argv[1:] if arguments is None else arguments)
+        kind = type(error).__name__
+        return _say(f"{verb} met a mistake of the program ({kind}); the report is {report}", 70)
+
+
+def _say(message: str, status: int) -> int:
+    """Prints a message as one line; returns the status."""
+    print(f"splatpilot: {' '.join(message.split())}", file=sys.stderr)
+    return status
 
 
 @contextlib.contextmanager

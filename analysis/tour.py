@@ -10,6 +10,8 @@ from splatpilot.diagrams import fly
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import SceneConfig
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.systems.configuration import claim_folder
+from splatpilot.systems.files import holds_folder
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -28,6 +30,7 @@ class TourConfig:
     flight: Scenario = field(default_factory=Scenario)  # its world is the reconstruction
 
 
+@holds_folder("out")
 def run(
     *, world: str | Path, out: Path, scene: Path | None, config: TourConfig, seed: int = 0
 ) -> dict[str, float | str]:
@@ -38,11 +41,12 @@ def run(
 
     Raises:
         FileNotFoundError, ValueError, OSError: see `render_capture.run`, `make_scene` and
-            `fly.run`.
+            `fly.run`; or if the scene was begun with other settings of `reconstruct`.
     """
     capture = out / "capture"
     scene = out / "scene" if scene is None else scene
     render_capture.run(world=world, out=capture, config=config.render, seed=seed)
+    claim_folder(out / "reconstruct.yaml", config.reconstruct)
     make_scene(capture, scene, config.reconstruct)
     config.flight.world = SceneConfig(path=str(scene.absolute()))
     return fly.run(scenario=config.flight, out=out / "flight", overwrite=True)

@@ -14,7 +14,9 @@ from typing import Any, cast
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.read_limit import read_text
 from splatpilot.systems.registry import Registry
 
 OPEN_REGISTRY = "registry"
@@ -48,13 +50,7 @@ def load_config[Config](
     """
     config = defaults
     if path is not None:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: there is no such file")
-        try:
-            text = path.read_text()
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{path} is not text: {error}") from None
-        config = _updated(config, text, str(path))
+        config = _updated(config, read_text(path), str(path))
     for override in overrides or []:
         name, equals, value = override.partition("=")
         if not equals:
@@ -82,6 +78,13 @@ def dump_config(config: Any) -> str:
     """The configuration as YAML, every field written out."""
     _resolve_open_fields(config, set())
     return cast(str, yaml_dump_typed(config))
+
+
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """What is wrong with a text that is not YAML, in one line and without what it holds."""
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
+        return reason_of(error)
+    return f"line {error.problem_mark.line + 1}: {error.problem}"
 
 
 def claim_folder(file: Path, config: Any) -> str:
@@ -168,11 +171,13 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
         _check_names(config, yaml.load(text, _NamesLoader), "")
         return yaml_load_typed(schema=type(config), data=tagged or text, defaults=config)
     except yaml.YAMLError as error:
-        raise ValueError(f"{source} is not YAML: {error}") from None
+        raise ValueError(f"{source} is not YAML: {yaml_problem(error)}") from None
+    except RecursionError:
+        raise ValueError(f"{source}: fields are nested too deeply; name another file") from None
     except AssertionError:  # How Drake's reader refuses a plain value where fields belong.
         raise ValueError(f"{source}: null stands where fields belong") from None
-    except (RuntimeError, ValueError, TypeError, AttributeError) as error:
-        reason = str(error).partition("\n")[0]
+    except Exception as error:  # Drake's reader raises anything of values of other types
+        reason = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"{source}: {_UNKNOWN_TAG.sub(_known_tags, reason)}") from None
 
 

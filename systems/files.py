@@ -1,27 +1,152 @@
-"""Files and folders that appear whole or not at all."""
+"""Files and folders that appear whole or not at all, and whose process at work is known.
 
+What is being written has a temporary name, `.STEM.HOST.PID.partial.SUFFIX`, beside its place. A
+process that is killed leaves it there; `require_writable_folder`, with which every run begins,
+removes what dead processes of this host have left.
+"""
+
+import contextlib
+import ctypes
 import errno
+import fcntl
+import functools
+import inspect
 import os
+import platform
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+_HOST = re.sub(r"[^\w-]", "-", platform.node()) or "host"
+_LEFTOVER = re.compile(rf"\..+\.{re.escape(_HOST)}\.(\d+)\.partial(\..*)?")
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of renameat2(2)
+
+
+class _UnwritableError(OSError):
+    """Says already which file cannot be written."""
+
 
 @contextmanager
-def written_atomically(path: Path) -> Iterator[Path]:
+def written_atomically(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
     """
     Yields a temporary path beside `path` to write to, which becomes `path` when the block ends.
 
     An exception in the block removes the temporary file and leaves what stood at `path`. The
     temporary name keeps the suffix, because many writers choose their format by it.
+
+    Args:
+        check: raises OSError of a file that its writer left broken without a word; called with the
+            temporary file before it is renamed.
+
+    Raises:
+        OSError: if it cannot be written; the message names `path`.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    partial = _temporary(path, path.stem, path.suffix)
     try:
-        yield partial
-        os.replace(partial, path)
+        with _naming(path, partial):
+            yield partial
+            _flush(partial)
+            if check is not None:
+                check(partial)
+            os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[Path]:
+    """
+    Yields a temporary folder beside `path` to write into, which becomes `path` when the block ends.
+
+    An exception in the block removes the temporary folder.
+
+    Args:
+        replace: whether it takes the place of a folder that is at `path`. Otherwise what another
+            process put there meanwhile stays.
+
+    Raises:
+        OSError: if it cannot be written; the message names `path`.
+    """
+    partial = _temporary(path, path.name)
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        with _naming(path, partial):
+            partial.mkdir(parents=True)
+            yield partial
+            for file in partial.rglob("*"):
+                _flush(file)
+            if replace and path.is_dir():
+                _exchange(partial, path)
+            else:
+                _rename_unless_there(partial, path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def held_folder(path: Path) -> Iterator[None]:
+    """
+    Makes the folder `path` if need be, and holds it for this process while the block runs; a
+    process that ends in any way no longer holds it. A folder made here that stays empty goes again.
+
+    Raises:
+        OSError: if it cannot be made or written to, or another process holds it; the message says
+            which. Network file systems that know no locks let all in.
+    """
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    require_writable_folder(path)
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OSError(
+                f"{path} is in use by {_holder(descriptor)}; wait until that ends, or choose "
+                "another folder"
+            ) from None
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL):
+                raise
+        yield
+    finally:
+        os.close(descriptor)
+        with contextlib.suppress(OSError):  # unless they are empty
+            for folder in made:
+                folder.rmdir()
+
+
+def holds_folder[**P, Result](
+    argument: str,
+) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
+    """Decorates a function that works in the folder which this argument names: it holds that
+    folder, see `held_folder`."""
+
+    def decorate(function: Callable[P, Result]) -> Callable[P, Result]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def holding(*args: P.args, **keywords: P.kwargs) -> Result:
+            with held_folder(Path(signature.bind(*args, **keywords).arguments[argument])):
+                return function(*args, **keywords)
+
+        return holding
+
+    return decorate
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what processes of this host that have ended were writing into a folder."""
+    for path in folder.iterdir():
+        match = _LEFTOVER.fullmatch(path.name)
+        if match is None or _runs(int(match[1])):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def require_existing(path: Path, what: str) -> None:
@@ -39,7 +164,10 @@ def require_unused(path: Path, overwrite: bool) -> None:
         FileExistsError: if there is a file, or a folder that holds anything, and that is not to be
             overwritten.
     """
-    used = any(path.iterdir()) if path.is_dir() else path.exists()
+    if not path.is_dir():
+        used = path.exists()
+    else:
+        used = any(_LEFTOVER.fullmatch(file.name) is None for file in path.iterdir())
     if used and not overwrite:
         raise FileExistsError(
             f"{path} is there already; name another --out, or replace it with --overwrite"
@@ -48,39 +176,93 @@ def require_unused(path: Path, overwrite: bool) -> None:
 
 def require_writable_folder(path: Path) -> None:
     """
-    Makes the folder `path` if need be.
+    Makes the folder `path` if need be, and removes what dead processes have left in it.
 
     Raises:
         OSError: if it cannot be made or written to; the message says which and what to do.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".{os.getpid()}.probe"
+        probe = _temporary(path / "probe", "probe")
         probe.touch()
         probe.unlink()
+        remove_leftovers(path)
     except OSError as error:
         raise OSError(
             f"cannot write to the output folder {path}: {error.strerror}; choose another with --out"
         ) from None
 
 
-@contextmanager
-def folder_written_atomically(path: Path) -> Iterator[Path]:
-    """
-    Yields a temporary folder beside `path` to write into, which becomes `path` when the block ends.
+def _temporary(path: Path, stem: str, suffix: str = "") -> Path:
+    return path.with_name(f".{stem}.{_HOST}.{os.getpid()}.partial{suffix}")
 
-    An exception in the block removes the temporary folder. What another process put at `path`
-    meanwhile stays.
-    """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+
+@contextmanager
+def _naming(path: Path, partial: Path) -> Iterator[None]:
+    """Says of which file it is that the disk is full; libraries do not."""
     try:
-        yield partial
-        try:
-            partial.rename(path)
-        except OSError as error:
-            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-                raise
+        yield
+    except _UnwritableError:
+        raise
+    except OSError as error:
+        if error.filename is not None and not str(error.filename).startswith(str(partial)):
+            raise  # It is about another file.
+        remedy = "make room" if error.errno in (None, *_NO_ROOM) else "is the folder writable?"
+        reason = error.strerror or str(error)
+        raise _UnwritableError(f"{path}: cannot be written ({reason}); {remedy}") from error
+
+
+def _flush(path: Path) -> None:
+    """Some file systems say only now that there is no room."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        os.close(descriptor)
+
+
+def _rename_unless_there(folder: Path, path: Path) -> None:
+    try:
+        folder.rename(path)
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Exchanges two folders in one step, where the system can; elsewhere a kill between two steps
+    leaves `other` under a temporary name."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    names = os.fsencode(one), os.fsencode(other)
+    if rename is not None and not rename(
+        _AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE
+    ):
+        return
+    between = one.with_name(f"{one.name}.old")
+    other.rename(between)
+    one.rename(other)
+    between.rename(one)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _holder(descriptor: int) -> str:
+    """Who holds a folder, as Linux's /proc tells."""
+    status = os.fstat(descriptor)
+    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}"
+    with contextlib.suppress(OSError, IndexError, ValueError):
+        for line in Path("/proc/locks").read_text().splitlines():
+            words = line.split()
+            if words[1] == "FLOCK" and words[5] == f"{device}:{status.st_ino}":
+                pid = int(words[4])
+                command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+                return f"process {pid} ({b' '.join(command[:8]).decode(errors='replace').strip()})"
+    return "another process"

@@ -9,9 +9,10 @@ from typing import Any
 from splatpilot.analysis.benchmark.run import Row, conclude, flights_there
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.systems.files import written_atomically
+from splatpilot.systems.files import holds_folder, written_atomically
 
 
+@holds_folder("out")
 def run(*, out: Path, shards: list[Path]) -> list[Row]:
     """
     Joins the folders of all shards of a study. What is left in `out` is the study as if it had been

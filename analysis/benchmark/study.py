@@ -85,12 +85,7 @@ class StudyConfig:
             ValueError: for an unknown scenario, policy or speed, anything given twice, and values
                 that cannot be flown; the message names it and what there is.
         """
-        if not 1 <= self.seeds <= TRAINING_SEEDS:
-            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
-        for speed in self.speeds:
-            if not 0.0 < speed < math.inf:
-                raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
-        self._check_names()
+        self.validate()
         for override in self.overrides:
             _check_override(override)
         for variant in self.variants:
@@ -106,6 +101,18 @@ class StudyConfig:
             except ValueError as error:
                 raise ValueError(f"scenario {name}: {error}") from None
         return scenarios
+
+    def validate(self) -> None:
+        """
+        Raises:
+            ValueError: for numbers out of range, anything given twice or not at all.
+        """
+        if not 1 <= self.seeds <= TRAINING_SEEDS:
+            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
+        for speed in self.speeds:
+            if not 0.0 < speed < math.inf:
+                raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
+        self._check_names()
 
     def _check_names(self) -> None:
         """Raises ValueError unless everything is given, once, and all flights differ in name."""

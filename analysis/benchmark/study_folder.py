@@ -16,7 +16,6 @@ A flight is there when its file in `rollouts/` is; files appear whole.
 import csv
 import json
 import shutil
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,21 @@ from typing import Any
 import numpy as np
 import yaml
 
-from splatpilot.analysis.benchmark.rollout import ARRAYS, Fault, Rollout
+from splatpilot.analysis.benchmark.rollout import ARRAYS, INFEASIBLE, Fault, Rollout
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
-from splatpilot.systems.configuration import dump_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.array_files import read_archive, reason_of
+from splatpilot.systems.configuration import dump_config, parse_config
+from splatpilot.systems.files import require_existing, require_writable_folder, written_atomically
+from splatpilot.systems.read_limit import read_text
 
 FORMAT_VERSION = 1
+
+
+_SHAPES = {"times": (), "states": (13,), "commands": (4,), "clearances": ()}
+"""Of a sample of the arrays that are kept."""
+
+_MEASURES = "flight_time_s", "path_length_m", "mean_speed_m_s", "min_clearance_m", "jerk_m_s3"
 
 
 @dataclass(frozen=True)
@@ -71,17 +78,19 @@ class StudyFolder:
             described["shard"] = str(shard)
         if (self.path / "study.yaml").is_file():
             self._check_same(described)
-        elif self.path.is_dir() and any(self.path.iterdir()):
-            raise ValueError(
-                f"{self.path} is not empty and holds no study; choose another folder with --out"
-            )
-        require_writable_folder(self.path)
-        for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
-            (self.path / folder).mkdir(exist_ok=True)
-        shutil.rmtree(self.path / "errors", ignore_errors=True)
-        if not (self.path / "study.yaml").is_file():
+        else:
+            require_writable_folder(self.path)
+            if any(self.path.iterdir()):
+                raise ValueError(
+                    f"{self.path} is not empty and holds no study; choose another folder with --out"
+                )
+            # Before all else: it makes the folder that of this study.
             with written_atomically(self.path / "study.yaml") as path:
                 path.write_text(yaml.safe_dump(described, sort_keys=False))
+        require_writable_folder(self.path)
+        for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
+            require_writable_folder(self.path / folder)
+        shutil.rmtree(self.path / "errors", ignore_errors=True)
 
     def _check_same(self, described: dict[str, Any]) -> None:
         there = self._described()
@@ -100,21 +109,23 @@ class StudyFolder:
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
+        require_existing(file, "a folder that `splatpilot benchmark` has written")
         try:
-            described = yaml.safe_load(file.read_text())
+            described = yaml.safe_load(read_text(file))
             version = described["format_version"]
-        except FileNotFoundError:
-            raise FileNotFoundError(
-                f"{file}: there is no such file; a study is a folder that `splatpilot benchmark` "
-                "has written"
-            ) from None
-        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError) as error:
-            raise ValueError(f"{file} describes no study: {error}") from None
+        except (yaml.YAMLError, KeyError, TypeError, RecursionError) as error:
+            raise ValueError(f"{file} describes no study: {reason_of(error)}") from None
         if version != FORMAT_VERSION:
             raise ValueError(
                 f"{file}: format version {version}, this program knows {FORMAT_VERSION}; use the "
                 "version of the program that made the study"
             )
+        for name, kind in (("study", dict), ("program", dict), ("shard", str | None)):
+            if not isinstance(described.get(name), kind):
+                raise ValueError(
+                    f"{file} describes no study: {name} is {described.get(name)!r:.80}; restore "
+                    "the file, or fly the study anew in another folder"
+                )
         return described
 
     def config(self) -> StudyConfig:
@@ -123,7 +134,14 @@ class StudyFolder:
         Raises:
             FileNotFoundError, ValueError: if the folder holds no study.
         """
-        return StudyConfig(**self._described()["study"])
+        file = self.path / "study.yaml"
+        text = yaml.safe_dump(self._described()["study"])
+        config = parse_config(StudyConfig(), text, str(file))
+        try:
+            config.validate()
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
+        return config
 
     def program(self) -> dict[str, str]:
         """What `claim` was told of the program."""
@@ -146,7 +164,8 @@ class StudyFolder:
         """Keeps the traceback of a fault; returns its file."""
         file = self.path / "errors" / f"{fault.id}.txt"
         file.parent.mkdir(exist_ok=True)
-        file.write_text(fault.traceback)
+        with written_atomically(file) as path:
+            path.write_text(fault.traceback)
         return file
 
     def read(self, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -159,13 +178,16 @@ class StudyFolder:
         """
         file = self.trajectory(spec.id)
         try:
-            with np.load(file) as arrays:
-                row = json.loads(str(arrays["row"]))
-                flown = {name: arrays[name] for name in ARRAYS if name in arrays}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
-            raise ValueError(f"{file} is damaged: {error}") from None
+            arrays = read_archive(file)
+            row = json.loads(str(arrays["row"]))
+            flown = {name: arrays[name] for name in ARRAYS if name in arrays}
+        except FileNotFoundError:
+            raise
+        except (OSError, ValueError, KeyError, RecursionError) as error:
+            raise ValueError(f"{file} is damaged: {reason_of(error)}") from None
+        if not isinstance(row, dict):
+            raise ValueError(f"{file} is damaged: its row is {row!r:.80}")
+        _check_flight(file, row, flown)
         if {name: row.get(name) for name in spec._fields} != spec._asdict():
             raise ValueError(f"{file} is of another flight, {row}")
         return {"id": spec.id} | row, flown
@@ -187,3 +209,24 @@ class StudyFolder:
             writer = csv.DictWriter(file, columns, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
+
+
+def _check_flight(file: Path, row: dict[str, Any], flown: dict[str, np.ndarray]) -> None:
+    """Raises ValueError unless this is all that is kept of a flight."""
+    names = ("reason",) if row.get("outcome") == INFEASIBLE else ("outcome", "digest")
+    wrong = [name for name in names if not isinstance(row.get(name), str)]
+    if not isinstance(row.get("success"), bool):
+        wrong.append("success")
+    if row.get("outcome") != INFEASIBLE:
+        count = flown["times"].shape[:1] if "times" in flown else ()
+        wrong += [name for name in _MEASURES if type(row.get(name)) not in (int, float)]
+        wrong += [
+            name
+            for name, shape in _SHAPES.items()
+            if name not in flown
+            or flown[name].dtype.kind != "f"
+            or flown[name].shape != (*count, *shape)
+            or not count
+        ]
+    if wrong:
+        raise ValueError(f"{file} is damaged: {wrong[0]} is missing or of another kind")

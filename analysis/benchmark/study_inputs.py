@@ -11,7 +11,7 @@ from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
 from splatpilot.systems.configuration import dump_config, load_config
-from splatpilot.systems.files import written_atomically
+from splatpilot.systems.files import folder_written_atomically, written_atomically
 
 
 def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:
@@ -105,13 +105,12 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
     scene = find_scene(world)
     kept = folder.path / "scenes" / scene.name
     if not kept.exists():
-        partial = kept.with_name(f".{kept.name}.partial")
         if scene.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
-            shutil.copytree(scene, partial)
+            with folder_written_atomically(kept) as partial:
+                shutil.copytree(scene, partial, dirs_exist_ok=True)
         else:
-            shutil.copyfile(scene, partial)
-        partial.rename(kept)
+            with written_atomically(kept) as partial:
+                shutil.copyfile(scene, partial)
     return str(kept.relative_to(folder.path))
 
 

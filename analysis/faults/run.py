@@ -15,7 +15,7 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.configuration import dump_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import holds_folder, require_writable_folder, written_atomically
 
 
 def _scenario() -> Scenario:
@@ -45,6 +45,7 @@ class FaultsConfig:
         self.scenario.validate()
 
 
+@holds_folder("out")
 def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
     """
     Flies the trials, from where an interrupted campaign of the same configuration stopped.

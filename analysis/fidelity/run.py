@@ -29,7 +29,7 @@ from splatpilot.diagrams.worlds.scene_metadata import (
     write_scene_metadata,
 )
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import holds_folder, require_writable_folder, written_atomically
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render_capture import true_camera
 from splatpilot.training.reconstruction.measures import mean_measure
@@ -42,6 +42,7 @@ RECIPE = "reconstruct.yaml"
 _GRID = 0.1  # [m], steps in which the surroundings of a pose are tried
 
 
+@holds_folder("out")
 def run(
     scenes: Sequence[Path],
     out: Path,

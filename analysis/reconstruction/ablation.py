@@ -28,7 +28,7 @@ from splatpilot.analysis.reconstruction.scene_measures import (
 )
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import holds_folder, require_writable_folder, written_atomically
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_of_scene import read_capture_of
@@ -67,6 +67,7 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     )
 
 
+@holds_folder("out")
 def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> AblationResult:
     """Reconstructs each capture in four ways, measures them and writes the study to `out`.
 

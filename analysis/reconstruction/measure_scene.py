@@ -56,9 +56,9 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
         frames[i] = views.measure(frame, views.seen(frame), lpips)
     height, width = size
     measures = SceneMeasures(bool(views.metadata.held_out), width, height, frames, missing)
-    with written_atomically(scene / METRICS) as partial:
-        partial.write_text(json.dumps(measures.as_json(), indent=2))
     _write_views(scene / SHEET, views, measures)
+    with written_atomically(scene / METRICS) as partial:  # Last: it says that all is there.
+        partial.write_text(json.dumps(measures.as_json(), indent=2))
     return measures
 
 

@@ -5,8 +5,10 @@ from pathlib import Path
 from splatpilot.analysis.reconstruction.measure_scene import measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target
+from splatpilot.systems.files import held_folder
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
+from splatpilot.training.reconstruction.checkpoint import work_folder
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, reconstruct
 
@@ -27,8 +29,9 @@ def run(
     require_renderer(config.device)
     check_scene_target(out)
     opened = read_capture(capture, config.capture)
-    summary = reconstruct(opened, out, config, restart=restart)
-    print(summary)
-    measures = measure_scene(Path(out), opened)
-    print(measures)
+    with held_folder(work_folder(Path(out))):
+        summary = reconstruct(opened, out, config, restart=restart)
+        print(summary)
+        measures = measure_scene(Path(out), opened)
+        print(measures)
     return summary, measures

@@ -6,8 +6,6 @@ of what lies infinitely far (`EnvironmentMap`). `frontier.ply`, if there is one,
 where nobody looked any further: cameras of flights see it too, measures of the scene do not.
 """
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +23,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
-from splatpilot.systems.files import require_writable_folder
+from splatpilot.systems.files import folder_written_atomically, require_writable_folder
 from splatpilot.systems.splats.background import Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
@@ -139,7 +137,7 @@ def write_scene_folder(
     for what is said about it. Its Gaussians are without the `frontier`, see `close_frontier`.
 
     The folder appears whole: it is written beside its place and renamed. A scene that stands there
-    is replaced. Only the grid of the distance field is kept.
+    is replaced in the same step. Only the grid of the distance field is kept.
 
     Raises:
         ValueError, OSError: see `check_scene_target`; or if the disk is full.
@@ -167,10 +165,7 @@ def write_scene_folder(
         held_out=[int(frame) for frame in held_out],
         image_width=image_width,
     )
-    new = path.with_name(f".{path.name}.{os.getpid()}.new")
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
-    try:
-        new.mkdir(parents=True)
+    with folder_written_atomically(path, replace=True) as new:
         write_ply(world.gaussians, new / "gaussians.ply")
         if frontier is not None:
             write_ply(frontier, new / FRONTIER)
@@ -178,14 +173,6 @@ def write_scene_folder(
         if isinstance(world.background, EnvironmentMap):
             world.background.save(new / ENVIRONMENT)
         write_scene_metadata(new, metadata)
-        if path.exists():
-            path.rename(old)
-        new.rename(path)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-        if old.exists() and not path.exists():
-            old.rename(path)
-        shutil.rmtree(old, ignore_errors=True)
     return metadata
 
 

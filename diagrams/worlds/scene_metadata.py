@@ -7,7 +7,10 @@ import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from splatpilot.systems.array_files import reason_of
+from splatpilot.systems.configuration import yaml_problem
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.read_limit import read_text
 
 FORMAT_VERSION = 2
 ENVIRONMENT = "environment.png"
@@ -76,9 +79,12 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     """
     file = Path(path) / "scene.yaml"
     try:
-        metadata = yaml_load_typed(schema=SceneMetadata, filename=str(file))
-    except (RuntimeError, ValueError, TypeError, yaml.YAMLError) as error:
-        raise ValueError(f"{file}: {error}; reconstruct the scene again or repair it") from error
+        metadata = yaml_load_typed(schema=SceneMetadata, data=read_text(file))
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # Drake's reader raises anything of values of other types
+        wrong = yaml_problem(error) if isinstance(error, yaml.YAMLError) else reason_of(error)
+        raise ValueError(f"{file}: {wrong}; reconstruct the scene again or repair it") from None
     if metadata.format_version < FORMAT_VERSION:
         raise ValueError(
             f"{file}: format version {metadata.format_version}, from when scenes had no background "

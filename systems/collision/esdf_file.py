@@ -1,12 +1,11 @@
 """The file format `esdf.npz`: a compressed numpy archive with a version number."""
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from splatpilot.systems.array_files import read_archive
 from splatpilot.systems.files import written_atomically
 
 FORMAT_VERSION = 1
@@ -59,11 +58,8 @@ def read_esdf_arrays(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such distance field file (esdf.npz).")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in _ENTRIES if name in archive}
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError) as error:
-        raise ValueError(f"{path}: not a readable numpy archive (.npz): {error}") from error
+    archive = read_archive(path)
+    arrays = {name: archive[name] for name in _ENTRIES if name in archive}
     missing = [name for name in _ENTRIES if name not in arrays]
     if missing:
         raise ValueError(

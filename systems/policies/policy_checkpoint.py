@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from splatpilot.systems.array_files import read_archive
 from splatpilot.systems.files import written_atomically
 
 FORMAT = 1
@@ -96,9 +97,8 @@ def _read(path: Path, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray
     if not path.is_file():
         raise FileNotFoundError(f"there are no weights at {path}; {remedy}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            weights = {name: file[name] for name in file.files if name != "about"}
-            about = json.loads(str(file["about"]))
+        weights = read_archive(path)
+        about = json.loads(str(weights.pop("about")))
         missing = {"format", "policy", "spec", "provenance"} - about.keys()
     except Exception as error:
         raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None

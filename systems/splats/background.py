@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from splatpilot.systems.files import written_atomically
 from splatpilot.systems.splats.baked_scene import RenderedView
 
 if TYPE_CHECKING:
@@ -40,7 +41,10 @@ class EnvironmentMap:
         """
         if not file.exists():
             raise FileNotFoundError(f"{file}: does not exist; reconstruct the scene again")
-        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        try:
+            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        except cv2.error:  # more pixels than OpenCV decodes
+            image = None
         if image is None:
             raise ValueError(f"{file}: cannot be read as an image; reconstruct the scene again")
         return cls((image[..., ::-1] / 255).astype(np.float32))
@@ -51,7 +55,8 @@ class EnvironmentMap:
         Raises:
             OSError: if it cannot be written.
         """
-        file.write_bytes(self.png())
+        with written_atomically(file) as partial:
+            partial.write_bytes(self.png())
 
     def png(self) -> bytes:
         """The texels as an image of 8 bits."""

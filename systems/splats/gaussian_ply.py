@@ -8,9 +8,10 @@ f_rest_0..3(K-1)-1 (channel-major: all of red, then green, then blue) opacity (l
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.ply_files import read_ply_file
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 _NORMALS = ["nx", "ny", "nz"]
@@ -39,18 +40,7 @@ def read_ply(path: str | Path) -> GaussianScene:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; a PLY file with Gaussians is needed")
-    try:
-        ply = PlyData.read(str(path))
-    except PlyElementParseError as error:
-        raise ValueError(
-            f"{path}: the data do not match the header ({error}); the file is truncated or "
-            "damaged, copy it again"
-        ) from error
-    except (PlyParseError, UnicodeDecodeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: not a PLY file ({error}); a PLY file with Gaussians is needed"
-        ) from error
-
+    ply = read_ply_file(path)
     if "vertex" not in ply:
         raise ValueError(f"{path}: no element 'vertex'; a PLY file with Gaussians is needed")
     vertex = ply["vertex"]
@@ -71,7 +61,13 @@ def read_ply(path: str | Path) -> GaussianScene:
         )
 
     def columns(properties: list[str]) -> np.ndarray:
-        return np.stack([np.asarray(vertex[name], dtype=np.float64) for name in properties], 1)
+        try:
+            return np.stack([np.asarray(vertex[name], dtype=np.float64) for name in properties], 1)
+        except (ValueError, TypeError):
+            raise ValueError(
+                f"{path}: {', '.join(properties)} are not all plain numbers; export the scene in "
+                "the layout of 3D Gaussian splatting"
+            ) from None
 
     sh = columns(_DC)[:, None, :]
     if rest:
@@ -117,9 +113,5 @@ def write_ply(scene: GaussianScene, path: str | Path) -> None:
     names = [name for block, _ in blocks for name in block]
     table = np.concatenate([values for _, values in blocks], axis=1).astype("<f4", order="C")
     vertex = table.view([(name, "<f4") for name in names])[:, 0]
-    try:
-        with written_atomically(path) as partial:
-            PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(partial))
-    except OSError as error:
-        reason = error.strerror or error
-        raise OSError(f"{path}: cannot be written ({reason}); choose a writable folder") from error
+    with written_atomically(path) as partial:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(partial))

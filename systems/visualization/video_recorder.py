@@ -104,14 +104,17 @@ class VideoRecorder(LeafSystem):
         Raises:
             OSError: if the file cannot be written.
         """
-        try:
-            with written_atomically(path) as partial:
-                self._encode(partial, max_depth)
-        except OSError as error:
-            raise OSError(
-                f"{path}: cannot be written ({error.strerror}); is there room, and is the folder "
-                "writable?"
-            ) from None
+        with written_atomically(path, self._check) as partial:
+            self._encode(partial, max_depth)
+
+    def _check(self, path: Path) -> None:
+        """Raises OSError unless all pictures can be found in a video: its writer does not say when
+        the disk is full."""
+        recorded = self._file.tell() // self._frame.itemsize
+        with av.open(str(path)) as container:
+            found = sum(packet.size > 0 for packet in container.demux(video=0))
+        if found != recorded:
+            raise OSError(f"{found} of {recorded} pictures are there")
 
     def _encode(self, path: Path, max_depth: float) -> None:
         height, width = self._frame["depth"].shape

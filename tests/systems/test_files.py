@@ -1,9 +1,18 @@
 """Atomic files."""
 
+import errno
+import os
+import subprocess
+import sys
+import threading
+
 import pytest
 
 from splatpilot.systems.files import (
     folder_written_atomically,
+    held_folder,
+    holds_folder,
+    remove_leftovers,
     require_existing,
     require_unused,
     require_writable_folder,
@@ -90,3 +99,130 @@ def test_what_must_be_there_is_named(tmp_path):
     require_existing(tmp_path, "a folder")
     with pytest.raises(FileNotFoundError, match=r"nowhere: there is no .*; a scene is needed"):
         require_existing(tmp_path / "nowhere", "a scene")
+
+
+def test_full_disk_names_the_file_and_keeps_the_old(tmp_path):
+    """What libraries say of a full disk, with an error number or without, becomes a sentence with
+    the file and the remedy; an error about another file stays what it is."""
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    for error in (OSError(errno.ENOSPC, "No space left on device"), OSError("8 requested, 0 done")):
+        with (
+            pytest.raises(OSError, match=r"a\.txt: cannot be written \(.*\); make room"),
+            written_atomically(path),
+        ):
+            raise error
+    with pytest.raises(FileNotFoundError, match="nowhere"), written_atomically(path):
+        (tmp_path / "nowhere").read_text()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_found_broken_is_not_renamed(tmp_path):
+    """A file that its check refuses does not take the place of the old one."""
+    path = tmp_path / "a.txt"
+
+    def check(written):
+        if written.read_text() != "good":
+            raise OSError("it is not good")
+
+    with written_atomically(path, check) as partial:
+        partial.write_text("good")
+    with (
+        pytest.raises(OSError, match=r"a\.txt: cannot be written \(it is not good\)"),
+        written_atomically(path, check) as partial,
+    ):
+        partial.write_text("bad")
+    assert path.read_text() == "good"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_replaced_folder_is_there_at_every_instant(tmp_path):
+    """While a folder is replaced again and again, whoever looks finds it, and all of it."""
+    path = tmp_path / "a"
+    path.mkdir()
+    (path / "file").write_text("0")
+    over, found = threading.Event(), set()
+
+    def look():
+        while not over.is_set():
+            found.add((path / "file").read_text())
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        for number in range(1, 30):
+            with folder_written_atomically(path, replace=True) as partial:
+                (partial / "file").write_text(str(number))
+    finally:
+        over.set()
+        looking.join()
+    assert found <= {str(number) for number in range(30)} and len(found) > 1
+    assert (path / "file").read_text() == "29"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from splatpilot.systems.files import folder_written_atomically, written_atomically
+folder = Path(sys.argv[1])
+with written_atomically(folder / "a.txt") as file, folder_written_atomically(folder / "b") as inner:
+    file.write_text("half")
+    (inner / "c").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_kill_has_left_goes_with_the_next_run(tmp_path):
+    """Temporary files and folders of processes that have ended are removed, and count as nothing;
+    those of this process, which is at work, and all else stay."""
+    subprocess.run([sys.executable, "-c", _KILLED, str(tmp_path)], check=False)
+    assert len(list(tmp_path.iterdir())) == 2
+    require_unused(tmp_path, overwrite=False)
+    (tmp_path / ".mine.partial").write_text("")
+    with written_atomically(tmp_path / "mine.txt") as partial:
+        partial.write_text("")
+        require_writable_folder(tmp_path)
+        assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".mine.partial", partial])
+    remove_leftovers(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".mine.partial", "mine.txt"]
+
+
+def test_second_process_learns_who_holds_a_folder(tmp_path):
+    """A folder is one process's at a time; another is told which, and a kill sets it free."""
+    holding = (
+        "import sys, time; from pathlib import Path\n"
+        "from splatpilot.systems.files import held_folder\n"
+        "with held_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
+    )
+    folder = tmp_path / "out" / "folder"
+    words = [sys.executable, "-c", holding, str(folder)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"held\n"
+        told = rf"folder is in use by (process {other.pid} \(.*python|another process)"
+        with pytest.raises(OSError, match=told), held_folder(folder):
+            pass
+        other.kill()
+        other.wait()
+    with held_folder(folder):
+        (folder / "file").touch()
+    assert folder.is_dir()
+
+
+def test_folder_that_stays_empty_goes_again(tmp_path):
+    """A run that fails before it has written anything leaves no folder, and none above it."""
+
+    @holds_folder("out")
+    def run(*, out, text):
+        assert out.is_dir()
+        if not text:
+            raise ValueError("nothing to write")
+        (out / "file").write_text(text)
+
+    with pytest.raises(ValueError, match="nothing to write"):
+        run(out=tmp_path / "a" / "b", text="")
+    assert list(tmp_path.iterdir()) == []
+    run(out=tmp_path / "a" / "b", text="something")
+    assert (tmp_path / "a" / "b" / "file").read_text() == "something"
+    assert os.access(tmp_path / "a", os.W_OK)

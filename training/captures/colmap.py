@@ -5,6 +5,9 @@ configuration. COLMAP's image coordinates count as ours, from the corner of the 
 """
 
 import dataclasses
+import signal
+import sys
+import threading
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -14,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.extras import import_extra
 from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.colmap_records import check_records
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import read_depth
 from splatpilot.training.captures.lens import Lens, pinhole
@@ -48,7 +53,13 @@ def import_pycolmap() -> ModuleType:
     Raises:
         ModuleNotFoundError: if it is not installed; the message says what to install.
     """
-    return import_extra("pycolmap", "photos")
+    known = "pycolmap" in sys.modules
+    pycolmap = import_extra("pycolmap", "photos")
+    if not known and threading.current_thread() is threading.main_thread():
+        # It has SIGTERM print a stack, which can wait for ever for what it interrupted.
+        if (handler := signal.getsignal(signal.SIGTERM)) is not None:
+            signal.signal(signal.SIGTERM, handler)
+    return pycolmap
 
 
 def read_colmap(path: Path, config: CaptureConfig) -> Capture:
@@ -62,12 +73,7 @@ def read_colmap(path: Path, config: CaptureConfig) -> Capture:
     model = model_folder(path)
     if model is None:
         raise FileNotFoundError(f"{path}: no COLMAP model (cameras, images, points3D) in it")
-    pycolmap = import_pycolmap()
-    try:
-        reconstruction = pycolmap.Reconstruction(model)
-    except Exception as error:  # pycolmap raises what its C++ raises
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"{model}: not a readable COLMAP model ({reason})") from None
+    reconstruction = read_model(model)
     names = [image.name for image in reconstruction.images.values()]
     if not names:
         raise ValueError(f"{model}: the COLMAP model has no images")
@@ -79,6 +85,25 @@ def read_colmap(path: Path, config: CaptureConfig) -> Capture:
     )
 
 
+def read_model(model: Path) -> "pycolmap.Reconstruction":
+    """Reads the files of a model.
+
+    Raises:
+        ValueError: if they are damaged or do not belong together; the message names the folder.
+    """
+    pycolmap = import_pycolmap()
+
+    def num_params(number: int) -> int:
+        kind = pycolmap.CameraModelId(number)
+        return len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
+
+    check_records(model, num_params)
+    try:
+        return pycolmap.Reconstruction(model)
+    except Exception as error:  # pycolmap raises what its C++ raises
+        raise ValueError(f"{model}: not a readable COLMAP model ({reason_of(error)})") from None
+
+
 def capture_of_model(
     path: Path,
     kind: str,
@@ -88,7 +113,12 @@ def capture_of_model(
     dropped: tuple[str, ...] = (),
 ) -> Capture:
     """Returns the capture of a registered model, upright and, if `config` says how, metric."""
-    lenses = {number: _lens(camera, config) for number, camera in reconstruction.cameras.items()}
+    lenses = {}
+    for number, camera in reconstruction.cameras.items():
+        try:
+            lenses[number] = _lens(camera, config)
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{path}, camera {number}: {reason_of(error)}") from None
     depths = path / config.scale.depth_folder if config.scale.depth_folder else None
 
     def frame(image: "pycolmap.Image") -> FrameFiles:

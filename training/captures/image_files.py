@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from splatpilot.systems.array_files import array_layout, read_array, reason_of
+from splatpilot.systems.read_limit import require_readable_size
+
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
@@ -24,10 +27,11 @@ def image_size(file: Path) -> tuple[int, int]:
     try:
         with Image.open(file) as image:
             size, kind = image.size, image.format
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+    except Exception as error:  # Pillow raises anything of damaged files
         raise ValueError(
             f"{file}: not a readable image ({_reason(error)}); copy it again"
         ) from None
+    require_readable_size(file, 4 * size[0] * size[1])
     with file.open("rb") as stream:
         # Cameras append previews and padding to JPEGs, so the end is looked for, not asked for.
         stream.seek(max(0, file.stat().st_size - 65536))
@@ -43,13 +47,15 @@ def array_shape(file: Path) -> tuple[int, ...]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is empty, no array or cut short.
     """
+    return _depth_layout(file)[0]
+
+
+def _depth_layout(file: Path) -> tuple[tuple[int, ...], np.dtype]:
     _require_content(file)
-    try:
-        return np.load(file, mmap_mode="r", allow_pickle=False).shape
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(
-            f"{file}: not a readable array ({_reason(error)}); copy it again"
-        ) from None
+    shape, dtype = array_layout(file)
+    if dtype.kind not in "iuf":
+        raise ValueError(f"{file}: an array of {dtype}; depth is integers or floats")
+    return shape, dtype
 
 
 def depth_size(file: Path) -> tuple[int, int]:
@@ -79,11 +85,8 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     write where they see nothing, become 0, unknown.
     """
     if file.suffix == ".npy":
-        try:
-            raw = np.load(file, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            reason = _reason(error)
-            raise ValueError(f"{file}: not a readable array ({reason}); copy it again") from None
+        _depth_layout(file)
+        raw = read_array(file)
     else:
         raw = _decode(file, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype == np.uint8:
@@ -133,7 +136,10 @@ def _clean(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _decode(file: Path, flags: int) -> NDArray:
     raw = np.fromfile(file, dtype=np.uint8)
-    image = cv2.imdecode(raw, flags) if len(raw) else None
+    try:
+        image = cv2.imdecode(raw, flags) if len(raw) else None
+    except cv2.error:  # more pixels than OpenCV decodes
+        image = None
     if image is None:
         raise ValueError(f"{file}: not a readable image; copy it again")
     return image
@@ -147,4 +153,4 @@ def _require_content(file: Path) -> None:
 
 
 def _reason(error: Exception) -> str:
-    return str(error).partition("\n")[0].partition(" '")[0]
+    return reason_of(error).partition(" '")[0]

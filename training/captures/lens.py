@@ -7,6 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_LARGEST = 1 << 16  # [px]
+_LONGEST = 1e6  # [px]
+
 
 @dataclass(frozen=True, eq=False)
 class Lens:
@@ -20,6 +23,25 @@ class Lens:
     height: int  # [px]
     project: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px]; None for a pinhole."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for what is no camera."""
+        focal, center = np.diag(self.K)[:2], self.K[:2, 2]
+        size = np.array([self.width, self.height])
+        if not (size >= 1).all() or not (size <= _LARGEST).all():
+            raise ValueError(
+                f"images of {self.width}x{self.height} pixels; 1 to {_LARGEST} are needed"
+            )
+        if not ((focal > 0) & (focal <= _LONGEST)).all():
+            raise ValueError(
+                f"focal lengths of {focal.tolist()} px; more than 0 and at most {_LONGEST:g} px "
+                "are needed"
+            )
+        if not (np.abs(center - size / 2) <= 10 * size).all():
+            raise ValueError(
+                f"a principal point of {center.tolist()} px in {self.width}x{self.height} pixels; "
+                "it must be in the image or near it"
+            )
 
     def pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the image coordinates (N, 2) [px] of rays (N, 2), x/z and y/z."""

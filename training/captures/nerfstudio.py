@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.systems.array_files import reason_of
+from splatpilot.systems.ply_files import read_ply_file
+from splatpilot.systems.read_limit import read_text
 from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
@@ -53,12 +55,16 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
     """
     file = path / TRANSFORMS
     try:
-        content = json.loads(file.read_text())
-        entries = list(content["frames"])
+        content = json.loads(read_text(file))
+        entries = [dict(entry) for entry in content["frames"]]
         named = [(entry["file_path"], entry["transform_matrix"], entry) for entry in entries]
-    except (ValueError, KeyError, TypeError) as error:
+        points, unit = content.get("ply_file_path") or "", _depth_unit(content, config)
+        for path_like in (points, *(entry.get("depth_file_path") or "" for entry in entries)):
+            if not isinstance(path_like, str):
+                raise TypeError(f"{path_like!r:.40} stands where a path belongs")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
-            f"{file}: not nerfstudio's format ({error}); `frames` with `file_path` and "
+            f"{file}: not nerfstudio's format ({reason_of(error)}); `frames` with `file_path` and "
             "`transform_matrix` is needed"
         ) from None
     lenses: dict[tuple, Lens] = {}  # Equal cameras share one, and one resampling.
@@ -74,7 +80,6 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
                 _lens(file, {**content, **entry}, image, config, lenses),
             )
         )
-    unit = config.depth_unit or 1 / float(content.get("depth_unit_scale_factor", 1e-3))
     capture = open_frames(
         path,
         "nerfstudio capture",
@@ -83,18 +88,28 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
         read_depth=lambda file: read_depth(file, unit),
         depth_camera=_smaller_depth_camera(frames),
     )
-    if points := content.get("ply_file_path"):
+    if points:
         capture = dataclasses.replace(capture, points=_read_points(path / points))
     if config.scale.given() or not capture.has_depth:
         capture = make_metric(capture, config.scale)
     return turn_upright(capture, config.up or "z")
 
 
+def _depth_unit(content: dict[str, Any], config: CaptureConfig) -> float:
+    """How many units of the stored depth make a metre."""
+    if config.depth_unit:
+        return config.depth_unit
+    metres = float(content.get("depth_unit_scale_factor", 1e-3))
+    if not 1e-9 < metres < 1e9:
+        raise ValueError(f"depth_unit_scale_factor is {metres}; it must be the metres of a unit")
+    return 1 / metres
+
+
 def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:
     def X_FB() -> RigidTransform:
         try:
             array = np.array(matrix, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             array = np.zeros(0)
         if array.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"{source}: transform_matrix is no 4x4 matrix of numbers")
@@ -139,18 +154,18 @@ def _lens(
             fy = float(values.get("fl_y", fx))
             cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
         distortion = tuple(float(values.get(name, 0.0)) for name in _DISTORTION[model])
+        key = (model, width, height, fx, fy, cx, cy, distortion)
+        if key not in lenses:
+            make = fisheye_lens if model == "OPENCV_FISHEYE" else opencv_lens
+            lenses[key] = make(pinhole(fx, fy, cx, cy), width, height, distortion)
+        return lenses[key]
     except OSError:
         return None
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
-            f"{file}: the camera of {image.name} is not described ({error}); w, h, fl_x, fl_y, cx "
-            "and cy, or camera_angle_x, are needed"
+            f"{file}: the camera of {image.name} is not described ({reason_of(error)}); w, h, "
+            "fl_x, fl_y, cx and cy, or camera_angle_x, are needed"
         ) from None
-    key = (model, width, height, fx, fy, cx, cy, distortion)
-    if key not in lenses:
-        make = fisheye_lens if model == "OPENCV_FISHEYE" else opencv_lens
-        lenses[key] = make(pinhole(fx, fy, cx, cy), width, height, distortion)
-    return lenses[key]
 
 
 def _smaller_depth_camera(
@@ -176,9 +191,11 @@ def _smaller_depth_camera(
 
 def _read_points(file: Path) -> SfmPoints:
     try:
-        vertices = PlyData.read(str(file))["vertex"]
+        vertices = read_ply_file(file)["vertex"]
         p_WQ = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
         colors = np.column_stack([vertices[name] for name in ("red", "green", "blue")])
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(f"{file}: not a PLY of coloured points ({error})") from None
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: not a PLY of coloured points ({reason_of(error)})") from None
+    if not (np.isfinite(p_WQ).all() and np.isfinite(colors).all()):
+        raise ValueError(f"{file}: points or colours are not finite; export it again")
     return SfmPoints(p_WQ, colors.astype(np.float64) / 255)

@@ -12,9 +12,10 @@ from PIL import Image
 from tqdm import tqdm
 
 from splatpilot.systems.cores import available_cores
+from splatpilot.systems.files import folder_written_atomically, remove_leftovers
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap
+from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap, read_model
 from splatpilot.training.captures.image_files import IMAGE_SUFFIXES, image_size
 
 _MAX_SIZE = 1600
@@ -60,7 +61,7 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     model = _cache(files, config) / "model"
     if not model.is_dir():
         _register(folder, names, _one_camera(files), model)
-    reconstruction = import_pycolmap().Reconstruction(model)
+    reconstruction = read_model(model)
     registered = {image.name for image in reconstruction.images.values() if image.has_pose}
     dropped += [
         f"{folder / name}: not registered, it shares too little with the other photographs"
@@ -100,11 +101,7 @@ def _one_camera(files: list[Path]) -> bool:
 
 
 def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> None:
-    """Registers photographs and writes the largest model that results, whole or not at all.
-
-    Seeds are fixed and images get their numbers in order, so that the result does not depend on
-    which thread is first.
-    """
+    """Registers photographs and writes the largest model that results, whole or not at all."""
     try:
         model.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -112,8 +109,15 @@ def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> 
             f"{model.parent}: cannot be written ({error.strerror}); set capture.cache to a folder "
             "that can"
         ) from None
-    work = model.with_name(f".{os.getpid()}.partial")
-    shutil.rmtree(work, ignore_errors=True)
+    remove_leftovers(model.parent)
+    with folder_written_atomically(model) as written:
+        _write_model(folder, names, one_camera, written)
+
+
+def _write_model(folder: Path, names: list[str], one_camera: bool, written: Path) -> None:
+    """Seeds are fixed and images get their numbers in order, so that the result does not depend on
+    which thread is first."""
+    work = written / "work"
     work.mkdir()
     pycolmap = import_pycolmap()
     pycolmap.set_random_seed(_SEED)
@@ -168,13 +172,10 @@ def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> 
                 "together, of a place with texture, moving between them"
             )
         largest = max(models.values(), key=lambda each: each.num_reg_images())
-        written = work / "written"
-        written.mkdir()
         largest.write(written)
-        os.replace(written, model)
+        shutil.rmtree(work)
     finally:
         pycolmap.logging.minloglevel = level
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _advance(progress: tqdm, count: int) -> None:

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.systems.read_limit import read_text
+
 _LARGEST = 1e6
 """[m], beyond which a position is no place of any capture."""
 
@@ -23,7 +25,7 @@ def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
     if not file.is_file():
         raise FileNotFoundError(f"{file}: the file is missing")
     rows = []
-    for number, line in enumerate(file.read_text(errors="replace").rstrip().splitlines(), start=1):
+    for number, line in enumerate(read_text(file, "replace").rstrip().splitlines(), start=1):
         if line.startswith("#"):
             continue
         try:

@@ -18,7 +18,7 @@ from splatpilot.diagrams.worlds.make_world import is_procedural, make_blueprint
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.configuration import dump_config, load_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import held_folder, require_writable_folder, written_atomically
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
@@ -60,6 +60,11 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     out = Path(out).absolute()
     world = benchmark_scenarios().get(str(world)) or Path(world).absolute()
     partial = out.with_name(f".{out.name}.partial")
+    with held_folder(partial):
+        _render(world, out, partial, config, seed)
+
+
+def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: int) -> None:
     blueprint = None
     if world.suffix in (".yaml", ".yml"):
         scenario = load_config(Scenario(), world)
@@ -90,7 +95,6 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     else:
         esdf = esdf_from_distance_field(blueprint.distance_field, config.voxel_size)
     X_WCs = _poses(esdf, config)
-    require_writable_folder(partial)
     with written_atomically(partial / RECIPE) as file:
         file.write_text(text)
     mesh = partial / recipe.mesh
@@ -209,7 +213,7 @@ def _write_frames(
     """Writes the frames that are not there yet, as a TartanAir V1 sequence."""
     images, depths = folder / "image_left", folder / "depth_left"
     for part in (images, depths):
-        part.mkdir(parents=True, exist_ok=True)
+        require_writable_folder(part)
     rows = []
     for i, X_WC in enumerate(tqdm(X_WCs, what, unit="frame")):
         rows.append(_row(X_WC))

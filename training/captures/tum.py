@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.systems.read_limit import read_text
 from splatpilot.training.captures.capture import Capture, FileAxes
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
@@ -110,7 +111,7 @@ def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
     if not file.is_file():
         raise FileNotFoundError(f"{file}: the file is missing; a TUM sequence needs it")
     times, names = [], []
-    for number, line in enumerate(file.read_text(errors="replace").splitlines(), start=1):
+    for number, line in enumerate(read_text(file, "replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
             continue
         try:

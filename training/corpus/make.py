@@ -8,6 +8,7 @@ from tqdm import tqdm
 
 from splatpilot.systems.configuration import claim_folder
 from splatpilot.systems.cores import available_cores
+from splatpilot.systems.files import holds_folder, require_writable_folder
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.provenance import revision
@@ -20,6 +21,7 @@ from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.corpus.world_record import WorldRecord
 
 
+@holds_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
     """
     Gathers what a corpus in `out` lacks of its first `worlds` worlds.
@@ -50,9 +52,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     names = [world_source(config.worlds, config.seed, k).name for k in range(worlds)]
     claim_folder(out / CONFIG, config)
     for part in ("worlds", "shards"):
-        (out / part).mkdir(exist_ok=True)
-        for left in (out / part).glob(".*.partial"):  # by a kill
-            shutil.rmtree(left)
+        require_writable_folder(out / part)
     missing = [k for k in range(worlds) if not _is_there(out, names[k])]
     gather = partial(_gather, out, config, revision())
     with tqdm(total=worlds, initial=worlds - len(missing), desc="worlds", unit="world") as bar:

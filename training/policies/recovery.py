@@ -22,7 +22,7 @@ from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.files import folder_written_atomically, written_atomically
+from splatpilot.systems.files import folder_written_atomically, holds_folder, written_atomically
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -52,6 +52,7 @@ class Task:
     timeout: float  # [s]
 
 
+@holds_folder("out")
 def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[str, Any]:
     """
     Trains a student, has it fly, gathers what it was to have done, and trains another on all.

@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from splatpilot.systems.files import written_atomically
+from splatpilot.systems.files import holds_folder
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.device import require_device
 from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
 from splatpilot.training.policies.trainer import FLIGHTS, Trainer, TrainingConfig
+from splatpilot.training.tensor_files import save_tensors
 
 
 @dataclass
@@ -32,6 +33,7 @@ class NotFiniteError(ValueError):
     """A term of the loss, or the gradient, became infinite or not a number."""
 
 
+@holds_folder("out")
 @one_torch_thread()
 def run[Config: TrainingConfig](
     *, config: Config, out: Path, make: Callable[[Config], Trainer], bar_line: int = 0
@@ -79,16 +81,15 @@ def run[Config: TrainingConfig](
 
     def save() -> None:
         progress.cpu_seconds = spent_before + time.process_time() - started
-        with written_atomically(checkpoint) as path:
-            torch.save(
-                {
-                    "progress": vars(progress),
-                    "network": network.state_dict(),
-                    "optimizer": optimizer.state_dict(),
-                    "trainer": trainer.state_dict(),
-                },
-                path,
-            )
+        save_tensors(
+            {
+                "progress": vars(progress),
+                "network": network.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "trainer": trainer.state_dict(),
+            },
+            checkpoint,
+        )
         folder.write_curves(progress.curves)
 
     bar = tqdm(

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from splatpilot.systems.files import written_atomically
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
+from splatpilot.training.tensor_files import save_tensors
 
 VERSION = 2
 # What may differ when an interrupted run goes on, for it changes nothing that is computed.
@@ -25,6 +25,12 @@ _INDIFFERENT = (
 )
 
 
+def work_folder(out: Path) -> Path:
+    """Where what is not finished of the scene folder `out` is kept, beside it."""
+    out = out.absolute()
+    return out.with_name(f".{out.name}.partial")
+
+
 class Checkpoint:
     """The one file in which an optimisation is kept while it runs, in a work folder beside `out`.
 
@@ -35,8 +41,7 @@ class Checkpoint:
     """
 
     def __init__(self, out: Path, config: ReconstructConfig, views: ReconstructionViews):
-        out = out.absolute()
-        self.folder = out.with_name(f".{out.name}.partial")
+        self.folder = work_folder(out)
         self.file = self.folder / "checkpoint.pt"
         fields = asdict(config)
         self._config = {name: fields[name] for name in fields if name not in _INDIFFERENT}
@@ -53,17 +58,8 @@ class Checkpoint:
                 before is kept.
         """
         own = {"version": VERSION, "config": self._config, "capture": self._capture}
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with written_atomically(self.file) as partial:
-                torch.save({**own, **content}, partial)
-        except (OSError, RuntimeError) as error:
-            # torch's own writer raises RuntimeError when the disk is full.
-            reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-            raise OSError(
-                f"{self.file}: the checkpoint cannot be written ({reason}); make room, or choose "
-                "another folder with --out"
-            ) from error
+        self.folder.mkdir(parents=True, exist_ok=True)
+        save_tensors({**own, **content}, self.file)
 
     def load(self) -> dict[str, Any] | None:
         """Returns what was kept last, or None if nothing was.

@@ -202,5 +202,5 @@ def test_failed_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
 
 def test_unwritable_folder(tmp_path):
     """A folder that is not there is an error that names the file."""
-    with pytest.raises(OSError, match=r"scene\.ply: cannot be written .*writable folder"):
+    with pytest.raises(OSError, match=r"scene\.ply: cannot be written .*the folder writable"):
         write_ply(random_scene(), tmp_path / "nowhere" / "scene.ply")

@@ -168,7 +168,9 @@ def test_missing_parts(model):
     (model / "images").rename(model / "elsewhere")
     with pytest.raises(FileNotFoundError, match="none of the model's images"):
         read_capture(model)
-    (model / "sparse/0/images.bin").write_bytes(b"1234")
+    (model / "sparse/0/images.bin").unlink()
+    (model / "sparse/0/images.txt").write_text("1234")
+    (model / "sparse/0/cameras.txt").write_text("1 PINHOLE 64")
     with pytest.raises(ValueError, match="not a readable COLMAP model"):
         read_capture(model)
 

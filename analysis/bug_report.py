@@ -1,0 +1,39 @@
+"""Reports of exceptions that are nobody's fault but this program's."""
+
+import platform
+import shlex
+import tempfile
+import traceback
+from collections.abc import Sequence
+
+
+def write_report(error: BaseException, arguments: Sequence[str]) -> str:
+    """
+    Writes what is needed to find a mistake of this program to a file in the folder for temporary
+    files.
+
+    Args:
+        error: what ended the program.
+        arguments: the words after `splatpilot`.
+
+    Returns:
+        The file; or, where none can be written, the report.
+    """
+    from splatpilot.systems.provenance import program
+
+    told = [
+        f"splatpilot {shlex.join(arguments)}",
+        *(f"{name} {version}" for name, version in program().items()),
+        f"Python {platform.python_version()} on {platform.platform()}",
+        "",
+        *traceback.format_exception(error),
+    ]
+    text = "\n".join(told)
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="splatpilot-", suffix=".txt", delete=False
+        ) as file:
+            file.write(text)
+    except OSError:
+        return text
+    return file.name
