@@ -70,12 +70,11 @@ def run(
         if path is not None:
             require_unused(path, overwrite)
     scenario.validate()
+    if graphviz is not None:
+        require_writable_folder(graphviz.parent)
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
     sample_initial_state(scenario, world)  # Refuses a start or goal without room before the rest.
-    require_writable_folder(out)
-    if graphviz is not None:
-        require_writable_folder(graphviz.parent)
 
     meshcat = open_meshcat(scenario, world) if live else None
     if meshcat is not None:

@@ -18,7 +18,7 @@ from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
-_MAX_PIXELS = 4096 * 4096
+_MAX_PIXELS = 4096 * 2304
 
 # Fields of Drake's CameraConfig about render engines and LCM, which a splat camera has no use for.
 # Its background is the world's, and its depth image is registered with its colour image.
@@ -117,15 +117,15 @@ def _check(name: str, value: object, valid: bool | np.bool_, limit: str) -> None
 
 def _check_camera(camera: CameraConfig) -> None:
     pixels = camera.width * camera.height
-    valid = camera.width > 0 and camera.height > 0 and pixels <= _MAX_PIXELS
+    valid = camera.width > 1 and camera.height > 1 and pixels <= _MAX_PIXELS
     size = f"{camera.width}x{camera.height} pixels"
-    _check("camera", size, valid, f"at least 1x1 and at most {_MAX_PIXELS} pixels")
+    _check("camera", size, valid, f"at least 2x2 and at most {_MAX_PIXELS} pixels")
     focal = (camera.focal_x(), camera.focal_y())
     _check("camera.focal", focal, all(0 < f < inf for f in focal), "positive and finite [pixels]")
     center = camera.principal_point()
     valid = np.all((center > 0) & (center < [camera.width, camera.height]))
     _check("camera's principal point", center.tolist(), valid, "inside the image [pixels]")
-    _check("camera.fps", camera.fps, 0 < camera.fps <= 1000, "more than 0, at most 1000 Hz")
+    _check("camera.fps", camera.fps, 0.01 <= camera.fps <= 1000, "0.01 to 1000 Hz")
     for name in WITHOUT_EFFECT:
         value, default = (repr(getattr(c, name)) for c in (camera, CameraConfig()))
         _check(f"camera.{name}", value, value == default, "left out: a splat camera ignores it")

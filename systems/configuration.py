@@ -8,8 +8,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from textwrap import indent
-from types import UnionType
-from typing import Any, cast
+from types import NoneType, UnionType
+from typing import Any, cast, get_args
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
@@ -194,20 +194,30 @@ def _known_tags(refusal: re.Match[str]) -> str:
     )
 
 
+_TAGGED = object()
+
+
 class _NamesLoader(yaml.SafeLoader):
     """Reads only for the names of fields: what tagged values hold is left to Drake's reader."""
 
 
-_NamesLoader.add_multi_constructor("!", lambda loader, tag, node: None)
+_NamesLoader.add_multi_constructor("!", lambda loader, tag, node: _TAGGED)
 
 
 def _check_names(config: Any, given: Any, prefix: str) -> None:
     """Raises ValueError for a field that `config` does not have, and says which it might be."""
     known = _field_names(config)
-    if not known or given is None:
+    if given is None and prefix and (known or isinstance(config, dict)):
+        raise ValueError(f"{prefix[:-1]} is null where fields belong; leave it out, or give some")
+    if isinstance(config, dict) and isinstance(given, dict):
+        for name, value in given.items():
+            _check_names({}, value, f"{prefix}{name}.")
+    if not known or given is None or given is _TAGGED:
         return
     if not isinstance(given, dict):
-        raise ValueError(f"{prefix.rstrip('.') or 'the file'} is {given}; it must be fields")
+        raise ValueError(
+            f"{prefix[:-1] or 'the file'} is {_shown(given)}; it must be fields, NAME: VALUE each"
+        )
     for name, value in given.items():
         if name not in known:
             close = _nested_fields(config, str(name), prefix) or [
@@ -216,7 +226,21 @@ def _check_names(config: Any, given: Any, prefix: str) -> None:
             hint = f"did you mean {' or '.join(close)}?"
             listed = f"the fields are {', '.join(sorted(prefix + other for other in known))}"
             raise ValueError(f"there is no field {prefix}{name}; {hint if close else listed}")
+        if value is None and _may_be_null(config, name):
+            continue
         _check_names(getattr(config, name), value, f"{prefix}{name}.")
+
+
+def _may_be_null(config: Any, name: str) -> bool:
+    """Whether a field's type says that it may have no value."""
+    fields = dataclasses.fields(config) if dataclasses.is_dataclass(config) else ()
+    return any(field.name == name and NoneType in get_args(field.type) for field in fields)
+
+
+def _shown(value: Any) -> str:
+    """A value that is not what it should be: enough to know it by, for it may be a whole file."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= 40 else f"{text[:40]}..."
 
 
 def _nested_fields(config: Any, name: str, prefix: str) -> list[str]:

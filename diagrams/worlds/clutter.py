@@ -10,6 +10,7 @@ from splatpilot.diagrams.worlds.feasibility import draw_feasible
 from splatpilot.diagrams.worlds.fittings import (
     CLEARING,
     check_count,
+    check_ground,
     check_positive,
     check_range,
     check_size,
@@ -51,6 +52,7 @@ class ClutterConfig:
     def validate(self) -> None:
         """Raises ValueError for the first value with which no field can be made."""
         check_positive(self, "length", "width", "height", "voxel_size")
+        check_ground(self)
         check_range(self, "sphere_min", "sphere_max")
         check_range(self, "half_min", "half_max")
         check_count(self, "spheres", "boxes")

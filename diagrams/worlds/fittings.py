@@ -1,6 +1,7 @@
 """What procedural worlds are put together from: boxes, halls, signs, daylight, lamps."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,7 @@ from splatpilot.diagrams.worlds.solids.light import Daylight
 from splatpilot.diagrams.worlds.solids.patterns import SIGN
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -24,6 +26,9 @@ INSET = 1.5
 CLEARING, TIGHT_CLEARING = 1.0, 0.9
 """[m], radius about start and goal in which no obstacles are put: in the open, and among thin or
 reconstructed things. It is more than the `CLEARANCE` that worlds are checked for."""
+
+MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0
+"""[m²] and [m], of generated worlds: 35 times the default forest, 20 million Gaussians."""
 
 PASSAGE = 2 * VEHICLE_RADIUS + 0.1
 """[m], least width of a gap that is left for the vehicle."""
@@ -146,6 +151,21 @@ def check_positive(config: object, *names: str) -> None:
         value = getattr(config, name)
         if not 0 < value <= 200:
             raise ValueError(f"{name} = {value} must be more than 0, at most 200")
+
+
+def check_ground(config: Any) -> None:
+    """Raises ValueError for a `config` whose world would take more memory and time than anybody has
+    in mind, by its length, width, height and voxel size [m]."""
+    area = config.length * config.width
+    if not area <= MAX_GROUND:
+        raise ValueError(
+            f"length = {config.length:g} m times width = {config.width:g} m is {area:.3g} m² of "
+            f"ground; it must be at most {MAX_GROUND:g} m²"
+        )
+    if not config.height <= MAX_HEIGHT:
+        raise ValueError(f"height = {config.height:g} m must be at most {MAX_HEIGHT:g} m")
+    upper = np.array([config.length, config.width, config.height])
+    grid_shape(np.zeros(3), upper, config.voxel_size)
 
 
 def check_count(config: object, *names: str) -> None:

@@ -10,6 +10,7 @@ from splatpilot.diagrams.worlds.fittings import (
     PASSAGE,
     WALL,
     box,
+    check_ground,
     check_positive,
     ground,
     hall,
@@ -40,6 +41,7 @@ class OverUnderConfig:
     def validate(self) -> None:
         """Raises ValueError for the first value with which no hall can be built."""
         check_positive(self, "length", "width", "height", "over", "under", "voxel_size")
+        check_ground(self)
         if self.over > self.height - PASSAGE:
             raise ValueError(
                 f"over = {self.over} m must be at most height - {PASSAGE:.2f} m = "

@@ -10,6 +10,7 @@ from pydrake.math import RotationMatrix
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, draw_feasible
 from splatpilot.diagrams.worlds.fittings import (
     check_count,
+    check_ground,
     check_positive,
     check_size,
     clear_of,
@@ -40,6 +41,7 @@ class RoomConfig:
     def validate(self) -> None:
         """Raises ValueError for the first value with which no room can be furnished."""
         check_positive(self, "length", "width", "height", "voxel_size")
+        check_ground(self)
         check_count(self, "items")
         check_size(self, "room", 6, 4, 2.4)
 

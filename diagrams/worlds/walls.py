@@ -11,6 +11,7 @@ from splatpilot.diagrams.worlds.fittings import (
     PASSAGE,
     WALL,
     box,
+    check_ground,
     check_positive,
     daylight,
     ground,
@@ -52,6 +53,7 @@ class WallsConfig:
         if self.pattern not in PATTERNS:
             raise ValueError(f"pattern = {self.pattern!r} must be one of {', '.join(PATTERNS)}")
         check_positive(self, "length", "width", "height", "wall", "depth", "voxel_size")
+        check_ground(self)
         if self.pattern == "slits":
             for slit in self.slits:
                 if not PASSAGE <= slit <= self.width / 2:

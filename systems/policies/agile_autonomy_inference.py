@@ -118,8 +118,7 @@ class TrajectoryNetwork:
 
 def load_network(path: str | None) -> TrajectoryNetwork:
     """The network from a file of weights; see `PolicyCheckpoint.load`."""
-    checkpoint = PolicyCheckpoint.load(path, "agile_autonomy", AGILE_NETWORK)
-    return TrajectoryNetwork(AGILE_NETWORK, dict(checkpoint.weights))
+    return PolicyCheckpoint.load(path, "agile_autonomy", AGILE_NETWORK).build(TrajectoryNetwork)
 
 
 def state_observation(

@@ -1,18 +1,20 @@
 """Files of trained policies: weights, architecture and how they were made, in one .npz."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatpilot.systems.array_files import read_archive
+from splatpilot.systems.array_files import read_archive, reason_of
 from splatpilot.systems.files import written_atomically
 
 FORMAT = 1
 """Of the file; observations and commands that mean something else make another number."""
+
+_LARGEST = 1e6  # A sum of products with what is seen does not leave single precision.
 
 _SHIPPED = Path(__file__).parent / "weights"
 
@@ -28,6 +30,21 @@ class PolicyCheckpoint:
     weights: Mapping[str, np.ndarray]
     provenance: dict[str, Any]
     """How it was made: command, config, seed, revision and success, as what JSON can hold."""
+    path: Path | None = None
+    """The file, if it was read from one."""
+
+    def build[Network](self, make: Callable[[Any, dict[str, np.ndarray]], Network]) -> Network:
+        """The network that `make` makes of the architecture and the weights.
+
+        Raises:
+            ValueError: for weights that it refuses; the message names the file.
+        """
+        try:
+            return make(self.spec, dict(self.weights))
+        except ValueError as error:
+            raise ValueError(
+                f"{self.path}: {error}; train them with: splatpilot train {self.policy} --out DIR"
+            ) from None
 
     def save(self, path: Path) -> None:
         """Writes `path`, whole or not at all."""
@@ -64,8 +81,8 @@ class PolicyCheckpoint:
             )
         if isinstance(spec, type):
             try:
-                return cls(policy, spec(**found_spec), weights, provenance)
-            except TypeError as error:
+                return cls(policy, spec(**found_spec), weights, provenance, path)
+            except (TypeError, ValueError) as error:
                 raise ValueError(
                     f"{path} holds weights of another architecture ({error}); {remedy}"
                 ) from None
@@ -79,7 +96,7 @@ class PolicyCheckpoint:
             raise ValueError(
                 f"{path} holds weights of another architecture ({', '.join(differing)}); {remedy}"
             )
-        return cls(policy, spec, weights, provenance)
+        return cls(policy, spec, weights, provenance, path)
 
 
 def policy_of(path: str | Path) -> str:
@@ -99,11 +116,13 @@ def _read(path: Path, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray
     try:
         weights = read_archive(path)
         about = json.loads(str(weights.pop("about")))
-        missing = {"format", "policy", "spec", "provenance"} - about.keys()
-    except Exception as error:
-        raise ValueError(f"{path} holds no weights of a policy ({error}); {remedy}") from None
-    if missing:
-        raise ValueError(f"{path} holds no weights of a policy (no {min(missing)}); {remedy}")
+    except (OSError, ValueError, KeyError, RecursionError) as error:
+        reason = reason_of(error)
+        raise ValueError(f"{path} holds no weights of a policy ({reason}); {remedy}") from None
+    about = about if isinstance(about, dict) else {}
+    for name, kind in (("format", int), ("policy", str), ("spec", dict), ("provenance", dict)):
+        if not isinstance(about.get(name), kind):
+            raise ValueError(f"{path} holds no weights of a policy (no {name}); {remedy}")
     return about, weights
 
 
@@ -119,6 +138,6 @@ def check_weights(
         if name not in weights or weights[name].shape != shape:
             found = weights[name].shape if name in weights else "missing"
             raise ValueError(f"the weights {name} are {found}, but must be of shape {shape}")
-        if not np.isfinite(weights[name]).all():
-            raise ValueError(f"the weights {name} are not all finite")
+        if weights[name].dtype.kind != "f" or not (np.abs(weights[name]) <= _LARGEST).all():
+            raise ValueError(f"the weights {name} are not all finite numbers up to {_LARGEST:g}")
     return {name: np.asarray(weights[name], np.float32) for name in shapes}

@@ -112,7 +112,7 @@ class RecurrentNetwork:
 
 def load_network(path: str | None, policy: str, spec: NetworkSpec) -> RecurrentNetwork:
     """The network of `policy` from a file of weights; see `PolicyCheckpoint.load`."""
-    return RecurrentNetwork(spec, PolicyCheckpoint.load(path, policy, spec).weights)
+    return PolicyCheckpoint.load(path, policy, spec).build(RecurrentNetwork)
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:

@@ -34,6 +34,17 @@ class StudentSpec:
     where something is decides where to fly."""
     state_features: int = 64
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for a field that no network can be made with."""
+        if self.observation not in OBSERVATIONS:
+            raise ValueError(f"observation is {self.observation!r}; it must be of {OBSERVATIONS}")
+        for name in ("width", "height", "cell_features", "state_features"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or not 1 <= value <= 4096:
+                raise ValueError(f"{name} is {value!r}; it must be 1 to 4096")
+        if not isinstance(self.fov_x, int | float) or not 1.0 <= self.fov_x < 180.0:
+            raise ValueError(f"fov_x is {self.fov_x!r}; it must be 1 to 180 deg")
+
     @property
     def pixels(self) -> str:
         """The name of what it sees, of a sample of a corpus: `color` or `depth`."""
@@ -104,7 +115,7 @@ def _rectified(x: np.ndarray) -> np.ndarray:
 def load_network(path: str, observation: str) -> StudentNetwork:
     """The network from a file of weights; see `PolicyCheckpoint.load`."""
     checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
-    return StudentNetwork(checkpoint.spec, dict(checkpoint.weights))
+    return checkpoint.build(StudentNetwork)
 
 
 def encode_color(color: np.ndarray) -> np.ndarray:

@@ -68,15 +68,16 @@ class LatticeConfig:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("num_yaws", "num_pitches", "num_hypotheses"):
             _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
-        for name in ("speed", "horizon"):
-            _check(name, getattr(self, name), 0.0 < getattr(self, name) < math.inf, "positive")
+        for name, most in (("speed", 20.0), ("horizon", 30.0)):
+            value = getattr(self, name)
+            _check(name, value, 0.0 < value <= most, f"positive and at most {most:g}")
         samples = self.horizon / WAYPOINT_PERIOD
         whole = samples > NUM_WAYPOINTS - 0.5 and abs(samples - round(samples)) < 1e-6
         least = NUM_WAYPOINTS * WAYPOINT_PERIOD
         _check("horizon", self.horizon, whole, f"a multiple of 0.1 s and at least {least} s")
         weights = "penetration_weight", "speed_weight", "jerk_weight"
         for name in (*weights, "separation", "margin", "max_yaw", "max_pitch"):
-            _check(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, "at least 0")
+            _check(name, getattr(self, name), 0.0 <= getattr(self, name) <= 1e6, "0 to 1e6")
         _check("max_yaw", self.max_yaw, self.max_yaw <= math.pi, "at most pi")
         _check("max_pitch", self.max_pitch, self.max_pitch < math.pi / 2, "less than pi/2")
         in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)

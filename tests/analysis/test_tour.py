@@ -52,6 +52,13 @@ def test_a_room_is_captured_reconstructed_and_flown_in(opengl, tmp_path, capsys)
     assert "is rendered already" in printed
     assert "is reconstructed already" in printed
 
+    (out / "scene" / "metrics.json").unlink()  # as a kill while it is measured leaves it
+    assert main(command) == 0
+    assert (out / "scene" / "metrics.json").is_file() and (out / "scene" / "views.png").is_file()
+    capsys.readouterr()
+    assert main([*command, "--set", "reconstruct.iterations=25"]) == 1
+    assert "reconstruct.yaml holds another configuration" in capsys.readouterr().err
+
     other = [str(tmp_path / "other") if word == str(out) else word for word in command]
     assert main([*other, "--scene", str(out / "scene")]) == 1
     assert "was made of" in capsys.readouterr().err

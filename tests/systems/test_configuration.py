@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.make_world import SceneConfig, make_world, register_world
@@ -47,7 +48,11 @@ def test_dumped_scenario_loads_as_itself(tmp_path):
         ("qqqqqq=3", r"no field qqqqqq; the fields are .*timeout"),
         ("policy=3", "'policy=3': policy is 3; it must be fields"),
         ("world=foo", "'world=foo': world is foo; it must be fields"),
-        ("camera=null", "'camera=null': null stands where fields belong"),
+        ("camera=null", "'camera=null': camera is null where fields belong"),
+        ("world=null", "'world=null': world is null where fields belong"),
+        ("policy=null", "'policy=null': policy is null where fields belong"),
+        ("sensors=null", "'sensors=null': sensors is null where fields belong"),
+        ("sensors={a: null}", "null}': sensors.a is null where fields belong"),
         ("start=5", "'start=5': "),
         ("camera.X_PB.translation=[1, 2]", "'camera.X_PB.translation=.1, 2.': "),
         ("timeout=soon", "'timeout=soon': .*soon"),
@@ -69,9 +74,37 @@ def test_bad_file_is_named(tmp_path):
     path.write_text("timout: 3\n")
     with pytest.raises(ValueError, match=r"scenario.yaml: there is no field timout; did"):
         load_config(Scenario(), path)
-    path.write_text("timeout: [\n")
-    with pytest.raises(ValueError, match=r"scenario.yaml is not YAML"):
+    path.write_text("seed: 3\ntimeout: [\n")
+    with pytest.raises(ValueError, match=r"scenario.yaml is not YAML: line 3: expected .*") as said:
         load_config(Scenario(), path)
+    assert "\n" not in str(said.value)
+
+
+def test_files_are_not_repeated_in_errors(tmp_path):
+    """Of a file that holds no fields an error shows enough to know it by, not all it holds; one
+    that is too large, no text, or nested without end is not read at all."""
+    path = tmp_path / "secret.yaml"
+    path.write_text("password\n" * 1000)
+    with pytest.raises(ValueError, match=r"secret.yaml: the file is password password") as said:
+        load_config(Scenario(), path)
+    assert len(str(said.value)) < 200 + len(str(path))
+    path.write_bytes(b"seed: \xff")
+    with pytest.raises(ValueError, match=r"secret.yaml is no text: byte 6 is 0xff"):
+        load_config(Scenario(), path)
+    path.write_text("start: " + "[" * 5000 + "]" * 5000)
+    with pytest.raises(ValueError, match=r"secret.yaml: fields are nested too deeply"):
+        load_config(Scenario(), path)
+    with path.open("wb") as file:
+        file.truncate(100_000_000)
+    with pytest.raises(ValueError, match=r"secret.yaml has 100 MB; .* at most 64 MB"):
+        load_config(Scenario(), path)
+
+
+def test_fields_that_may_be_empty_may_be_null(tmp_path):
+    """A field whose type allows for nothing takes null, whatever it holds."""
+    config = load_config(HardwareConfig(), overrides=["time_of_flight={latency: 0.1}"])
+    assert config.time_of_flight is not None and config.time_of_flight.latency == 0.1
+    assert load_config(config, overrides=["time_of_flight=null"]).time_of_flight is None
 
 
 @pytest.mark.parametrize(
@@ -88,7 +121,14 @@ def test_bad_file_is_named(tmp_path):
         ("camera.width=0", "camera is 0x240 pixels"),
         ("camera.width=1000000", "camera is 1000000x240 pixels"),
         ("camera.center_x=-1", "principal point is .*inside the image"),
-        ("camera.fps=.inf", "camera.fps is inf; it must be more than 0"),
+        ("camera.fps=1e-9", "camera.fps is 1e-09; it must be 0.01"),
+        ("camera.width=1", "camera is 1x240 pixels; it must be at least 2x2"),
+        ("camera={width: 4096, height: 4096}", "camera is 4096x4096 pixels; it must be .* at most"),
+        ("policy.lattice.speed=1e300", "speed is 1e[+]300 but must be positive and at most 20"),
+        ("world.length=1000000", "is 1.6e[+]07 m² of ground; it must be at most"),
+        ("world.width=1e9", "m² of ground; it must be at most"),
+        ("world.voxel_size=1e-9", "distance field: a box of .* the limit is"),
+        ("camera.fps=.inf", "camera.fps is inf; it must be 0.01 to 1000 Hz"),
         ("camera.focal=!FocalLength {x: 0}", "camera.focal is .*; it must be positive"),
         ("camera.lcm_bus=other", "camera.lcm_bus is 'other'; it must be left out"),
         ("simulator.integration_scheme=foo", "integration_scheme is foo; .*runge_kutta3"),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.fittings import CLEARING, INSET, PASSAGE, check_count
+from splatpilot.diagrams.worlds.fittings import CLEARING, INSET, PASSAGE, check_count, check_ground
 
 
 @dataclass
@@ -35,6 +35,7 @@ class TrunksConfig:
         for name in positive:
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)} m must be positive and finite")
+        check_ground(self)
         check_count(self, "rocks", "logs")
         if not 0 <= self.lean_max <= 10:
             raise ValueError(f"lean_max = {self.lean_max} deg must be between 0 and 10 deg")

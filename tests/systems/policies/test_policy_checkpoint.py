@@ -1,5 +1,6 @@
 """Files of weights: what is refused, and how it says so."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork, load_network
+from splatpilot.systems.policies.student_inference import load_network as load_student
 
 
 def some_weights(spec=DIFFAERO_NETWORK) -> dict[str, np.ndarray]:
@@ -46,6 +48,42 @@ def test_other_files_are_refused_with_the_remedy(path, tmp_path):
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=r"policy.npz holds no weights of a policy"):
         load_network(str(path), "diffaero", DIFFAERO_NETWORK)
+
+
+def test_weights_of_another_kind_name_the_file(path):
+    """Weights that are missing, of another shape, type or size are refused by file and name."""
+    name, weight = next(iter(some_weights().items()))
+    for other, message in (
+        ({}, "missing, but must be of shape"),
+        ({name: weight[:1]}, "but must be of shape"),
+        ({name: weight * np.nan}, "not all finite numbers"),
+        ({name: weight + np.float32(1e9)}, "not all finite numbers"),
+        ({name: weight.astype(complex)}, "not all finite numbers"),
+    ):
+        weights = {key: value for key, value in some_weights().items() if key != name} | other
+        PolicyCheckpoint("diffaero", DIFFAERO_NETWORK, weights, {}).save(path)
+        with pytest.raises(ValueError, match=rf"policy.npz: the weights {name} are .*{message}"):
+            load_network(str(path), "diffaero", DIFFAERO_NETWORK)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ({"width": -160}, "width is -160"),
+        ({"height": 10**9}, "height is 1000000000"),
+        ({"fov_x": "wide"}, "fov_x is 'wide'"),
+        ({"observation": "smell"}, "observation is 'smell'"),
+        ({"nose": 1}, "nose"),
+        ([], "no spec"),
+    ],
+)
+def test_architectures_that_cannot_be_are_refused(tmp_path, spec, message):
+    """An architecture that a file states is believed only within limits."""
+    path = tmp_path / "student.npz"
+    about = {"format": 1, "policy": "student_depth", "spec": spec, "provenance": {}}
+    np.savez(path, about=json.dumps(about))
+    with pytest.raises(ValueError, match=rf"student.npz holds .*{message}"):
+        load_student(str(path), "depth")
 
 
 def test_weights_that_cannot_fly_are_refused():

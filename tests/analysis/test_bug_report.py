@@ -1,0 +1,63 @@
+"""What the command line says of exceptions that are no user's fault, and of want of memory."""
+
+import argparse
+import tempfile
+
+import pytest
+
+from splatpilot.analysis import cli
+from splatpilot.analysis.cli import main
+
+
+@pytest.fixture
+def failing(monkeypatch, tmp_path):
+    """Makes `splatpilot fly` raise."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def fail(error: BaseException) -> None:
+        class Command:
+            @staticmethod
+            def add_to(verbs: argparse._SubParsersAction) -> None:
+                def run(options: argparse.Namespace) -> None:
+                    raise error
+
+                verbs.add_parser("fly").set_defaults(verb=run)
+
+        monkeypatch.setattr(cli, "COMMANDS", [Command])
+
+    return fail
+
+
+def test_mistakes_of_the_program_leave_a_report(failing, tmp_path, capsys):
+    """What is no user's fault ends with one line and a file that has all that is needed."""
+    failing(KeyError("of our own"))
+    assert main(["fly"]) == 70
+    said = capsys.readouterr().err
+    [report] = tmp_path.iterdir()
+    assert said == (
+        f"splatpilot: fly met a mistake of the program (KeyError); the report is {report}\n"
+    )
+    text = report.read_text()
+    assert "splatpilot fly" in text and "Traceback" in text and "of our own" in text
+    assert "numpy " in text and "Python " in text
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError("Unable to allocate 9 TiB"), r"more memory than there is (Unable to allocate"),
+        (MemoryError(), "needs more memory than there is; make"),
+        (OverflowError("too large for C long"), "a number given to fly is too large (too large"),
+        (ValueError("first\n  second"), "splatpilot: first second"),
+        (BrokenPipeError(), "was not read to its end"),
+        (KeyboardInterrupt(), "splatpilot: interrupted"),
+    ],
+)
+def test_what_users_can_do_is_one_line(failing, error, message, tmp_path, capsys):
+    """Want of memory, numbers too large, and messages of several lines are one line each, and no
+    report."""
+    failing(error)
+    assert main(["fly"]) in (1, 130)
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
