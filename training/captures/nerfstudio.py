@@ -32,6 +32,7 @@ TRANSFORMS = "transforms.json"
 _AXES = FileAxes(
     "OpenGL: x right, y up, z back", RotationMatrix(), RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 )
+_MAX_DISTORTION = 100.0
 _DISTORTION = {
     "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
@@ -154,6 +155,8 @@ def _lens(
             fy = float(values.get("fl_y", fx))
             cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
         distortion = tuple(float(values.get(name, 0.0)) for name in _DISTORTION[model])
+        if not np.abs(distortion).max(initial=0.0) <= _MAX_DISTORTION:
+            raise ValueError(f"a distortion of {distortion} is none of a lens")
         key = (model, width, height, fx, fy, cx, cy, distortion)
         if key not in lenses:
             make = fisheye_lens if model == "OPENCV_FISHEYE" else opencv_lens

@@ -82,7 +82,8 @@ def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys, conte
     out = tmp_path / "damaged"
     shutil.copytree(whole, out)
     files = [out / "rollouts" / f"{spec.id}.npz" for spec in config.rollouts()]
-    files[0].write_bytes(files[0].read_bytes()[:-100])
+    content = files[0].read_bytes()
+    files[0].write_bytes(content[:547] + bytes(24) + content[571:])
     shutil.copyfile(files[4], files[3])
     untouched = files[1].stat().st_mtime_ns
     benchmark.run(config=config, out=out, jobs=1)

@@ -38,6 +38,25 @@ def recorder_after_one_second() -> VideoRecorder:
     return recorder
 
 
+def test_video_that_its_writer_broke_is_not_kept(recorder_after_one_second, tmp_path, monkeypatch):
+    """A video that lacks pictures, of which its writer said nothing, is an error with the file, and
+    does not take the place of the one before."""
+    path = tmp_path / "video.mp4"
+    recorder_after_one_second.save(path, max_depth=20.0)
+    before, frames = path.read_bytes(), recorder_after_one_second.frames
+
+    def seven(max_depth):
+        for number, pictures in enumerate(frames(max_depth)):
+            if number < 7:
+                yield pictures
+
+    monkeypatch.setattr(recorder_after_one_second, "frames", seven)
+    with pytest.raises(OSError, match=r"video\.mp4: cannot be written \(7 of 10 pictures"):
+        recorder_after_one_second.save(path, max_depth=20.0)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_video_holds_every_frame_in_order(recorder_after_one_second, tmp_path):
     """One second at 10 Hz is ten frames: growing red on the left, depth on the right."""
     path = tmp_path / "video.mp4"

@@ -138,6 +138,18 @@ def test_points(write):
         ({"frames": 3}, r"transforms\.json: not nerfstudio's format"),
         ({"frames": [{"file_path": "00.png"}]}, r"transforms\.json: .*transform_matrix"),
         ({"ply_file_path": "00.png"}, r"00\.png: not a PLY of coloured points"),
+        ({"ply_file_path": 3}, r"transforms\.json: .*3 stands where a path belongs"),
+        ({"depth_unit_scale_factor": 0}, r"transforms\.json: .*depth_unit_scale_factor is 0"),
+        ({"depth_unit_scale_factor": None}, r"transforms\.json: not nerfstudio's format"),
+        ({"depth_unit_scale_factor": -1}, r"transforms\.json: .*depth_unit_scale_factor is -1"),
+        ({"depth_unit_scale_factor": np.nan}, r"transforms\.json: .*scale_factor is nan"),
+        ({"w": np.inf}, r"transforms\.json: the camera of 00\.png .*infinity"),
+        ({"w": 10**9}, r"transforms\.json: the camera of .*images of 1000000000x48 pixels"),
+        ({"fl_x": -40}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[-40"),
+        ({"fl_x": 1e300}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[1e\+300"),
+        ({"fl_x": np.nan}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[nan"),
+        ({"cx": np.nan}, r"transforms\.json: the camera of 00\.png .*principal point of \[nan"),
+        ({"k1": np.nan}, r"transforms\.json: the camera of 00\.png .*distortion"),
     ],
 )
 def test_bad_transforms(write, change, message):
@@ -147,6 +159,35 @@ def test_bad_transforms(write, change, message):
     (path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message):
         read_capture(path)
+
+
+def test_nesting_without_end(write):
+    """Brackets in brackets are refused by file, however many."""
+    path = write()
+    (path / "transforms.json").write_text('{"frames": ' + "[" * 10**5 + "]" * 10**5 + "}")
+    with pytest.raises(ValueError, match=r"transforms\.json: not nerfstudio's format"):
+        read_capture(path)
+
+
+@pytest.mark.parametrize(
+    "depth",
+    [
+        np.full((48, 64), 1 + 1j),
+        np.full((48, 64), np.datetime64("2026-01-01")),
+        np.ones((48, 64), bool),
+        b"\x93NUMPY\x01\x00G\x00{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999)}",
+        b"\x93NUMPY\x01\x00\xff\xff nonsense",
+    ],
+)
+def test_bad_depth_drops_its_frame(write, depth):
+    """A depth that is none, or whose header claims what is not there, drops its own frame only."""
+    path = write()
+    if isinstance(depth, bytes):
+        (path / "03.npy").write_bytes(depth)
+    else:
+        np.save(path / "03.npy", depth)
+    capture = read_capture(path)
+    assert len(capture) == 9 and "03.npy" in capture.dropped[0]
 
 
 def test_bad_matrix_is_left_out(write):

@@ -1,0 +1,70 @@
+"""The files of studies: what is damaged, and what a kill leaves."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.systems.provenance import program
+
+
+@pytest.mark.parametrize("row", [[1, 2], 3, {}, {"success": True, "outcome": "goal"}])
+def test_rows_that_are_none_are_damage(study, tmp_path, row):
+    """A flight's file that can be read and says nothing of use counts as damaged."""
+    config, whole = study
+    spec = config.rollouts()[0]
+    folder = StudyFolder(tmp_path)
+    (tmp_path / "rollouts").mkdir()
+    arrays = StudyFolder(whole).read(spec)[1]
+    if isinstance(row, dict):
+        row = spec._asdict() | row
+    np.savez(folder.trajectory(spec.id), row=np.array(json.dumps(row)), **arrays)
+    with pytest.raises(ValueError, match=rf"{spec.id}\.npz is damaged: "):
+        folder.read(spec)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "describes no study"),
+        ("[1", "describes no study"),
+        ("format_version: 1", "describes no study: study is None"),
+        ("format_version: 1\nstudy: {}\nprogram: null", "describes no study: program is None"),
+        ("format_version: 1\nstudy: {}\nprogram: {}\nshard: 3", "no study: shard is 3"),
+        ("format_version: 1\nstudy: {sedes: 3}\nprogram: {}", "there is no field sedes"),
+        ("format_version: 1\nstudy: {seeds: many}\nprogram: {}", ".*many"),
+        ("format_version: 1\nstudy: {seeds: 1000000000}\nprogram: {}", "seeds is 1000000000"),
+        ("format_version: 1\nstudy: {speeds: [.nan]}\nprogram: {}", "speed nan m/s cannot be"),
+        ("format_version: 9\nstudy: {}\nprogram: {}", "format version 9"),
+    ],
+)
+def test_descriptions_that_are_none_name_the_file(tmp_path, text, message):
+    """A `study.yaml` with fields missing, null, unknown or out of range is refused by name."""
+    (tmp_path / "study.yaml").write_text(text)
+    with pytest.raises(ValueError, match=rf"study\.yaml:? .*{message}"):
+        StudyFolder(tmp_path).config()
+
+
+def test_study_that_was_killed_before_it_began_is_begun(study, tmp_path, contents):
+    """What a kill leaves in a folder, at any moment before the first flight, is no other study's:
+    half a `study.yaml`, and half a scenario behind a whole one."""
+    config, whole = study
+    out = tmp_path / "killed"
+    begun = (
+        "import os, signal, sys; from pathlib import Path\n"
+        "from splatpilot.systems.files import written_atomically\n"
+        "with written_atomically(Path(sys.argv[1])) as file:\n"
+        "    file.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    out.mkdir()
+    for file in ("study.yaml", "scenarios/short.yaml"):
+        (out / file).parent.mkdir(exist_ok=True)
+        subprocess.run([sys.executable, "-c", begun, str(out / file)], check=False)
+        StudyFolder(out).claim(config, program())
+    assert not list(out.rglob("*.partial*"))
+    benchmark.run(config=config, out=out, jobs=1)
+    assert contents(out) == contents(whole)
