@@ -7,7 +7,7 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(wildcard native/*.hpp native/*.cpp)
 
-.PHONY: fly test lint docs stub messages sanitize nightly clean
+.PHONY: fly test lint fuzz docs stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
@@ -20,6 +20,11 @@ lint: .venv/installed
 	.venv/bin/ruff format --check .
 	.venv/bin/clang-format --dry-run --Werror $(NATIVE)
 	.venv/bin/pyright
+
+# Every reader on 10,000 damaged files, or as many as CASES says, with limits of memory and time.
+CASES ?= 10000
+fuzz: .venv/installed
+	OMP_NUM_THREADS=1 PYTHONPATH=tests .venv/bin/python -m fuzz --cases $(CASES)
 
 # The documentation, in build/site; needs no network.
 docs: .venv/installed

@@ -16,7 +16,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.files import require_writable_folder, written_atomically
-from splatpilot.systems.read_limit import read_text
+from splatpilot.systems.read_limit import read_text, require_shallow
 from splatpilot.systems.registry import Registry
 
 OPEN_REGISTRY = "registry"
@@ -84,7 +84,7 @@ def yaml_problem(error: yaml.YAMLError) -> str:
     """What is wrong with a text that is not YAML, in one line and without what it holds."""
     if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
         return reason_of(error)
-    return f"line {error.problem_mark.line + 1}: {error.problem}"
+    return f"line {error.problem_mark.line + 1}: {reason_of(error.problem)}"
 
 
 def claim_folder(file: Path, config: Any) -> str:
@@ -165,6 +165,7 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
 
     `tagged` is the same text with the types of fields that may have several.
     """
+    require_shallow(text, source)
     try:
         tokens = [token for token in yaml.scan(text) if isinstance(token, yaml.TagToken)]
         _resolve_open_fields(config, {token.value[1] for token in tokens})
@@ -177,8 +178,9 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
     except AssertionError:  # How Drake's reader refuses a plain value where fields belong.
         raise ValueError(f"{source}: null stands where fields belong") from None
     except Exception as error:  # Drake's reader raises anything of values of other types
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise ValueError(f"{source}: {_UNKNOWN_TAG.sub(_known_tags, reason)}") from None
+        unknown = _UNKNOWN_TAG.fullmatch(str(error).partition("\n")[0])
+        reason = _known_tags(unknown) if unknown else reason_of(error)
+        raise ValueError(f"{source}: {reason}") from None
 
 
 _UNKNOWN_TAG = re.compile(r"The yaml type tag value '(.*)' did not match .* for '(.*)' \((.*)\)$")

@@ -2,6 +2,7 @@
 their own size, before anything is made of them."""
 
 import os
+import re
 from pathlib import Path
 
 LIMIT = "SPLATPILOT_READ_LIMIT"
@@ -9,6 +10,10 @@ LIMIT = "SPLATPILOT_READ_LIMIT"
 
 MAX_TEXT = 64_000_000
 """[bytes], of a text that describes something: a configuration or a list of frames."""
+
+_MAX_DEPTH = 50
+_NESTED = re.compile(r"[][{}]")
+_DASHES = re.compile(r"(?:[-?:]\s+){50}")
 
 _DEFAULT = 8e9  # [bytes]
 
@@ -45,6 +50,20 @@ def require_readable_size(path: Path, size: float) -> None:
             f"{path} would take {size / 1e9:.3g} GB of memory, of which files may take "
             f"{limit / 1e9:.3g} GB; if it is meant, set {LIMIT} to more"
         )
+
+
+def require_shallow(text: str, source: str) -> None:
+    """
+    Raises:
+        ValueError: if brackets of `text`, or dashes of its lists, stand in each other so deep that
+            readers of YAML take for ever; the message begins with `source`.
+    """
+    depth = deepest = 0
+    for bracket in _NESTED.findall(text):
+        depth = depth + 1 if bracket in "[{" else max(depth - 1, 0)
+        deepest = max(deepest, depth)
+    if deepest > _MAX_DEPTH or _DASHES.search(text):
+        raise ValueError(f"{source}: fields are nested too deeply; name another file")
 
 
 def read_text(path: Path, errors: str = "strict") -> str:

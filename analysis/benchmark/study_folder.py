@@ -29,7 +29,7 @@ from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.systems.array_files import read_archive, reason_of
 from splatpilot.systems.configuration import dump_config, parse_config
 from splatpilot.systems.files import require_existing, require_writable_folder, written_atomically
-from splatpilot.systems.read_limit import read_text
+from splatpilot.systems.read_limit import read_text, require_shallow
 
 FORMAT_VERSION = 1
 
@@ -110,8 +110,10 @@ class StudyFolder:
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
         require_existing(file, "a folder that `splatpilot benchmark` has written")
+        text = read_text(file)
+        require_shallow(text, str(file))
         try:
-            described = yaml.safe_load(read_text(file))
+            described = yaml.safe_load(text)
             version = described["format_version"]
         except (yaml.YAMLError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{file} describes no study: {reason_of(error)}") from None
@@ -195,9 +197,10 @@ class StudyFolder:
     def read_timing(self, id: str) -> dict[str, Any]:
         """How long a flight took; empty where that is not known."""
         try:
-            return json.loads((self.path / "timings" / f"{id}.json").read_text())
-        except (OSError, ValueError):
+            timing = json.loads(read_text(self.path / "timings" / f"{id}.json"))
+        except (OSError, ValueError, RecursionError):
             return {}
+        return timing if isinstance(timing, dict) else {}
 
     def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
         """Writes rows as CSV, with the columns of all of them."""
@@ -226,7 +229,8 @@ def _check_flight(file: Path, row: dict[str, Any], flown: dict[str, np.ndarray])
             if name not in flown
             or flown[name].dtype.kind != "f"
             or flown[name].shape != (*count, *shape)
-            or not count
+            or not flown[name].size
+            or not (name == "clearances" or np.isfinite(flown[name]).all())
         ]
     if wrong:
         raise ValueError(f"{file} is damaged: {wrong[0]} is missing or of another kind")

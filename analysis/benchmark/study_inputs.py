@@ -47,7 +47,12 @@ def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
     Raises:
         FileNotFoundError, ValueError: if it is not there or damaged.
     """
-    scenario = load_config(Scenario(), folder.path / "scenarios" / f"{name}.yaml")
+    file = folder.path / "scenarios" / f"{name}.yaml"
+    scenario = load_config(Scenario(), file)
+    try:
+        scenario.validate()
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     if isinstance(scenario.world, SceneSource):
         scenario.world.path = str((folder.path / scenario.world.path).absolute())
     weights = folder.weights(_own(name))

@@ -10,7 +10,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.configuration import yaml_problem
 from splatpilot.systems.files import written_atomically
-from splatpilot.systems.read_limit import read_text
+from splatpilot.systems.read_limit import read_text, require_shallow
 
 FORMAT_VERSION = 2
 ENVIRONMENT = "environment.png"
@@ -78,10 +78,10 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
             three finite components and a format version that is not known.
     """
     file = Path(path) / "scene.yaml"
+    text = read_text(file)
+    require_shallow(text, str(file))
     try:
-        metadata = yaml_load_typed(schema=SceneMetadata, data=read_text(file))
-    except FileNotFoundError:
-        raise
+        metadata = yaml_load_typed(schema=SceneMetadata, data=text)
     except Exception as error:  # Drake's reader raises anything of values of other types
         wrong = yaml_problem(error) if isinstance(error, yaml.YAMLError) else reason_of(error)
         raise ValueError(f"{file}: {wrong}; reconstruct the scene again or repair it") from None

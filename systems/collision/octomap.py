@@ -142,13 +142,16 @@ def esdf_from_octomap(
         FileNotFoundError, ValueError: see `read_octomap` and `Octomap.states`.
     """
     octomap = read_octomap(path)
-    states, lower_W = octomap.states(lower_W, upper_W)
-    return esdf_from_occupancy(
-        states == FieldState.OCCUPIED,
-        states == FieldState.UNKNOWN,
-        lower_W,
-        octomap.resolution,
-    )
+    try:
+        states, lower_W = octomap.states(lower_W, upper_W)
+        return esdf_from_occupancy(
+            states == FieldState.OCCUPIED,
+            states == FieldState.UNKNOWN,
+            lower_W,
+            octomap.resolution,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _links(path: Path, masks: np.ndarray, num_bytes: int) -> np.ndarray:

@@ -32,6 +32,22 @@ class _Received(Received):
     gaps: int = 0
 
 
+def decode_message(codec: Codec, data: bytes) -> Any:
+    """The message in a packet, for `codec.unpack`.
+
+    Raises:
+        ValueError, struct.error: if it is none of the codec's, is longer than its content, or has
+            another frame.
+    """
+    rest = BytesIO(data)
+    message: Any = codec.message.decode(rest)
+    if rest.read(1):
+        raise ValueError(f"the message has {len(data)} bytes; it is longer than its content")
+    if message.header.frame_name != codec.frame:
+        raise ValueError(f"the frame is {message.header.frame_name!r}; it must be {codec.frame!r}")
+    return message
+
+
 class MessageSubscriber(LeafSystem):
     """Gives the signal of the last LCM message, its age, and how many were lost or of no use.
 
@@ -136,15 +152,8 @@ class MessageSubscriber(LeafSystem):
 
     def _after(self, last: _Received, data: bytes, unix_time: float, epoch: float) -> _Received:
         """What there is after another message; raises ValueError or struct.error to refuse it."""
-        rest = BytesIO(data)
-        message: Any = self._codec.message.decode(rest)
-        if rest.read(1):
-            raise ValueError(f"the message has {len(data)} bytes; it is longer than its content")
+        message = decode_message(self._codec, data)
         header = message.header
-        if header.frame_name != self._codec.frame:
-            raise ValueError(
-                f"the frame is {header.frame_name!r}; it must be {self._codec.frame!r}"
-            )
         ahead = header.utime * 1e-6 - unix_time
         if ahead > MAX_AHEAD:
             raise ValueError(

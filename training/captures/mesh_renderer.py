@@ -23,6 +23,7 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.opengl import require_opengl
 from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.gltf_claims import check_gltf_claims
 
 NEAREST, FARTHEST = 0.05, 150.0
 """[m], range of the depth images; nearer is 0, farther is inf."""
@@ -98,7 +99,7 @@ class MeshRenderer:
 
 
 def check_mesh(mesh: Path, up: str) -> None:
-    """Raises what `MeshRenderer` says about its arguments."""
+    """Raises what `MeshRenderer` says about its arguments; and ValueError for a damaged .gltf."""
     if not mesh.is_file():
         raise FileNotFoundError(f"{mesh}: there is no such file; a .gltf or .obj is needed")
     if mesh.suffix not in (".gltf", ".obj"):
@@ -106,5 +107,7 @@ def check_mesh(mesh: Path, up: str) -> None:
             f"{mesh}: Drake renders .gltf and .obj, not {mesh.suffix or 'files without suffix'}; "
             "export it as one .gltf with everything embedded"
         )
+    if mesh.suffix == ".gltf":
+        check_gltf_claims(mesh)
     if up not in ("y", "z"):
         raise ValueError(f"up is {up!r}; 'y' (as glTF says) or 'z' is needed")

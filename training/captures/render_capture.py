@@ -15,10 +15,13 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.gltf import write_gltf
 from splatpilot.diagrams.worlds.make_world import is_procedural, make_blueprint
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
+from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import held_folder, require_writable_folder, written_atomically
+from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
@@ -149,12 +152,22 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     """
     try:
         surface = trimesh.load(mesh, force="mesh")
+        area = surface.area if isinstance(surface, trimesh.Trimesh) else 0.0
     except Exception as error:  # whatever its reader meets in a damaged file
-        raise ValueError(f"{mesh}: not a readable mesh ({error}); export it again") from error
-    if not isinstance(surface, trimesh.Trimesh) or not surface.area > 0:
+        raise ValueError(
+            f"{mesh}: not a readable mesh ({reason_of(error)}); export it again"
+        ) from error
+    if not isinstance(surface, trimesh.Trimesh) or not 0 < area < np.inf:
         raise ValueError(f"{mesh}: holds no surface; export it again")
-    count = int(_SAMPLES_PER_VOXEL_FACE * surface.area / voxel_size**2) + 1
-    p_WQ = np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0], dtype=np.float64)
+    count = int(_SAMPLES_PER_VOXEL_FACE * area / voxel_size**2) + 1
+    require_readable_size(mesh, 64.0 * count)
+    lower, upper = surface.bounds
+    try:
+        grid_shape(lower - voxel_size, upper + voxel_size, voxel_size)
+    except ValueError as error:
+        raise ValueError(f"{mesh}: {error}") from None
+    samples = trimesh.sample.sample_surface(surface, count, seed=0)[0]
+    p_WQ = np.asarray(samples, dtype=np.float64)
     if up == "y":
         p_WQ = p_WQ @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     lower_W = p_WQ.min(axis=0) - voxel_size
