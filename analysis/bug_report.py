@@ -26,7 +26,7 @@ def write_report(error: BaseException, arguments: Sequence[str]) -> str:
         *(f"{name} {version}" for name, version in program().items()),
         f"Python {platform.python_version()} on {platform.platform()}",
         "",
-        *traceback.format_exception(error),
+        "".join(traceback.format_exception(error)),
     ]
     text = "\n".join(told)
     try:

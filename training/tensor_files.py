@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.files import written_atomically
 
 
@@ -18,4 +19,4 @@ def save_tensors(content: dict[str, Any], path: Path) -> None:
         try:
             torch.save(content, partial)
         except RuntimeError as error:  # so torch says that the disk is full
-            raise OSError(str(error).partition("\n")[0]) from error
+            raise OSError(f"perhaps the disk is full: {reason_of(error)}") from error

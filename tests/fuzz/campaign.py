@@ -138,7 +138,8 @@ def _run_from(name: str, start: int, stop: int, seed: int) -> tuple[list[Outcome
         status = process.poll()
         process.kill()
         process.wait()
-        out.seek(0), err.seek(0)
+        out.seek(0)
+        err.seek(0)
         return [Outcome(*json.loads(line)) for line in out], status, err.read()
 
 

@@ -247,7 +247,7 @@ def _read_study(folder: Path) -> Any:
 
     study = StudyFolder(folder / "study")
     specs = study.config().rollouts()
-    study.program(), study.shard()
+    assert study.program() and study.shard() is None
     flights = [study.read(spec) for spec in specs]
     return study, flights, list(kept_flights(study, specs))
 
