@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_occupancy import MAX_VOXELS, esdf_from_occupancy
@@ -106,10 +107,12 @@ def read_octomap(path: str | Path) -> Octomap:
     try:
         kind, count, resolution = entries["id"], int(entries["size"]), float(entries["res"])
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: the header needs id, size and res; {error} is wrong.") from error
+        raise ValueError(
+            f"{path}: the header needs id, size and res; {reason_of(error)} is wrong."
+        ) from None
     if kind.strip() != "OcTree" or not (np.isfinite(resolution) and resolution > 0.0):
         raise ValueError(
-            f"{path}: an octree of kind {kind!r} and resolution {resolution} m; readable are trees "
+            f"{path}: an octree of kind '{reason_of(kind)}' and resolution {resolution} m; readable are trees "
             "of kind 'OcTree' with a positive resolution."
         )
     if not tree:

@@ -50,7 +50,7 @@ class VideoRecorder(LeafSystem):
         self._frame = np.dtype(
             [("rgb", np.uint8, (height, width, 3)), ("depth", np.uint16, (height, width))]
         )
-        self._file = tempfile.TemporaryFile()
+        self._file = tempfile.TemporaryFile(buffering=0)
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
         self.DeclareAbstractInputPort("depth_image_16u", Value(ImageDepth16U(width, height)))
         self.DeclareInitializationPublishEvent(self._clear)
@@ -77,7 +77,14 @@ class VideoRecorder(LeafSystem):
         frame = np.empty((), self._frame)
         frame["rgb"] = np.asarray(color.data)[..., :3]
         frame["depth"] = np.asarray(depth.data)[..., 0]
-        self._file.write(frame.tobytes())
+        try:
+            self._file.write(frame.tobytes())
+        except OSError as error:
+            raise OSError(
+                f"the pictures of the flight cannot wait in {tempfile.gettempdir()} "
+                f"({error.strerror}); make room there, name another folder by TMPDIR, or film "
+                "fewer and smaller ones (camera.fps, camera.width)"
+            ) from None
         return EventStatus.Succeeded()
 
     def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:

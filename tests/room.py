@@ -1,0 +1,81 @@
+"""A small place, ray-traced in TartanAir's north-east-down convention by formulas of its own."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+# The inside of a box [m], in north-east-down: 6 m north, 3 m east, 2.5 m high, floor at z = 0.
+LOWER_N = np.array([0.0, -1.5, -2.5])
+UPPER_N = np.array([6.0, 1.5, 0.0])
+
+
+def room_color(p_N: np.ndarray) -> np.ndarray:
+    """Colour (..., 3), 0 to 1, of the points (..., 3) on the walls: broad coloured waves."""
+    north, east, down = np.moveaxis(p_N, -1, 0)
+    return np.stack(
+        [
+            0.5 + 0.3 * np.sin(1.5 * north) * np.cos(2 * down),
+            0.5 + 0.3 * np.cos(2 * east),
+            0.45 + 0.25 * np.sin(1.2 * down + north),
+        ],
+        axis=-1,
+    )
+
+
+def trace_room(p_N: np.ndarray, R_NB: np.ndarray, width: int, height: int):
+    """Depth (H, W) [m] along the body's x axis and colour (H, W, 3) of the room from inside."""
+    f = width / 2
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    d_B = np.stack([np.ones_like(u), (u - width / 2) / f, (v - height / 2) / f], axis=-1)
+    d_N = d_B @ R_NB.T
+    with np.errstate(divide="ignore"):
+        to_walls = np.where(d_N > 0, (UPPER_N - p_N) / d_N, (LOWER_N - p_N) / d_N)
+    depth = to_walls.min(axis=-1)
+    return depth, room_color(p_N + depth[..., None] * d_N)
+
+
+def rotation_from_yaw_pitch(yaw: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+    """R_NB and the quaternion xyzw of a yaw to the right followed by a pitch up (NED) [rad]."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    R_NB = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array(
+        [[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]
+    )
+    a, b, c, d = np.cos(yaw / 2), np.sin(yaw / 2), np.cos(pitch / 2), np.sin(pitch / 2)
+    return R_NB, np.array([-b * d, a * d, b * c, a * c])
+
+
+# Poses that walk through the room and look around: position in N [m], yaw and pitch [rad].
+ROOM_POSES = [
+    ((0.8 + 0.4 * i, 0.6 * np.sin(i), -1.2 + 0.1 * np.cos(i)), yaw, pitch)
+    for i, (yaw, pitch) in enumerate(
+        [(0, 0), (0.5, -0.5), (-0.9, -0.3), (1.5, 0.3), (3.0, -0.2), (-2.2, -0.4)] * 2
+    )
+]
+
+
+def write_room_capture(
+    path: Path,
+    *,
+    width: int = 64,
+    height: int = 48,
+    poses: list = ROOM_POSES,
+    brightness: Callable[[int, np.ndarray], np.ndarray] = lambda i, rho_squared: np.ones(1),
+) -> Path:
+    """Writes the room as a TartanAir V1 sequence, image i times brightness(i, (H, W) rho^2)."""
+    (path / "image_left").mkdir(parents=True)
+    (path / "depth_left").mkdir()
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    rho_squared = ((u - width / 2) ** 2 + (v - height / 2) ** 2) / ((width**2 + height**2) / 4)
+    lines = []
+    for i, (p_N, yaw, pitch) in enumerate(poses):
+        R_NB, xyzw = rotation_from_yaw_pitch(yaw, pitch)
+        depth, color = trace_room(np.array(p_N), R_NB, width, height)
+        color = np.clip(color * brightness(i, rho_squared)[..., None], 0, 1)
+        bgr = np.round(color[..., ::-1] * 255).astype(np.uint8)
+        cv2.imwrite(str(path / "image_left" / f"{i:06d}_left.png"), bgr)
+        np.save(path / "depth_left" / f"{i:06d}_left_depth.npy", depth.astype(np.float32))
+        lines.append(" ".join(f"{x:.9f}" for x in (*p_N, *xyzw)))
+    (path / "pose_left.txt").write_text("\n".join(lines) + "\n")
+    return path
