@@ -112,8 +112,8 @@ def read_octomap(path: str | Path) -> Octomap:
         ) from None
     if kind.strip() != "OcTree" or not (np.isfinite(resolution) and resolution > 0.0):
         raise ValueError(
-            f"{path}: an octree of kind '{reason_of(kind)}' and resolution {resolution} m; readable are trees "
-            "of kind 'OcTree' with a positive resolution."
+            f"{path}: an octree of kind '{reason_of(kind)}' and resolution {resolution} m; "
+            "readable are trees of kind 'OcTree' with a positive resolution."
         )
     if not tree:
         raise ValueError(f"{path}: the octree is empty.")

@@ -44,26 +44,25 @@ class Campaign:
         self.whole = root / "whole"
         self.whole.mkdir()
         prepare(self.whole)
-        made = _run(
-            f"reconstruct {self.whole}/room --out {self.whole}/scene --iterations 0".split(),
-            self.whole,
-        )
-        assert made.returncode == 0, made.stderr
         self._expected: dict[str, tuple[dict[str, str], float, int]] = {}
 
-    def _folder(self) -> Path:
-        """A folder at one and the same path, because scenes say which capture they are of."""
+    def _folder(self, name: str) -> Path:
+        """A folder for a command, always at the same path: scenes say which capture they are of."""
         folder = self.root / "round"
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(self.whole, folder)
-        metadata = folder / "scene" / "scene.yaml"
-        metadata.write_text(metadata.read_text().replace(str(self.whole), str(folder)))
+        if VERBS[name].reads_scene:
+            if not (self.root / "scene").is_dir():
+                words = f"reconstruct {folder}/room --out {self.root}/scene --iterations 0".split()
+                made = _run(words, folder)
+                assert made.returncode == 0, made.stderr
+            shutil.copytree(self.root / "scene", folder / "scene")
         return folder
 
     def expected(self, name: str) -> tuple[dict[str, str], float, int]:
         """The digests of what a command leaves, its time [s] and its largest file [bytes]."""
         if name not in self._expected:
-            folder, started = self._folder(), time.monotonic()
+            folder, started = self._folder(name), time.monotonic()
             ended = _run(VERBS[name].words(folder), folder)
             assert ended.returncode == 0, f"{name}: {ended.stderr}"
             took = time.monotonic() - started
@@ -76,7 +75,7 @@ class Campaign:
         """One round; the seed decides the moment."""
         expected, took, largest = self.expected(name)
         moment = float(np.random.default_rng([seed, *name.encode()]).random())
-        folder = self._folder()
+        folder = self._folder(name)
         words = VERBS[name].words(folder)
         if way == "full disk":
             limit = int(200 * (largest / 200) ** moment)

@@ -32,6 +32,7 @@ class Verb:
     """Patterns of the files in `out` whose bytes must be equal, parted by spaces."""
     changed: str = ""
     """Patterns of what of `prepare` the command writes to, and must be equal too."""
+    reads_scene: bool = False
 
 
 def prepare(folder: Path) -> None:
@@ -94,7 +95,7 @@ VERBS = {
     "train": Verb(_train, "*.npz curves.csv config.yaml"),
     "tour": Verb(_tour, "capture/*/* scene/* flight/trajectory.npz"),
     "ablate": Verb(_ablate, "*.csv *.md room/*/*"),
-    "fidelity": Verb(_fidelity, "*.csv */*/*", "scene/*"),
+    "fidelity": Verb(_fidelity, "*.csv */*/*", "scene/*", reads_scene=True),
 }
 """By name."""
 
