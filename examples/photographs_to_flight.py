@@ -43,8 +43,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("photos", type=Path)
     parser.add_argument("--camera-height", type=float, help="above the floor [m]")
-    parser.add_argument(
-        "--iterations", type=int, default=-1, help="steps of optimisation; -1 for enough"
-    )
+    parser.add_argument("--iterations", type=int, default=-1, help="steps; -1 for enough")
     parser.add_argument("--out", type=Path, default=Path("out/place"))
     main(**vars(parser.parse_args()))

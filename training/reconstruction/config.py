@@ -101,7 +101,7 @@ class ReconstructConfig:
     colors_rate: float = 2.5e-3
     """Learning rate of the colours of degree 0; of higher ones a twentieth."""
 
-    contrast: float = 0.05
+    contrast: float = 0.03
     """Standard deviation of colour (0 to 1) that one Gaussian may hide at first."""
     max_cell: int = 16
     """[px] of the image that one Gaussian of the surface may cover; a power of two."""
