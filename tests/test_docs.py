@@ -65,8 +65,8 @@ def commands(page: Path) -> list[list[str]]:
     return [[word for word in words if word != "&"] for words in lines if words]
 
 
-class ParsedError(Exception):
-    """Raised in the place of running what was parsed."""
+class ParsedError(BaseException):
+    """Raised in the place of running what was parsed; `main` reports all others."""
 
 
 @pytest.fixture
