@@ -37,18 +37,18 @@ def run(
     """Renders `world` to `out/capture`, reconstructs that as `scene` (`out/scene` if None), flies
     in it, leaving `out/flight`, and returns the summary of the flight.
 
-    What is there from a run before is used again: an interrupted tour goes on.
+    What is there from a run of the same configuration is used again: an interrupted tour goes on.
 
     Raises:
         FileNotFoundError, ValueError, OSError: see `render_capture.run`, `make_scene` and
-            `fly.run`; or if the scene was begun with other settings of `reconstruct`.
+            `fly.run`; or if `out` holds a tour of another configuration, or something else.
     """
     capture = out / "capture"
     scene = out / "scene" if scene is None else scene
-    render_capture.run(world=world, out=capture, config=config.render, seed=seed)
-    claim_folder(out / "reconstruct.yaml", config.reconstruct)
-    make_scene(capture, scene, config.reconstruct)
     config.flight.world = SceneConfig(path=str(scene.absolute()))
+    claim_folder(out / "tour.yaml", config)
+    render_capture.run(world=world, out=capture, config=config.render, seed=seed)
+    make_scene(capture, scene, config.reconstruct)
     return fly.run(scenario=config.flight, out=out / "flight", overwrite=True)
 
 

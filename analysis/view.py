@@ -19,7 +19,7 @@ from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_folde
 from splatpilot.diagrams.worlds.scene_metadata import FRONTIER, read_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import load_config
-from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.systems.visualization.drawing import GOAL_COLOR, START_COLOR, draw_box, draw_goal
 from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace, place_page
@@ -39,19 +39,26 @@ type _Ends = tuple[NDArray[np.float64], NDArray[np.float64]] | None
 
 
 def run(
-    *, what: str, out: Path | None = None, seed: int | None = None, overrides: Sequence[str] = ()
+    *,
+    what: str,
+    out: Path | None = None,
+    seed: int | None = None,
+    overrides: Sequence[str] = (),
+    overwrite: bool = False,
 ) -> Path:
     """Writes the page of a place, prints where, and returns that.
 
     Args:
         what: a scene folder, a PLY, the folder of a capture, or a scenario.
-        out: the page; `out/view/NAME.html` if None.
+        out: the page; `out/view/NAME.html` if None, or `NAME-SEED.html` of a generated world.
         seed: of a generated world; that of its scenario if None.
         overrides: FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
+        overwrite: the page, if it is there.
 
     Raises:
         FileNotFoundError, ValueError, OSError: if there is no such place or it is damaged, settings
-            are given of what has none, or the page cannot be written.
+            are given of what has none, the page is there and not to be overwritten, or cannot be
+            written.
     """
     path = Path(what)
     generated = not (path.is_dir() or path.suffix.lower() == ".ply")
@@ -60,15 +67,21 @@ def run(
     scene = path.suffix.lower() == ".ply" or (path / "scene.yaml").is_file()
     if overrides and scene:
         raise ValueError(f"--set {overrides[0]}: a finished scene has no settings; leave it out")
+    name, scenario = path.resolve().name if path.is_dir() else path.stem, Scenario()
     if generated:
-        place, ends = _scenario(what, seed, overrides)
+        scenario = load_config(scenario, scenario_file(what), list(overrides))
+        scenario.seed = scenario.seed if seed is None else seed
+        name = f"{name}-{scenario.seed:03d}"
+    out = out or Path("out/view") / f"{name}.html"
+    require_unused(out, overwrite)
+    if generated:
+        place, ends = _scenario(scenario)
     elif path.is_dir() and scene:
         place, ends = _scene(path)
     elif scene:
         place, ends = _ply(path)
     else:
         place, ends = _capture(path, overrides)
-    out = out or Path("out/view") / f"{place.name}.html"
     require_writable_folder(out.absolute().parent)
     meshcat = empty_meshcat(place.background)
     draw_box(meshcat, "/splatpilot/bounds", place.lower_W, place.upper_W)
@@ -82,14 +95,12 @@ def run(
     return out
 
 
-def _scenario(what: str, seed: int | None, overrides: Sequence[str]) -> tuple[ShownPlace, _Ends]:
-    scenario = load_config(Scenario(), scenario_file(what), list(overrides))
+def _scenario(scenario: Scenario) -> tuple[ShownPlace, _Ends]:
     scenario.validate()
-    seed = scenario.seed if seed is None else seed
-    world = make_world(scenario.world, seed)
+    world = make_world(scenario.world, scenario.seed)
     start = world.p_WS if scenario.start is None else np.asarray(scenario.start, dtype=float)
     ends = start, goal_of(scenario, world)
-    return _place_of(world, f"{world.name}, seed {seed}", ends), ends
+    return _place_of(world, f"{world.name}, seed {scenario.seed}", ends), ends
 
 
 def _scene(path: Path) -> tuple[ShownPlace, _Ends]:

@@ -23,7 +23,11 @@ from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightRec
 
 
 def run(
-    *, scenario: Scenario, config: HardwareConfig, log: Path | None = None
+    *,
+    scenario: Scenario,
+    config: HardwareConfig,
+    log: Path | None = None,
+    overwrite: bool = False,
 ) -> dict[str, float | str]:
     """
     Waits for a vehicle's messages and flies it to the scenario's goal.
@@ -37,6 +41,7 @@ def run(
         scenario: who flies, and where to.
         config: where messages travel.
         log: where to write all messages, as LCM's logger does.
+        overwrite: that log, if it is there.
 
     Returns:
         How it ended (`outcome`: of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of
@@ -49,7 +54,7 @@ def run(
     scenario.validate()
     config.validate()
     lcm = open_lcm(config.url)
-    with contextlib.nullcontext() if log is None else recorded(lcm, log):
+    with contextlib.nullcontext() if log is None else recorded(lcm, log, overwrite):
         world = make_world(scenario.world, scenario.seed)
         diagram = BuildHardwareDiagram(scenario, world, lcm, config)
         print(f"Waiting for a vehicle at {config.url}...", flush=True)

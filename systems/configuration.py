@@ -87,24 +87,35 @@ def yaml_problem(error: yaml.YAMLError) -> str:
     return f"line {error.problem_mark.line + 1}: {reason_of(error.problem)}"
 
 
-def claim_folder(file: Path, config: Any) -> str:
+def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
     """
     Makes the folder of `file` one of what `config` describes, which it may be already, and writes
     `config` there.
+
+    Args:
+        overwrite: whether the folder may be of something else.
 
     Returns:
         The configuration as YAML.
 
     Raises:
-        ValueError: if the file holds another configuration.
+        ValueError: if the file holds another configuration, or the folder something else.
         OSError: if it cannot be written.
     """
     require_writable_folder(file.parent)
     text = dump_config(config)
-    if file.exists() and dump_config(load_config(type(config)(), file)) != text:
+    if overwrite:
+        pass
+    elif file.exists():
+        if dump_config(load_config(type(config)(), file)) != text:
+            raise ValueError(
+                f"{file} holds another configuration; choose another --out, or the same "
+                "configuration to go on there"
+            )
+    elif there := sorted(p.name for p in file.parent.iterdir() if not p.name.startswith(".")):
         raise ValueError(
-            f"{file} holds another configuration; choose another --out, or the same configuration "
-            "to go on there"
+            f"{file.parent} holds {there[0]} and no {file.name}; choose another --out, or an empty "
+            "folder"
         )
     with written_atomically(file) as partial:
         partial.write_text(text)

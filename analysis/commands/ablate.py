@@ -5,7 +5,7 @@ from pathlib import Path
 
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.reconstruct import reconstruction_defaults
-from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
 
 
@@ -29,6 +29,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     ablate.add_argument(
         "--out", type=Path, default=Path("out/ablation"), help="output folder (%(default)s)"
     )
+    add_overwrite(ablate)
     add_overrides(ablate, ("iterations=3000", "image_width=320"), reconstruction_defaults)
 
 
@@ -39,4 +40,4 @@ def _ablate(options: argparse.Namespace) -> None:
     from splatpilot.systems.configuration import load_config
 
     config = load_config(reconstruction_defaults(), overrides=options.overrides)
-    ablation.run(options.captures, options.out, config)
+    ablation.run(options.captures, options.out, config, options.overwrite)

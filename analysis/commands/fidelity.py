@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
 
 
@@ -27,6 +27,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     fidelity.add_argument(
         "--out", type=Path, default=Path("out/fidelity"), help="output folder (%(default)s)"
     )
+    add_overwrite(fidelity)
     add_overrides(fidelity, ("max_depth_error=0.03",), _defaults)
 
 
@@ -43,4 +44,4 @@ def _fidelity(options: argparse.Namespace) -> None:
     from splatpilot.systems.configuration import load_config
 
     config = load_config(_defaults(options), overrides=options.overrides)
-    fidelity.run(options.scenes, options.out, config)
+    fidelity.run(options.scenes, options.out, config, overwrite=options.overwrite)

@@ -28,7 +28,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     vehicle.add_argument(
         "--out", type=Path, default=Path("out/vehicle"), help="output folder (%(default)s)"
     )
-    add_overwrite(vehicle)
     bridge = add_verb(
         verbs,
         "bridge",
@@ -67,6 +66,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         parser.add_argument(
             "--patience", type=float, metavar="S", help="how long to wait for messages [s]"
         )
+        add_overwrite(parser)
         add_scenario(parser)
 
 
@@ -80,11 +80,18 @@ def _vehicle(options: argparse.Namespace) -> None:
 
 
 def _bridge(options: argparse.Namespace) -> None:
+    if options.log is not None:
+        require_unused(options.log, options.overwrite)
     check_config(options.hardware)
     scenario = read_scenario(options)
     from splatpilot.diagrams import bridge
 
-    bridge.run(scenario=scenario, config=_config(options), log=options.log)
+    bridge.run(
+        scenario=scenario,
+        config=_config(options),
+        log=options.log,
+        overwrite=options.overwrite,
+    )
 
 
 def _px4_defaults(options: argparse.Namespace) -> Any:

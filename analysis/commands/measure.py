@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
 
 
@@ -14,14 +14,15 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         _measure,
         help="compare a scene with the frames of its capture that were held out",
         description="Writes metrics.json (PSNR, SSIM, LPIPS, depth errors, floaters) and views.png "
-        "into a scene folder.",
-        examples=("measure scenes/hospital", "measure out/warehouse/scene"),
+        "into a scene folder. One that `splatpilot reconstruct` has finished has them already.",
+        examples=("measure scenes/room_metric", "measure scenes/hospital --overwrite"),
     )
     measure.add_argument("scene", type=Path, help="scene folder")
+    add_overwrite(measure)
 
 
 def _measure(options: argparse.Namespace) -> None:
     require_existing(options.scene, "a scene folder")
     from splatpilot.analysis.reconstruction import measure_scene
 
-    measure_scene.run(options.scene)
+    measure_scene.run(options.scene, options.overwrite)

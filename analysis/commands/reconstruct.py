@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_verb
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
+from splatpilot.systems.files import require_existing, require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -30,6 +30,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     reconstruct.add_argument(
         "--restart", action="store_true", help="discard what an interrupted run has left"
     )
+    add_overwrite(reconstruct)
     add_overrides(
         reconstruct,
         ("voxel_size=0.1", "image_width=640", "max_gaussians=200000", "device=cuda"),
@@ -39,6 +40,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _reconstruct(options: argparse.Namespace) -> None:
     require_existing(options.capture, "the folder of a capture")
+    require_unused(options.out, options.overwrite)
     from splatpilot.analysis.reconstruction import run as reconstruction
     from splatpilot.systems.configuration import load_config
 
@@ -49,7 +51,11 @@ def _reconstruct(options: argparse.Namespace) -> None:
         overrides.append(f"iterations={options.iterations}")
     config = load_config(reconstruction_defaults(), overrides=overrides)
     reconstruction.run(
-        capture=options.capture, out=options.out, config=config, restart=options.restart
+        capture=options.capture,
+        out=options.out,
+        config=config,
+        restart=options.restart,
+        overwrite=options.overwrite,
     )
 
 

@@ -6,8 +6,9 @@ from typing import Any
 
 from splatpilot.analysis.commands.checks import SCENARIOS, check_place
 from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.systems.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -25,6 +26,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     )
     view.add_argument("--out", type=Path, help="page to write (default: out/view/NAME.html)")
     view.add_argument("--seed", type=int, help="seed of a generated world")
+    add_overwrite(view)
     add_overrides(view, ("world.spacing=2.4", "world.height=8"), _scenario_defaults)
 
 
@@ -39,8 +41,14 @@ def _scenario_defaults(options: argparse.Namespace) -> Any:
 
 def _view(options: argparse.Namespace) -> None:
     check_place(Path(options.what), "a scene folder, a PLY, a capture or a scenario")
+    if options.out is not None:
+        require_unused(options.out, options.overwrite)
     from splatpilot.analysis import view
 
     view.run(
-        what=options.what, out=options.out, seed=options.seed, overrides=list(options.overrides)
+        what=options.what,
+        out=options.out,
+        seed=options.seed,
+        overrides=list(options.overrides),
+        overwrite=options.overwrite,
     )

@@ -14,8 +14,8 @@ from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import dump_config
-from splatpilot.systems.files import holds_folder, require_writable_folder, written_atomically
+from splatpilot.systems.configuration import claim_folder
+from splatpilot.systems.files import holds_folder, written_atomically
 
 
 def _scenario() -> Scenario:
@@ -61,12 +61,8 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
         OSError: if `out` cannot be written.
     """
     config.validate()
-    require_writable_folder(out)
-    text, file, lines = dump_config(config), out / "config.yaml", out / "trials.jsonl"
-    if file.exists() and file.read_text() != text:
-        raise ValueError(f"{file} is of another campaign; choose another --out")
-    with written_atomically(file) as path:
-        path.write_text(text)
+    claim_folder(out / "config.yaml", config)
+    lines = out / "trials.jsonl"
     rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
     worlds: dict[int, Any] = {}
     for number in tqdm(range(len(rows), config.trials), unit="trial", disable=None):

@@ -41,3 +41,13 @@ class FidelityConfig:
         for name in ("clearance", "max_depth_error", "max_psnr_drop"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}, more than 0 is needed")
+
+
+@dataclass
+class StudiedScenes:
+    """The content of `fidelity.yaml`: which study a folder holds."""
+
+    scenes: dict[str, str] = field(default_factory=dict)
+    """Folders of the scenes, and what each was made from."""
+    config: FidelityConfig = field(default_factory=FidelityConfig)
+    """What was tried, and what counts as trusted."""

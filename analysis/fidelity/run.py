@@ -12,11 +12,10 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
-from splatpilot.analysis.fidelity.config import FidelityConfig
+from splatpilot.analysis.fidelity.config import FidelityConfig, StudiedScenes
 from splatpilot.analysis.fidelity.figures import write_curves, write_views
 from splatpilot.analysis.fidelity.off_path import choose_withheld, displace_pose, drop_frames
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
@@ -29,7 +28,8 @@ from splatpilot.diagrams.worlds.scene_metadata import (
     write_scene_metadata,
 )
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.files import holds_folder, require_writable_folder, written_atomically
+from splatpilot.systems.configuration import claim_folder, dump_config
+from splatpilot.systems.files import holds_folder, written_atomically
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render_capture import true_camera
 from splatpilot.training.reconstruction.measures import mean_measure
@@ -38,7 +38,7 @@ from splatpilot.training.reconstruction.reconstruct import reconstruct
 TrueCamera = Callable[[RigidTransform], CaptureFrame]
 """Returns what the camera of a capture would have seen from another pose."""
 
-RECIPE = "reconstruct.yaml"
+_RECIPE = "reconstruct.yaml"
 _GRID = 0.1  # [m], steps in which the surroundings of a pose are tried
 
 
@@ -48,6 +48,7 @@ def run(
     out: Path,
     config: FidelityConfig,
     find_camera: Callable[[Path], TrueCamera | None] = true_camera,
+    overwrite: bool = False,
 ) -> list[FidelityStudy]:
     """Studies each scene folder, stores the bounds in its `scene.yaml` and writes figures.
 
@@ -55,17 +56,20 @@ def run(
     the truth from anywhere, and None for others.
 
     `out` gets `fidelity.png`, `fidelity.csv` and, for each scene, a sheet of views. What is
-    reconstructed without some frames is kept in `out/SCENE`, and used again.
+    reconstructed without some frames is kept in `out/SCENE`, and used again; `fidelity.yaml` says
+    which study it is. With `overwrite` it takes the place of another study in `out`, and its bounds
+    that of another's in the scenes.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a scene that is damaged, has no capture with
-            depth, or two of one name; settings that make no sense; a folder that cannot be written.
+            depth, bounds of another study, or the name of another one; settings that make no sense;
+            something else in `out`, or a folder that cannot be written.
     """
     config.validate()
-    require_writable_folder(out)
     names = [scene.resolve().name for scene in scenes]
     if len(set(names)) < len(names):
         raise ValueError(f"two scenes have one name ({', '.join(names)}); rename one folder")
+    _claim(out, scenes, config, overwrite)
     studies = []
     for scene, name in zip(scenes, names, strict=True):
         study = study_scene(scene, out / name, config, find_camera)
@@ -80,6 +84,20 @@ def run(
     write_curves(out / "fidelity.png", studies)
     _write_csv(out / "fidelity.csv", studies)
     return studies
+
+
+def _claim(out: Path, scenes: Sequence[Path], config: FidelityConfig, overwrite: bool) -> None:
+    """Makes `out` the folder of this study, and refuses to replace the bounds of another one."""
+    file = out / "fidelity.yaml"
+    said = {scene: read_scene_metadata(scene) for scene in scenes}
+    for scene, metadata in said.items():
+        if metadata.pose_perturbation_bounds and not file.is_file() and not overwrite:
+            raise FileExistsError(
+                f"{scene / 'scene.yaml'} has the bounds of another study; go on with that one in "
+                "its --out, or replace them with --overwrite"
+            )
+    made_from = {str(scene.resolve()): metadata.provenance for scene, metadata in said.items()}
+    claim_folder(file, StudiedScenes(made_from, config), overwrite)
 
 
 def study_scene(
@@ -212,8 +230,8 @@ def _withheld_frames(
     withheld = choose_withheld(len(whole), config.stretches, config.kept)
     representation = views.metadata.representation
     settings = replace(config.reconstruct, representation=representation, hold_out=0)
-    recipe = f"{yaml_dump_typed(settings)}withheld: {withheld}\n"
-    file = out / RECIPE
+    recipe = f"{dump_config(settings)}withheld: {withheld}\n"
+    file = out / _RECIPE
     part = drop_frames(whole, withheld)
     if not file.is_file() or file.read_text() != recipe:
         reconstruct(part, out, settings)

@@ -6,11 +6,10 @@ The study of the paper's Table II, over any number of captures.
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
 
 from splatpilot.analysis.reconstruction.ablation_result import ARMS, COLUMNS, AblationResult, Arm
 from splatpilot.analysis.reconstruction.figures import (
@@ -28,7 +27,8 @@ from splatpilot.analysis.reconstruction.scene_measures import (
 )
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.files import holds_folder, require_writable_folder, written_atomically
+from splatpilot.systems.configuration import claim_folder, dump_config
+from splatpilot.systems.files import holds_folder, written_atomically
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_of_scene import read_capture_of
@@ -42,6 +42,16 @@ from splatpilot.training.reconstruction.triangulation import triangulate
 
 _RECIPE = "reconstruct.yaml"
 _ERROR_LIMIT = 0.5  # [m], brightest colour of depth errors
+
+
+@dataclass
+class AblationStudy:
+    """The content of `ablation.yaml`: which study a folder holds."""
+
+    # Folders of the captures.
+    captures: list[str] = field(default_factory=list)
+    # How the arms are reconstructed, except for what makes them arms.
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
 
 
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
@@ -68,17 +78,20 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
 
 
 @holds_folder("out")
-def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> AblationResult:
+def run(
+    captures: Sequence[Path], out: Path, config: ReconstructConfig, overwrite: bool = False
+) -> AblationResult:
     """Reconstructs each capture in four ways, measures them and writes the study to `out`.
 
-    Every arm is a scene folder `out/CAPTURE/ARM`. Arms that are there already, made with the same
-    settings, are not made again. `ablation.md` and `ablation.csv` have the table, `CAPTURE.png` the
-    arms side by side.
+    Every arm is a scene folder `out/CAPTURE/ARM`. Arms that are there already, made of the same
+    capture with the same settings, are not made again. `ablation.md` and `ablation.csv` have the
+    table, `CAPTURE.png` the arms side by side, `ablation.yaml` which study it is; with `overwrite`
+    it takes the place of another one in `out`.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a capture that is damaged or has no depth, two
-            of one name, settings without held-out frames, arms in `out` made with other settings,
-            or a folder that cannot be written.
+            of one name, settings without held-out frames, something else in `out`, or a folder that
+            cannot be written.
     """
     config.validate()
     require_renderer(config.device)
@@ -96,7 +109,8 @@ def run(captures: Sequence[Path], out: Path, config: ReconstructConfig) -> Ablat
             raise ValueError(f"{path}: has no depth, so neither recipe nor measures can use it")
         if names.count(capture.name) > 1:
             raise ValueError(f"{path}: two captures are called {capture.name}; rename one folder")
-    require_writable_folder(out)
+    study = AblationStudy([str(path.resolve()) for path in captures], config)
+    claim_folder(out / "ablation.yaml", study, overwrite)
     result = AblationResult(
         {capture.name: _ablate(capture, out / capture.name, config) for _, capture in opened}
     )
@@ -120,14 +134,9 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
     points = capture.points
     for arm in ARMS:
         scene = out / arm.key
-        recipe = yaml_dump_typed(arm_config(arm, config)) or ""
+        recipe = f"capture: {capture.folder}\n{dump_config(arm_config(arm, config))}"
         file = scene / _RECIPE
-        if file.is_file() and file.read_text() != recipe:
-            raise ValueError(
-                f"{file}: this arm was made with other settings; choose another --out, or delete "
-                f"{scene}"
-            )
-        if not file.is_file():
+        if not file.is_file() or file.read_text() != recipe:
             print(f"{capture.name}: {arm.title}")
             seen = capture
             if not arm.depth:

@@ -18,7 +18,7 @@ from splatpilot.analysis.reconstruction.figures import (
 from splatpilot.analysis.reconstruction.scene_measures import METRICS, SceneMeasures
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.files import written_atomically
+from splatpilot.systems.files import require_unused, written_atomically
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.reconstruction.lpips import Lpips
@@ -62,8 +62,14 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
     return measures
 
 
-def run(scene: Path) -> SceneMeasures:
-    """Measures a scene folder, see `measure_scene`, and prints what it is and the table."""
+def run(scene: Path, overwrite: bool = False) -> SceneMeasures:
+    """Measures a scene folder, see `measure_scene`, and prints what it is and the table.
+
+    Raises:
+        FileExistsError: if it has been measured, and that is not to be overwritten.
+        FileNotFoundError, ValueError, OSError: see `measure_scene`.
+    """
+    require_unused(scene / METRICS, overwrite)
     metadata = read_scene_metadata(scene)
     measures = measure_scene(scene)
     if metadata.provenance:

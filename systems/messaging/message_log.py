@@ -8,21 +8,21 @@ from pathlib import Path
 from lcm import LCM, EventLog
 from pydrake.systems.analysis import Simulator
 
+from splatpilot.systems.files import require_unused
 from splatpilot.systems.messaging.unix_clock import UnixClock
 
 
 @contextmanager
-def recorded(lcm: LCM, path: Path) -> Iterator[None]:
+def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
     """
     Writes what comes by LCM, on all channels, into a log, each message with the time at which the
     LCM was asked for it.
 
     Raises:
-        OSError: if there is such a file already, or it cannot be written.
+        OSError: if there is such a file already, unless with `overwrite`, or it cannot be written.
     """
-    if path.exists():
-        raise FileExistsError(f"{path} is there already; name another file for the log")
-    log = EventLog(path, "w")
+    require_unused(path, overwrite)
+    log = EventLog(path, "w", overwrite=overwrite)
     subscription = lcm.subscribe(
         ".*", lambda channel, data: log.write_event(time.time_ns() // 1000, channel, data)
     )

@@ -28,7 +28,7 @@ SMALL = [
 
 def test_a_room_is_captured_reconstructed_and_flown_in(opengl, tmp_path, capsys):
     """One command leaves a capture, a measured scene and a flight that reached its goal; run again
-    it uses what is there, and it refuses a scene of something else."""
+    it uses what is there; it refuses other settings there, and a scene of something else."""
     room = tmp_path / "room.obj"
     mesh = trimesh.creation.box((7.0, 4.0, 3.0))
     mesh.invert()
@@ -57,8 +57,7 @@ def test_a_room_is_captured_reconstructed_and_flown_in(opengl, tmp_path, capsys)
     assert (out / "scene" / "metrics.json").is_file() and (out / "scene" / "views.png").is_file()
     capsys.readouterr()
     assert main([*command, "--set", "reconstruct.iterations=25"]) == 1
-    assert "reconstruct.yaml holds another configuration" in capsys.readouterr().err
-
+    assert "tour.yaml holds another configuration" in capsys.readouterr().err
     other = [str(tmp_path / "other") if word == str(out) else word for word in command]
     assert main([*other, "--scene", str(out / "scene")]) == 1
     assert "was made of" in capsys.readouterr().err

@@ -76,9 +76,13 @@ def test_bad_urls_are_errors_before_the_world_is_made(tmp_path):
 
 
 def test_logs_are_not_overwritten(udp_url, tmp_path):
-    """A log that is there already is an error before anything is waited for."""
-    (tmp_path / "log").write_text("a flight")
+    """A log that is there already is an error before anything is waited for, unless it may be."""
+    log = tmp_path / "log"
+    log.write_text("a flight")
+    config = HardwareConfig(url=udp_url, patience=0.2)
     with pytest.raises(FileExistsError, match="is there already"):
-        bridge.run(
-            scenario=small_scenario(), config=HardwareConfig(url=udp_url), log=tmp_path / "log"
-        )
+        bridge.run(scenario=small_scenario(), config=config, log=log)
+    assert log.read_text() == "a flight"
+    with pytest.raises(TimeoutError):
+        bridge.run(scenario=small_scenario(), config=config, log=log, overwrite=True)
+    assert log.read_bytes() == b""

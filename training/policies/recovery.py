@@ -22,6 +22,7 @@ from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.configuration import claim_folder
 from splatpilot.systems.files import folder_written_atomically, holds_folder, written_atomically
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.processes import map_processes
@@ -52,6 +53,14 @@ class Task:
     timeout: float  # [s]
 
 
+@dataclass
+class RecoveryFlights:
+    """The content of `recovery.yaml`: what decides a run beside the configuration of training."""
+
+    # [-] Of the student, at most, in each world.
+    flights: int = 6
+
+
 @holds_folder("out")
 def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[str, Any]:
     """
@@ -62,7 +71,7 @@ def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[
 
     Leaves in `out`: `stage_1` and `stage_2`, see `train.run`; `corpora`, links to those of the
     first stage with the recovery samples beside them; `flights`, what the student flew, a file a
-    world; `recovery.json`, how many of what there are.
+    world; `recovery.yaml`, how many they may be; `recovery.json`, how many of what there are.
 
     Args:
         config: of both stages.
@@ -73,12 +82,14 @@ def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[
         What `recovery.json` says.
 
     Raises:
-        FileNotFoundError, ValueError: see `train.run` and `add_recovery`.
+        FileNotFoundError, ValueError: see `train.run` and `add_recovery`; or if `out` holds
+            something else.
         OSError: if `out` cannot be written, or a process was killed.
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
         if value < 1:
             raise ValueError(f"--{name} is {value}; it must be at least 1")
+    claim_folder(out / "recovery.yaml", RecoveryFlights(flights))
     first = train.run(config=config, out=out / "stage_1", make=StudentTrainer)
     weights = out / "stage_1" / f"{first['policy']}.npz"
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]

@@ -1,6 +1,7 @@
 """Flights in which something goes wrong, and that nothing worse comes of it."""
 
 import json
+import shutil
 
 import lcm
 import numpy as np
@@ -93,6 +94,7 @@ def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
     assert len(rows) == 2 and all(json.loads(row)["safe"] for row in rows)
     again = tmp_path / "again"
     again.mkdir()
+    shutil.copy(tmp_path / "whole" / "config.yaml", again)
     (again / "trials.jsonl").write_text(rows[0])
     assert main([*words, "--out", str(again)]) == 0
     assert (again / "trials.jsonl").read_text() == "".join(rows)

@@ -135,6 +135,26 @@ def test_withheld_stretches(place):
     assert (out / "real" / "gaussians.ply").stat().st_mtime_ns == made
 
 
+def test_studies_are_not_mixed(place, rendered_world):
+    """Bounds of another study in a scene, and another study in the folder, are refused and stay as
+    they are, unless they may be overwritten."""
+    scene, out = place.scene("perfect", held_out=[0]), place.folder / "out"
+    narrow, wide = (FidelityConfig(offsets=[0.0, offset]) for offset in (0.2, 0.4))
+    fidelity.run([scene], out, narrow, rendered_world)
+    for folder, error, message in (
+        (out, ValueError, r"fidelity.yaml holds another configuration"),
+        (place.folder / "other", FileExistsError, r"scene.yaml has the bounds of another study"),
+    ):
+        with pytest.raises(error, match=message):
+            fidelity.run([scene], folder, wide, rendered_world)
+    assert not (place.folder / "other").exists()
+    assert {row["offset"] for row in rows_of(out)} == {"0.0", "0.2"}
+    assert read_scene_metadata(scene).perturbation_bound == pytest.approx(0.2)
+    fidelity.run([scene], out, wide, rendered_world, overwrite=True)
+    assert {row["offset"] for row in rows_of(out)} == {"0.0", "0.4"}
+    assert read_scene_metadata(scene).perturbation_bound == pytest.approx(0.4)
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [

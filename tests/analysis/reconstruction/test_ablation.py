@@ -17,9 +17,9 @@ from splatpilot.training.reconstruction.measures import ViewMeasures
 SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=0.2")
 
 
-def ablate(place) -> int:
+def ablate(place, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
-    return main(["ablate", "room", "--out", str(place.folder), *settings])
+    return main(["ablate", *captures, "--out", str(place.folder / "out"), *settings, *words])
 
 
 def test_ablation_end_to_end(place, capsys, monkeypatch):
@@ -28,18 +28,18 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
     assert ablate(place) == 0
     printed = capsys.readouterr().out
     assert "paper    3DGS + depth (ours)  28.89      0.8676  0.184" in printed
-    table = (place.folder / "ablation.md").read_text()
+    table = (place.folder / "out" / "ablation.md").read_text()
     assert "| paper | Vanilla 2DGS | 29.07 | 0.8656 | 0.228 | 1.466 | 13.00% |" in table
-    with open(place.folder / "ablation.csv", newline="") as file:
+    with open(place.folder / "out" / "ablation.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["arm"] for row in rows] == [arm.key for arm in ARMS] * 2
     for arm, row in zip(ARMS, rows, strict=False):
-        metadata = read_scene_metadata(place.folder / "room" / arm.key)
+        metadata = read_scene_metadata(place.folder / "out" / "room" / arm.key)
         assert metadata.representation == arm.representation
         assert metadata.held_out == [0, 8]
         assert float(row["psnr_db"]) > 5 and row["lpips"] == ""
         assert f"{float(row['psnr_db']):.2f}" in printed
-    assert np.shape(cv2.imread(str(place.folder / "room.png")))[1] > 5 * 64
+    assert np.shape(cv2.imread(str(place.folder / "out" / "room.png")))[1] > 5 * 64
 
     def fail(*args, **kwargs):
         raise AssertionError("made again")
@@ -50,19 +50,33 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
     assert titles in printed
     assert capsys.readouterr().out == printed.replace(titles, "")
     # An arm that is missing would be made.
-    (place.folder / "room" / "2dgs" / "reconstruct.yaml").unlink()
+    (place.folder / "out" / "room" / "2dgs" / "reconstruct.yaml").unlink()
     assert ablate(place) == 70
     assert "a mistake of the program (AssertionError)" in capsys.readouterr().err
 
 
-def test_arms_of_other_settings_are_not_mixed(place, capsys):
-    """Arms that were made with other settings are refused, not reported as if of these."""
-    arm = place.scene("3dgs")
-    (place.folder / "room").mkdir()
-    arm.rename(place.folder / "room" / "3dgs")
-    (place.folder / "room" / "3dgs" / "reconstruct.yaml").write_text("iterations: 1\n")
-    assert ablate(place) == 1
-    assert "this arm was made with other settings" in capsys.readouterr().err
+def test_studies_are_not_mixed(place, monkeypatch, capsys):
+    """The folder of a study of other settings, or of other captures, is refused and stays as it is;
+    with --overwrite all arms are made anew."""
+
+    def make(capture, scene, config):
+        place.scene(f"out/room/{scene.name}")
+        made.append(scene.name)
+
+    made: list[str] = []
+    monkeypatch.setattr(ablation, "reconstruct", make)
+    assert ablate(place) == 0
+    table = (place.folder / "out" / "ablation.csv").read_bytes()
+    capsys.readouterr()
+    other = str(place.scene("scene", capture="room"))
+    other_steps = "--set", "iterations=13"
+    for words, captures in ((other_steps, ("room",)), ((), (other,))):
+        assert ablate(place, *words, captures=captures) == 1
+        assert "ablation.yaml holds another configuration" in capsys.readouterr().err
+    assert len(made) == len(ARMS)
+    assert (place.folder / "out" / "ablation.csv").read_bytes() == table
+    assert ablate(place, *other_steps, "--overwrite") == 0
+    assert len(made) == 2 * len(ARMS)
 
 
 def test_photometric_arms_see_no_depth():

@@ -31,7 +31,7 @@ TINY = [
 def expert(tmp_path_factory) -> Path:
     """The folder of a corpus of one short flight in each of two small forests."""
     folder = tmp_path_factory.mktemp("expert")
-    grove = folder / "grove.yaml"
+    grove = tmp_path_factory.mktemp("worlds") / "grove.yaml"
     grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
     config = CorpusConfig(
         worlds=LibraryConfig(kinds=[str(grove)]),
@@ -75,6 +75,9 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
             patch.setattr(recovery, step, interrupt)
             with pytest.raises(KeyboardInterrupt):
                 both_stages(expert, parts)
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
+        recovery.run(config=config, out=parts, flights=2, jobs=1)
     monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
     assert both_stages(expert, parts)["flights"] == ledger["flights"]
     expected, found = weights(whole), weights(parts)
