@@ -21,8 +21,15 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
 from splatpilot.systems.splats.gaussian_ply import read_ply
-from splatpilot.systems.visualization.drawing import GOAL_COLOR, START_COLOR, draw_box, draw_goal
+from splatpilot.systems.visualization.drawing import (
+    BALL,
+    GOAL_COLOR,
+    START_COLOR,
+    draw_box,
+    draw_goal,
+)
 from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace, place_page
+from splatpilot.systems.visualization.viser_place import serve_place
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_gaussians import capture_gaussians
@@ -31,11 +38,8 @@ from splatpilot.training.captures.read_capture import read_capture
 
 _MAX_IMAGES = 60
 _IMAGE_WIDTH = 480  # [px]
-_BALL = 0.25  # [m], radius of what marks start and goal
 _HEADROOM = 0.15  # of the place's height, left above what is of interest
 _BOUNDS = "#fff", "bounds"
-
-type _Ends = tuple[NDArray[np.float64], NDArray[np.float64]] | None
 
 
 def run(
@@ -56,54 +60,83 @@ def run(
         overwrite: the page, if it is there.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: if there is no such place or it is damaged, settings
-            are given of what has none, the page is there and not to be overwritten, or cannot be
-            written.
+        FileNotFoundError, ValueError, OSError: see `shown_place`; or if the page is there and not
+            to be overwritten, or cannot be written.
     """
     path = Path(what)
-    generated = not (path.is_dir() or path.suffix.lower() == ".ply")
-    if seed is not None and not generated:
-        raise ValueError(f"--seed {seed}: {what} is no generated world; leave the seed out")
-    scene = path.suffix.lower() == ".ply" or (path / "scene.yaml").is_file()
-    if overrides and scene:
-        raise ValueError(f"--set {overrides[0]}: a finished scene has no settings; leave it out")
-    name, scenario = path.resolve().name if path.is_dir() else path.stem, Scenario()
-    if generated:
-        scenario = load_config(scenario, scenario_file(what), list(overrides))
-        scenario.seed = scenario.seed if seed is None else seed
-        name = f"{name}-{scenario.seed:03d}"
+    name = path.resolve().name if path.is_dir() else path.stem
+    if _is_generated(path):
+        name = f"{name}-{_scenario(what, seed, overrides).seed:03d}"
     out = out or Path("out/view") / f"{name}.html"
     require_unused(out, overwrite)
-    if generated:
-        place, ends = _scenario(scenario)
-    elif path.is_dir() and scene:
-        place, ends = _scene(path)
-    elif scene:
-        place, ends = _ply(path)
-    else:
-        place, ends = _capture(path, overrides)
+    place = shown_place(what, seed, overrides)
     require_writable_folder(out.absolute().parent)
     meshcat = empty_meshcat(place.background)
     draw_box(meshcat, "/splatpilot/bounds", place.lower_W, place.upper_W)
     for p, name, color in zip(
-        ends or (), ("start", "goal"), (START_COLOR, GOAL_COLOR), strict=False
+        place.ends or (), ("start", "goal"), (START_COLOR, GOAL_COLOR), strict=False
     ):
-        draw_goal(meshcat, f"/splatpilot/{name}", p, _BALL, color)
+        draw_goal(meshcat, f"/splatpilot/{name}", p, BALL, color)
     with written_atomically(out) as partial:
         partial.write_text(place_page(meshcat.StaticHtml(), place))
     print(f"Wrote {out}, a page for any browser")
     return out
 
 
-def _scenario(scenario: Scenario) -> tuple[ShownPlace, _Ends]:
+def serve(*, what: str, seed: int | None = None, overrides: Sequence[str] = ()) -> None:
+    """Serves a place with viser until it is interrupted, and prints where; for the arguments see
+    `run`.
+
+    Raises:
+        ModuleNotFoundError: if viser is not installed; the message says what to install.
+        FileNotFoundError, ValueError, OSError: see `shown_place`.
+    """
+    server = serve_place(shown_place(what, seed, overrides))
+    print(f"Look at http://localhost:{server.get_port()}; Ctrl-C ends it", flush=True)
+    try:
+        server.sleep_forever()
+    finally:
+        server.stop()
+
+
+def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownPlace:
+    """What is shown of a place; for the arguments see `run`.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: if there is no such place or it is damaged, or
+            settings are given of what has none.
+    """
+    path = Path(what)
+    if _is_generated(path):
+        return _generated(_scenario(what, seed, overrides))
+    if seed is not None:
+        raise ValueError(f"--seed {seed}: {what} is no generated world; leave the seed out")
+    scene = path.suffix.lower() == ".ply" or (path / "scene.yaml").is_file()
+    if not scene:
+        return _capture(path, overrides)
+    if overrides:
+        raise ValueError(f"--set {overrides[0]}: a finished scene has no settings; leave it out")
+    return _scene(path) if path.is_dir() else _ply(path)
+
+
+def _is_generated(path: Path) -> bool:
+    return not (path.is_dir() or path.suffix.lower() == ".ply")
+
+
+def _scenario(what: str, seed: int | None, overrides: Sequence[str]) -> Scenario:
+    scenario = load_config(Scenario(), scenario_file(what), list(overrides))
+    return scenario if seed is None else replace(scenario, seed=seed)
+
+
+def _generated(scenario: Scenario) -> ShownPlace:
     scenario.validate()
     world = make_world(scenario.world, scenario.seed)
     start = world.p_WS if scenario.start is None else np.asarray(scenario.start, dtype=float)
     ends = start, goal_of(scenario, world)
-    return _place_of(world, f"{world.name}, seed {scenario.seed}", ends), ends
+    return _place_of(world, f"{world.name}, seed {scenario.seed}", ends)
 
 
-def _scene(path: Path) -> tuple[ShownPlace, _Ends]:
+def _scene(path: Path) -> ShownPlace:
     metadata = read_scene_metadata(path)
     world = read_scene_folder(path, metric=False)
     notes, images = [], None
@@ -123,10 +156,10 @@ def _scene(path: Path) -> tuple[ShownPlace, _Ends]:
         notes=notes,
         scale_command=f"splatpilot scale {shlex.quote(str(path))} --out {target}",
     )
-    return place, ends
+    return place
 
 
-def _ply(path: Path) -> tuple[ShownPlace, _Ends]:
+def _ply(path: Path) -> ShownPlace:
     try:
         world = read_scene(path)
     except ValueError as error:
@@ -142,12 +175,11 @@ def _ply(path: Path) -> tuple[ShownPlace, _Ends]:
             float(upper_W[2]),
             legend=[_BOUNDS],
             notes=notes,
-        ), None
-    ends = world.p_WS, world.p_WG
-    return _place_of(world, world.name, ends), ends
+        )
+    return _place_of(world, world.name, (world.p_WS, world.p_WG))
 
 
-def _capture(path: Path, overrides: Sequence[str]) -> tuple[ShownPlace, _Ends]:
+def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
     capture = read_capture(path, load_config(CaptureConfig(), overrides=list(overrides)))
     gaussians = capture_gaussians(capture, _some(capture))
     if gaussians is None:
@@ -171,13 +203,13 @@ def _capture(path: Path, overrides: Sequence[str]) -> tuple[ShownPlace, _Ends]:
         metric=capture.metric,
         legend=[_BOUNDS],
         notes=notes,
-    ), None
+    )
 
 
 def _place_of(
     world: World,
     name: str,
-    ends: _Ends,
+    ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
     images: CapturedImages | None = None,
 ) -> ShownPlace:
     lower_W, upper_W = world.esdf.lower_W, world.esdf.upper_W
@@ -193,6 +225,7 @@ def _place_of(
         upper_W=upper_W,
         height=_height(lower_W, upper_W, seen),
         field=world.esdf,
+        ends=ends,
         images=images,
         legend=legend,
     )

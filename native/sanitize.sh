@@ -17,12 +17,7 @@ build=$root/build/sanitize
 "$python" -m cmake --build "$build"
 
 # The tests that run native code; others only wrap what these run.
-if [ $# -eq 0 ]; then
-  for name in rasterization_gradients surfels rasterization rasterization_unscented baked_scene; do
-    set -- "$@" "tests/systems/splats/test_$name.py"
-  done
-  set -- "$@" tests/training/reconstruction/test_losses.py tests/training/policies/test_ray_casting.py
-fi
+[ $# -gt 0 ] || set -- $(cat "$root/native/kernel_tests.txt")
 # splatpilot._native comes from the build folder. pytest must not swallow the report (-s).
 program='
 import importlib.util

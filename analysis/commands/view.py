@@ -8,6 +8,7 @@ from splatpilot.analysis.commands.checks import SCENARIOS, check_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.systems.extras import import_extra
 from splatpilot.systems.files import require_unused
 
 
@@ -19,7 +20,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         help="look at a scene, a PLY, a capture or a generated world, and measure in it",
         description="Writes a page that any browser opens, without a server or a network: the "
         "Gaussians, distances to surfaces, the captured images where they were taken, a ruler.",
-        examples=("view scenes/hospital", "view P02 --seed 3 --set world.spacing=2.4"),
+        examples=(
+            "view scenes/hospital",
+            "view P02 --seed 3 --set world.spacing=2.4",
+            "view scenes/hospital --viser",
+        ),
     )
     view.add_argument(
         "what", help="scene folder, PLY, folder of a capture, or a scenario: P02 or a file"
@@ -27,6 +32,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     view.add_argument("--out", type=Path, help="page to write (default: out/view/NAME.html)")
     view.add_argument("--seed", type=int, help="seed of a generated world")
     add_overwrite(view)
+    view.add_argument(
+        "--viser", action="store_true", help="serve it with viser instead, over the network"
+    )
     add_overrides(view, ("world.spacing=2.4", "world.height=8"), _scenario_defaults)
 
 
@@ -41,10 +49,17 @@ def _scenario_defaults(options: argparse.Namespace) -> Any:
 
 def _view(options: argparse.Namespace) -> None:
     check_place(Path(options.what), "a scene folder, a PLY, a capture or a scenario")
-    if options.out is not None:
+    if options.viser and options.out is not None:
+        raise ValueError(f"--out {options.out} and --viser: viser writes no page; keep one of them")
+    if options.viser:
+        import_extra("viser", "viser")
+    elif options.out is not None:
         require_unused(options.out, options.overwrite)
     from splatpilot.analysis import view
 
+    if options.viser:
+        view.serve(what=options.what, seed=options.seed, overrides=list(options.overrides))
+        return
     view.run(
         what=options.what,
         out=options.out,

@@ -119,6 +119,12 @@ class GaussianScene:
         """Orientations of the principal axes as matrices, (N, 3, 3)."""
         return Rotation.from_quat(self.quats, scalar_first=True).as_matrix()
 
+    @property
+    def covariances(self) -> NDArray[np.float64]:
+        """Covariances about the centres, (N, 3, 3) [m^2]."""
+        axes = self.rotations * self.scales[:, None, :]
+        return axes @ axes.transpose(0, 2, 1)
+
     def transformed_by(self, X_WO: RigidTransform) -> GaussianScene:
         """Returns these Gaussians, standing in frame O, expressed in W."""
         R_WO = X_WO.rotation().matrix()

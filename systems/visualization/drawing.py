@@ -40,6 +40,7 @@ def draw_gaussians(
 
 
 GOAL_COLOR, START_COLOR = Rgba(0.1, 0.9, 0.3, 0.4), Rgba(0.1, 0.5, 1.0, 0.4)
+BALL = 0.25  # [m], radius of what marks start and goal where nobody flies
 
 
 def draw_goal(
@@ -53,14 +54,19 @@ def draw_goal(
     meshcat.SetTransform(path, RigidTransform(p_WG))
 
 
-def draw_box(meshcat: Meshcat, path: str, lower_W: np.ndarray, upper_W: np.ndarray) -> None:
-    """Draws the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
+def box_edges(lower_W: np.ndarray, upper_W: np.ndarray) -> np.ndarray:
+    """The ends (12, 2, 3) [m] of the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
     corners = np.array(list(np.ndindex(2, 2, 2)))
     starts, ends = np.nonzero(np.abs(corners[:, None] - corners).sum(axis=-1) == 1)
     once = starts < ends
     p_WQ = np.where(corners == 0, lower_W, upper_W)
-    white = Rgba(1.0, 1.0, 1.0)
-    meshcat.SetLineSegments(path, p_WQ[starts[once]].T, p_WQ[ends[once]].T, 1.0, white)
+    return np.stack([p_WQ[starts[once]], p_WQ[ends[once]]], axis=1)
+
+
+def draw_box(meshcat: Meshcat, path: str, lower_W: np.ndarray, upper_W: np.ndarray) -> None:
+    """Draws the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
+    edges = box_edges(lower_W, upper_W)
+    meshcat.SetLineSegments(path, edges[:, 0].T, edges[:, 1].T, 1.0, Rgba(1.0, 1.0, 1.0))
 
 
 def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
@@ -95,18 +101,21 @@ def distance_colors(distances: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2], -1)
 
 
-def draw_distance_slice(
-    meshcat: Meshcat, path: str, field: DistanceField, height: float, spacing: float = 0.2
-) -> None:
+def distance_slice(
+    field: DistanceField, height: float, spacing: float, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Draws the horizontal slice of a distance field at z = `height` [m].
+    The horizontal slice of a distance field at z = `height` [m], as a coloured mesh.
 
-    Red is at or inside a surface, fading through yellow at 1 m to blue at 2 m and more; unknown
+    Red is at or inside a surface, fading through yellow to blue at `reach` [m] and more; unknown
     space is grey.
 
     Args:
-        path: Meshcat path of the coloured mesh.
         spacing: distance between the samples [m].
+
+    Returns:
+        Its vertices p_WQ (N, 3) [m], faces (M, 3), which are seen from above, and the colours of
+        the vertices (N, 3), 0 to 1.
     """
     lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
     counts = np.maximum(2, np.ceil((upper_W[:2] - lower_W[:2]) / spacing).astype(int))
@@ -117,16 +126,30 @@ def draw_distance_slice(
     )
     p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
     sample = field.query(p_WQ)
-    colors = distance_colors(np.nan_to_num(sample.distance) / 2.0).T
-    colors[:, sample.state >= FieldState.UNKNOWN] = UNKNOWN_GREY
+    colors = distance_colors(np.nan_to_num(sample.distance) / reach)
+    colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GREY
 
     i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
     corner = (i * counts[1] + j).ravel()
     faces = np.concatenate(
         [
-            [corner, corner + counts[1], corner + 1],
-            [corner + 1, corner + counts[1], corner + counts[1] + 1],
-        ],
-        axis=1,
-    ).astype(np.int32)
-    meshcat.SetTriangleColorMesh(path, p_WQ.T, faces, colors)
+            np.stack([corner, corner + counts[1], corner + 1], axis=-1),
+            np.stack([corner + 1, corner + counts[1], corner + counts[1] + 1], axis=-1),
+        ]
+    )
+    return p_WQ, faces.astype(np.int32), colors
+
+
+def draw_distance_slice(
+    meshcat: Meshcat, path: str, field: DistanceField, height: float, spacing: float = 0.2
+) -> None:
+    """
+    Draws the `distance_slice` of a field, blue from 2 m on.
+
+    Args:
+        path: Meshcat path of the coloured mesh.
+        height: of the slice, z [m].
+        spacing: distance between the samples [m].
+    """
+    p_WQ, faces, colors = distance_slice(field, height, spacing, reach=2.0)
+    meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)

@@ -21,8 +21,7 @@ def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
     words[:, :3] = scene.means.view(np.uint32)
     shades = np.column_stack([scene.base_colors, scene.opacities])
     words[:, 3] = np.round(255 * shades).astype(np.uint8).view(np.uint32)[:, 0]
-    axes = scene.rotations * scene.scales[:, None, :]
-    covariances = _COVARIANCE_SCALE * axes @ axes.transpose(0, 2, 1)
+    covariances = _COVARIANCE_SCALE * scene.covariances
     # What is larger than a half holds shrinks as a whole, and stays an ellipsoid.
     largest = np.abs(covariances).max(axis=(1, 2), keepdims=True)
     covariances *= np.minimum(1, np.finfo(np.float16).max / np.maximum(largest, 1e-30))

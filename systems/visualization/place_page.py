@@ -49,6 +49,7 @@ class ShownPlace:
     upper_W: NDArray[np.float64]  # (3,) [m]
     height: float  # [m], above which nothing is shown at first
     field: Esdf | None = None
+    ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # (3,) [m], start and goal
     images: CapturedImages | None = None
     num_unknown: int = 0  # of the Gaussians, at their end: where nobody looked any further
     beyond: bool = True  # whether Gaussians beyond the bounds are shown at first
@@ -56,6 +57,13 @@ class ShownPlace:
     legend: Sequence[tuple[str, str]] = ()  # colours, as in CSS, of what is drawn, and its names
     notes: Sequence[str] = ()  # sentences about the place
     scale_command: str = ""  # to which two points and the length between them need be added
+
+    @property
+    def reach(self) -> float:
+        """[m], the distance to surfaces from which on all have one colour."""
+        if self.metric or self.field is None:
+            return _REACH
+        return _REACH_UNKNOWN * self.field.voxel_size
 
 
 def place_page(meshcat_page: str, place: ShownPlace) -> str:
@@ -84,7 +92,7 @@ def place_page(meshcat_page: str, place: ShownPlace) -> str:
         "beyond": place.beyond,
         "unknown": place.num_unknown,
         "scale_command": place.scale_command,
-        "grid": place.field and _grid(place.field, place.metric),
+        "grid": place.field and _grid(place.field, place.reach),
         "cameras": place.images and _cameras(place.images, float(np.linalg.norm(size))),
     }
     return splat_page(
@@ -97,10 +105,9 @@ def place_page(meshcat_page: str, place: ShownPlace) -> str:
     )
 
 
-def _grid(field: Esdf, metric: bool) -> dict[str, Any]:
+def _grid(field: Esdf, reach: float) -> dict[str, Any]:
     """The distances as bytes, of every so many-th voxel along each axis: 0 at a surface, 254 at
     `reach`, 255 where nobody looked."""
-    reach = _REACH if metric else _REACH_UNKNOWN * field.voxel_size
     stride = int(np.ceil(np.cbrt(field.distances.size / _MAX_VOXELS)))
     thin = (slice(stride // 2, None, stride),) * 3
     values = np.round(254 * np.clip(field.distances[thin] / reach, 0, 1)).astype(np.uint8)

@@ -1,0 +1,72 @@
+#!/bin/sh
+# Builds the native module for aarch64 and runs the tests of its kernels on it, under qemu's emulation
+# of that processor, with Debian's Python and PyPI's packages for it. On Debian, or what keeps its
+# archive's keys, as any user:
+#
+#     apt-get install g++-aarch64-linux-gnu qemu-user-static
+#     native/aarch64.sh [python] [test files]
+#
+# What is downloaded (0.5 GB) and built stays in build/aarch64. Emulation is some twenty times slower.
+set -eu
+root=$(cd "$(dirname "$0")/.." && pwd)
+python=${1:-$root/.venv/bin/python}
+[ $# -gt 0 ] && shift
+python=$(cd "$(dirname "$python")" && pwd)/$(basename "$python")
+work=$root/build/aarch64
+for tool in aarch64-linux-gnu-g++ qemu-aarch64-static apt-get cmake; do
+  command -v $tool > /dev/null || {
+    echo "$tool is not installed; apt-get install g++-aarch64-linux-gnu qemu-user-static cmake" >&2
+    exit 1
+  }
+done
+
+# Debian's Python for the emulated machine, unpacked and not installed: an apt of its own, which knows
+# of that processor's packages alone.
+if [ ! -e "$work/root/usr/bin/python3.13" ]; then
+  apt=$work/apt
+  mkdir -p "$apt/etc/preferences.d" "$apt/state/lists/partial" "$apt/cache/archives/partial"
+  : > "$apt/state/status"
+  echo "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]" \
+    "http://deb.debian.org/debian trixie main" > "$apt/etc/sources.list"
+  set_apart="-o Dir::Etc=$apt/etc -o Dir::State=$apt/state -o Dir::State::status=$apt/state/status
+    -o Dir::Cache=$apt/cache -o APT::Architecture=arm64 -o APT::Architectures=arm64"
+  apt-get $set_apart --quiet update
+  apt-get $set_apart --quiet --yes --no-install-recommends --download-only \
+    install python3.13 libpython3.13-dev libstdc++6 libgomp1
+  mkdir -p "$work/root/usr/lib"
+  ln -sfn usr/lib "$work/root/lib"
+  for package in "$apt"/cache/archives/*.deb; do dpkg-deb --extract "$package" "$work/root"; done
+fi
+
+# What the tests import, without what has no wheel for aarch64 and flies only (scikit-fmm). PyPI's
+# later PyTorch for it wants CUDA.
+if [ ! -e "$work/site/torch" ]; then
+  "$python" -m uv pip install --quiet --target "$work/site" --only-binary :all: \
+    --python-platform aarch64-manylinux_2_40 --python-version 3.13 \
+    drake edt hypothesis joblib lazy-loader lcm matplotlib numpy opencv-python-headless pillow \
+    plyfile pytest pyyaml scipy torch==2.8.0 tqdm trimesh
+fi
+
+mkdir -p "$work/package/splatpilot"
+for part in "$root"/api/splatpilot/*.py "$root/systems" "$root/diagrams" "$root/training" \
+  "$root/analysis"; do
+  ln -sfn "$part" "$work/package/splatpilot/$(basename "$part")"
+done
+cat > "$work/python" <<END
+#!/bin/sh
+PYTHONPATH=$work/package:$work/site exec qemu-aarch64-static -L $work/root \
+  $work/root/usr/bin/python3.13 "\$@"
+END
+chmod +x "$work/python"
+
+cmake -S "$root" -B "$work/build" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
+  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DCMAKE_CXX_FLAGS="-idirafter $work/root/usr/include" \
+  -DPython_EXECUTABLE="$work/python" -DPython_INCLUDE_DIR="$work/root/usr/include/python3.13" \
+  -DCMAKE_LIBRARY_OUTPUT_DIRECTORY="$work/package/splatpilot" \
+  -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)"
+cmake --build "$work/build" --parallel "$(nproc)"
+
+cd "$root"
+[ $# -gt 0 ] || set -- $(cat native/kernel_tests.txt)
+"$work/python" -m pytest -q -p no:cacheprovider "$@"
+echo "aarch64: every test passed"
