@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
         import argcomplete
 
         argcomplete.autocomplete(parser)
-    logging.getLogger("drake").setLevel(logging.WARNING)
+    logging.getLogger("drake").addFilter(_is_warning)
     verb = "splatpilot"
     try:
         with _ended_by_sigterm():
@@ -135,6 +135,11 @@ def _say(message: str, status: int) -> int:
     """Prints a message as one line; returns the status."""
     print(f"splatpilot: {' '.join(message.split())}", file=sys.stderr)
     return status
+
+
+def _is_warning(record: logging.LogRecord) -> bool:
+    """A filter in the place of a level, which Drake sets anew when it is imported."""
+    return record.levelno >= logging.WARNING
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@
 
 The same by commands:
 
-    splatpilot capture check PHOTOS
+    splatpilot view PHOTOS --set scale.camera_height=1.6
     splatpilot reconstruct PHOTOS --set capture.scale.camera_height=1.6 --out out/place/scene
     splatpilot fly --scene out/place/scene --out out/place/flight
 

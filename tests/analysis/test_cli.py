@@ -261,3 +261,15 @@ def test_signals_end_with_one_line(number, status, tmp_path):
     assert flying.wait(60) == status
     assert said.splitlines()[-1].startswith("splatpilot: ") and "Traceback" not in said
     assert not out.exists() or not list(out.iterdir())
+
+
+def test_drake_says_nothing_but_warnings(tmp_path):
+    """Pages are written by a Meshcat that nobody is to connect to, so its address is not told."""
+    script = (
+        "import sys; from splatpilot.analysis.cli import main\n"
+        f"main(['view', 'nowhere', '--out', {str(tmp_path / 'page.html')!r}])\n"
+        "from pydrake.geometry import Meshcat; Meshcat()"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == 0
+    assert ended.stderr.startswith("splatpilot: nowhere") and "Meshcat" not in ended.stderr

@@ -107,7 +107,10 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
         ValueError: if it has no depth, or too little of it to tell.
     """
     if not capture.has_depth:
-        raise ValueError(f"{capture.source}: no depth, so there is nothing to compare")
+        raise ValueError(
+            f"{capture.source}: no depth, so there is nothing to compare; look at its poses and "
+            "points with `splatpilot view`"
+        )
     found = choose_pairs(capture, pairs)
     if sum(len(pair.depth) for pair in found) < _FEWEST:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")

@@ -18,7 +18,7 @@ import torch
 
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.policies import policy_named
-from splatpilot.systems.configuration import load_config
+from splatpilot.systems.configuration import claim_folder, load_config
 from splatpilot.systems.policies import policy_checkpoint
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
@@ -197,6 +197,7 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
     """A folder of another run, and a checkpoint that is none, are named with the remedy."""
     with pytest.raises(ValueError, match="another configuration"):
         run(config=tiny("seed=1"), out=finished, make=TRAINERS.find("diffaero").make)
+    claim_folder(tmp_path / "config.yaml", tiny())
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="delete it to begin anew"):
         run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
