@@ -32,7 +32,7 @@ if [ ! -e "$work/root/usr/bin/python3.13" ]; then
     -o Dir::Cache=$apt/cache -o APT::Architecture=arm64 -o APT::Architectures=arm64"
   apt-get $set_apart --quiet update
   apt-get $set_apart --quiet --yes --no-install-recommends --download-only \
-    install python3.13 libpython3.13-dev libstdc++6 libgomp1
+    install python3.13 libpython3.13-dev libglib2.0-0t64 libgomp1 libstdc++6
   mkdir -p "$work/root/usr/lib"
   ln -sfn usr/lib "$work/root/lib"
   for package in "$apt"/cache/archives/*.deb; do dpkg-deb --extract "$package" "$work/root"; done

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.faults.run import FaultsConfig
 from splatpilot.analysis.fidelity.config import FidelityConfig
 from splatpilot.analysis.places import PlaceConfig
@@ -26,6 +27,7 @@ from splatpilot.diagrams.sensors import SENSORS
 from splatpilot.diagrams.worlds.make_world import WORLDS
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.field_descriptions import describe_fields
+from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.check import CheckConfig
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.corpus.config import CorpusConfig
@@ -97,6 +99,8 @@ def defaults(words: list[str], options: Namespace) -> Any:
             return config()
     if words[0] == "train":
         return TRAINERS.find(options.policies[0]).config()
+    if words[0] == "view" and options.what not in SCENARIOS:
+        return CaptureConfig()
     if words[0] == "recover":
         return TRAINERS.find(options.policy).config()
     scenario = Scenario()
