@@ -6,7 +6,7 @@ from typing import Any
 
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing, require_unused
+from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -40,7 +40,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _reconstruct(options: argparse.Namespace) -> None:
     require_existing(options.capture, "the folder of a capture")
-    require_unused(options.out, options.overwrite)
     from splatpilot.analysis.reconstruction import run as reconstruction
     from splatpilot.systems.configuration import load_config
 

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
+from splatpilot.analysis.reconstruction.measure_scene import SHEET, measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.files import held_folder, require_unused
+from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
 from splatpilot.training.reconstruction.checkpoint import work_folder
@@ -34,11 +36,23 @@ def run(
     config.validate()
     require_renderer(config.device)
     check_scene_target(out)
-    require_unused(Path(out), overwrite)
+    if (Path(out) / SHEET).exists():
+        require_unused(Path(out), overwrite)
     opened = read_capture(capture, config.capture)
+    if not _is_unmeasured(Path(out), opened):
+        require_unused(Path(out), overwrite)
     with held_folder(work_folder(Path(out))):
         summary = reconstruct(opened, out, config, restart=restart)
         print(summary)
         measures = measure_scene(Path(out), opened)
         print(measures)
     return summary, measures
+
+
+def _is_unmeasured(scene: Path, capture: Capture) -> bool:
+    """Whether an interrupted run has left this scene of the capture, and not measured it yet."""
+    if not (scene / "scene.yaml").is_file() or (scene / SHEET).exists():
+        return False
+    metadata = read_scene_metadata(scene)
+    made_of = metadata.capture, metadata.capture_settings
+    return made_of == (capture.folder, capture.config.settings())

@@ -51,7 +51,8 @@ def _fly(folder: Path) -> list[str]:
 
 
 def _reconstruct(folder: Path) -> list[str]:
-    return ["reconstruct", f"{folder}/room", "--out", f"{folder}/out/scene", *_set(*_RECONSTRUCT)]
+    words = ["reconstruct", f"{folder}/room", "--overwrite", "--out", f"{folder}/out/scene"]
+    return [*words, *_set(*_RECONSTRUCT)]
 
 
 def _benchmark(jobs: int) -> Callable[[Path], list[str]]:
@@ -81,7 +82,7 @@ def _ablate(folder: Path) -> list[str]:
 
 
 def _fidelity(folder: Path) -> list[str]:
-    words = ["fidelity", f"{folder}/scene", "--out", f"{folder}/out"]
+    words = ["fidelity", f"{folder}/scene", "--overwrite", "--out", f"{folder}/out"]
     return [*words, *_set(*_RECONSTRUCT, prefix="reconstruct."), "--set", "stretches=[1, 3]"]
 
 

@@ -10,7 +10,7 @@ SHORT = ["--set", "world.length=10", "--set", "world.width=6"]
 @pytest.mark.parametrize(
     ("words", "there"),
     [
-        (["reconstruct", "scene", "--out", "scene"], "scene/scene.yaml"),
+        (["reconstruct", "scene", "--out", "scene"], "scene/views.png"),
         (["measure", "scene"], "scene/metrics.json"),
         (["view", "scene", "--out", "mine"], "mine"),
         (["view", "P02", "--seed", "3"], "out/view/P02-003.html"),

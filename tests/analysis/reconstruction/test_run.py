@@ -65,6 +65,12 @@ def test_what_was_said_of_a_capture_stays_with_its_scene(folder, config, tmp_pat
     assert metadata.capture_settings == ["intrinsics=[32.0, 32.0, 32.0, 24.0]", "depth_unit=500.0"]
     assert read_capture_of(scene, metadata).K[0, 0] == 32
 
+    with pytest.raises(FileExistsError, match=f"{scene} is there already"):
+        run(capture=folder, out=scene, config=config)
+    (scene / "views.png").unlink()  # as a kill while it is measured leaves it
+    run(capture=folder, out=scene, config=config)
+    assert (scene / "metrics.json").read_bytes() == written
+
     capsys.readouterr()
     assert main(["measure", str(scene), "--overwrite"]) == 0
     assert (scene / "metrics.json").read_bytes() == written
