@@ -1,12 +1,12 @@
 #!/bin/sh
-# Builds the native module for aarch64 and runs the tests of its kernels on it, under qemu's emulation
-# of that processor, with Debian's Python and PyPI's packages for it. On Debian, or what keeps its
-# archive's keys, as any user:
+# Builds the native module for aarch64 and runs the tests of its kernels on it, under qemu's
+# emulation of that processor, with Debian's Python and PyPI's packages for it. On Debian, or what
+# keeps its archive's keys, as any user:
 #
 #     apt-get install g++-aarch64-linux-gnu qemu-user-static
 #     native/aarch64.sh [python] [test files]
 #
-# What is downloaded (0.5 GB) and built stays in build/aarch64. Emulation is some twenty times slower.
+# What is downloaded and built stays in build/aarch64. Emulation is slow: imports take minutes.
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 python=${1:-$root/.venv/bin/python}
@@ -20,8 +20,8 @@ for tool in aarch64-linux-gnu-g++ qemu-aarch64-static apt-get cmake; do
   }
 done
 
-# Debian's Python for the emulated machine, unpacked and not installed: an apt of its own, which knows
-# of that processor's packages alone.
+# Debian's Python for the emulated machine, unpacked and not installed: an apt of its own, which
+# knows of that processor's packages alone.
 if [ ! -e "$work/root/usr/bin/python3.13" ]; then
   apt=$work/apt
   mkdir -p "$apt/etc/preferences.d" "$apt/state/lists/partial" "$apt/cache/archives/partial"
