@@ -14,6 +14,9 @@ from typing import Any
 
 import lazy_loader
 
+from splatpilot.systems.numpy_kernels import fix_numpy_kernels
+
+fix_numpy_kernels()
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 

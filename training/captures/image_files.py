@@ -146,7 +146,11 @@ def _decode(file: Path, flags: int) -> NDArray:
 
 
 def _require_content(file: Path) -> None:
-    if not file.is_file():
+    try:
+        there = file.is_file()
+    except OSError as error:  # its name is too long
+        raise ValueError(f"{file.parent}, {file.name[:40]}...: {error.strerror}") from None
+    if not there:
         raise FileNotFoundError(f"{file}: the file is missing")
     if file.stat().st_size == 0:
         raise ValueError(f"{file}: the file is empty; copy it again")

@@ -122,9 +122,12 @@ def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:
 def _image_file(path: Path, name: str) -> Path:
     """Returns the file of an image, whose name may lack its suffix."""
     file = path / name
-    if file.is_file() or file.suffix:
+    try:
+        if file.is_file() or file.suffix:
+            return file
+        return next((f for f in sorted(file.parent.glob(file.name + ".*")) if f.is_file()), file)
+    except (OSError, ValueError, NotImplementedError):  # no name of a file: it is left out
         return file
-    return next((f for f in sorted(file.parent.glob(file.name + ".*")) if f.is_file()), file)
 
 
 def _lens(
