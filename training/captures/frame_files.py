@@ -99,7 +99,10 @@ def open_frames(
     shared = None if all(frame.lens for frame in sound) else lens(*sound[0].size)
     lenses = [frame.lens or shared for frame in sound]
     distinct = [each for each in dict.fromkeys(lenses) if each is not None]
-    camera = common_pinhole(distinct)
+    try:
+        camera = common_pinhole(distinct)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     maps = {each: resampling_maps(each, camera) for each in distinct}
     has_depth = read_depth is not None and any(frame.depth for frame in sound)
 
