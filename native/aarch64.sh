@@ -26,8 +26,9 @@ if [ ! -e "$work/root/usr/bin/python3.13" ]; then
   apt=$work/apt
   mkdir -p "$apt/etc/preferences.d" "$apt/state/lists/partial" "$apt/cache/archives/partial"
   : > "$apt/state/status"
-  echo "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]" \
-    "http://deb.debian.org/debian trixie main" > "$apt/etc/sources.list"
+  mirror=$(apt-get indextargets --format '$(SITE)' 'Created-By: Packages' | grep -m 1 /debian)
+  echo "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg] $mirror trixie main" \
+    > "$apt/etc/sources.list"
   set_apart="-o Dir::Etc=$apt/etc -o Dir::State=$apt/state -o Dir::State::status=$apt/state/status
     -o Dir::Cache=$apt/cache -o APT::Architecture=arm64 -o APT::Architectures=arm64"
   apt-get $set_apart --quiet update

@@ -1,4 +1,4 @@
-"""A place served by viser, which draws Gaussians in browsers over the network."""
+"""A place served by viser, which draws Gaussians in browsers."""
 
 import threading
 from dataclasses import replace
@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 _LARGEST = 200.0  # [m], standard deviation whose square viser's halves can hold
 
 
-def serve_place(place: ShownPlace, host: str = "0.0.0.0", port: int = 8080) -> "viser.ViserServer":
+def serve_place(
+    place: ShownPlace, host: str = "127.0.0.1", port: int = 8080
+) -> "viser.ViserServer":
     """
     Serves what `place_page` shows, but for the ruler, until the server that is returned is stopped.
 
@@ -35,7 +37,7 @@ def serve_place(place: ShownPlace, host: str = "0.0.0.0", port: int = 8080) -> "
 
     Args:
         place: what is shown.
-        host: address at which to listen; all of this machine's by default.
+        host: address at which to listen.
         port: the first to try; the server knows which one it is.
 
     Raises:
