@@ -69,7 +69,7 @@ def _train(folder: Path) -> list[str]:
 
 
 def _tour(folder: Path) -> list[str]:
-    render = _set("width=64", "height=48", "path=[[2, 0, 1.8], [5, 0, 1.8]]", prefix="render.")
+    render = _set("width=64", "height=48", "path=[[1, 0, 1.8], [2, 0, 1.8]]", prefix="render.")
     render += _set("spacing=1", "yaws=[0, 90, 180, -90]", prefix="render.")
     flight = _set("camera.width=64", "camera.height=48", "timeout=1.5", prefix="flight.")
     made = _set(*_RECONSTRUCT, prefix="reconstruct.")
