@@ -28,7 +28,7 @@ from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.systems.array_files import read_archive, reason_of
 from splatpilot.systems.configuration import dump_config, parse_config
-from splatpilot.systems.files import require_existing, require_writable_folder, written_atomically
+from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.read_limit import read_text, require_shallow
 
 FORMAT_VERSION = 1
@@ -109,7 +109,11 @@ class StudyFolder:
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
-        require_existing(file, "a folder that `splatpilot benchmark` has written")
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file}: there is no such file; a study is a folder that `splatpilot benchmark` "
+                "has written"
+            )
         text = read_text(file)
         require_shallow(text, str(file))
         try:
