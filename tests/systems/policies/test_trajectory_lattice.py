@@ -137,7 +137,7 @@ def test_selection_falls_back_to_the_most_distant():
         ({"horizon": 1.55}, "multiple of 0.1 s"),
         ({"num_yaws": 0}, "num_yaws is 0 but must be at least 1"),
         ({"max_pitch": 1.6}, "max_pitch is 1.6 but must be less than pi/2"),
-        ({"margin": -0.1}, "margin is -0.1 but must be at least 0"),
+        ({"margin": -0.1}, "margin is -0.1 but must be 0 to 1e6"),
         ({"speed_fractions": []}, "one or more values"),
         ({"speed_fractions": [0.5, 1.2]}, r"values in \(0, 1\]"),
         ({"num_hypotheses": 600}, "at most 525"),

@@ -101,7 +101,7 @@ def test_images_are_read_once(tmp_path, write_room, iterations):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"iterations": -1}, "iterations is -1"),
+        ({"iterations": -2}, "iterations is -2"),
         ({"max_gaussians": 0}, "max_gaussians is 0, at least 1"),
         ({"max_cell": 3}, "max_cell is 3, a power of two"),
         ({"opacity": 0.0}, r"opacity is 0\.0, it must be in \(0, 1\]"),
