@@ -10,8 +10,7 @@ from splatpilot.diagrams import fly
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import SceneConfig
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.configuration import claim_folder
-from splatpilot.systems.files import holds_folder
+from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig

@@ -23,12 +23,8 @@ from splatpilot.diagrams.meshcat import open_meshcat
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.files import (
-    holds_folder,
-    require_unused,
-    require_writable_folder,
-    written_atomically,
-)
+from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
+from splatpilot.systems.output_folders import holds_folder
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.systems.visualization.video_recorder import VideoRecorder

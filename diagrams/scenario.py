@@ -18,7 +18,7 @@ from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
-_MAX_PIXELS = 4096 * 2304
+_MAX_PIXELS = 4096 * 2304  # the most that H.264 films
 
 # Fields of Drake's CameraConfig about render engines and LCM, which a splat camera has no use for.
 # Its background is the world's, and its depth image is registered with its colour image.

@@ -23,8 +23,9 @@ from splatpilot.diagrams.real_time import run_in_real_time
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.files import holds_folder, require_writable_folder
+from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.messaging.open_lcm import open_lcm
+from splatpilot.systems.output_folders import holds_folder
 
 
 @holds_folder("out")

@@ -22,7 +22,7 @@ done
 
 # Debian's Python for the emulated machine, unpacked and not installed: an apt of its own, which
 # knows of that processor's packages alone.
-if [ ! -e "$work/root/usr/bin/python3.13" ]; then
+if [ ! -e "$work/system/usr/bin/python3.13" ]; then
   apt=$work/apt
   mkdir -p "$apt/etc/preferences.d" "$apt/state/lists/partial" "$apt/cache/archives/partial"
   : > "$apt/state/status"
@@ -34,9 +34,9 @@ if [ ! -e "$work/root/usr/bin/python3.13" ]; then
   apt-get $set_apart --quiet update
   apt-get $set_apart --quiet --yes --no-install-recommends --download-only \
     install python3.13 libpython3.13-dev libglib2.0-0t64 libgomp1 libstdc++6
-  mkdir -p "$work/root/usr/lib"
-  ln -sfn usr/lib "$work/root/lib"
-  for package in "$apt"/cache/archives/*.deb; do dpkg-deb --extract "$package" "$work/root"; done
+  mkdir -p "$work/system/usr/lib"
+  ln -sfn usr/lib "$work/system/lib"
+  for package in "$apt"/cache/archives/*.deb; do dpkg-deb --extract "$package" "$work/system"; done
 fi
 
 # What the tests import, without what has no wheel for aarch64 and flies only (scikit-fmm). PyPI's
@@ -55,14 +55,14 @@ for part in "$root"/api/splatpilot/*.py "$root/systems" "$root/diagrams" "$root/
 done
 cat > "$work/python" <<END
 #!/bin/sh
-PYTHONPATH=$work/package:$work/site exec qemu-aarch64-static -L $work/root \
-  $work/root/usr/bin/python3.13 "\$@"
+PYTHONPATH=$work/package:$work/site exec qemu-aarch64-static -L $work/system \
+  $work/system/usr/bin/python3.13 "\$@"
 END
 chmod +x "$work/python"
 
 cmake -S "$root" -B "$work/build" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
-  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DCMAKE_CXX_FLAGS="-idirafter $work/root/usr/include" \
-  -DPython_EXECUTABLE="$work/python" -DPython_INCLUDE_DIR="$work/root/usr/include/python3.13" \
+  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DCMAKE_CXX_FLAGS="-idirafter $work/system/usr/include" \
+  -DPython_EXECUTABLE="$work/python" -DPython_INCLUDE_DIR="$work/system/usr/include/python3.13" \
   -DCMAKE_LIBRARY_OUTPUT_DIRECTORY="$work/package/splatpilot" \
   -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)"
 cmake --build "$work/build" --parallel "$(nproc)"

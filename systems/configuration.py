@@ -15,7 +15,6 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
 from splatpilot.systems.array_files import reason_of
-from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.read_limit import read_text, require_shallow
 from splatpilot.systems.registry import Registry
 
@@ -85,41 +84,6 @@ def yaml_problem(error: yaml.YAMLError) -> str:
     if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
         return reason_of(error)
     return f"line {error.problem_mark.line + 1}: {reason_of(error.problem)}"
-
-
-def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
-    """
-    Makes the folder of `file` one of what `config` describes, which it may be already, and writes
-    `config` there.
-
-    Args:
-        overwrite: whether the folder may be of something else.
-
-    Returns:
-        The configuration as YAML.
-
-    Raises:
-        ValueError: if the file holds another configuration, or the folder something else.
-        OSError: if it cannot be written.
-    """
-    require_writable_folder(file.parent)
-    text = dump_config(config)
-    if overwrite:
-        pass
-    elif file.exists():
-        if dump_config(load_config(type(config)(), file)) != text:
-            raise ValueError(
-                f"{file} holds another configuration; choose another --out, or the same "
-                "configuration to go on there"
-            )
-    elif there := sorted(p.name for p in file.parent.iterdir() if not p.name.startswith(".")):
-        raise ValueError(
-            f"{file.parent} holds {there[0]} and no {file.name}; choose another --out, or an empty "
-            "folder"
-        )
-    with written_atomically(file) as partial:
-        partial.write_text(text)
-    return text
 
 
 def _resolve_open_fields(config: Any, tags: set[str]) -> None:

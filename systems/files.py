@@ -1,16 +1,12 @@
-"""Files and folders that appear whole or not at all, and whose process at work is known.
+"""Files and folders that appear whole or not at all.
 
 What is being written has a temporary name, `.STEM.HOST.PID.partial.SUFFIX`, beside its place. A
 process that is killed leaves it there; `require_writable_folder`, with which every run begins,
 removes what dead processes of this host have left.
 """
 
-import contextlib
 import ctypes
 import errno
-import fcntl
-import functools
-import inspect
 import os
 import platform
 import re
@@ -84,57 +80,6 @@ def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[
                 _rename_unless_there(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-@contextmanager
-def held_folder(path: Path) -> Iterator[None]:
-    """
-    Makes the folder `path` if need be, and holds it for this process while the block runs; a
-    process that ends in any way no longer holds it. A folder made here that stays empty goes again.
-
-    Raises:
-        OSError: if it cannot be made or written to, or another process holds it; the message says
-            which. Network file systems that know no locks let all in.
-    """
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    require_writable_folder(path)
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OSError(
-                f"{path} is in use by {_holder(descriptor)}; wait until that ends, or choose "
-                "another folder"
-            ) from None
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL):
-                raise
-        yield
-    finally:
-        os.close(descriptor)
-        with contextlib.suppress(OSError):  # unless they are empty
-            for folder in made:
-                folder.rmdir()
-
-
-def holds_folder[**P, Result](
-    argument: str,
-) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
-    """Decorates a function that works in the folder which this argument names: it holds that
-    folder, see `held_folder`."""
-
-    def decorate(function: Callable[P, Result]) -> Callable[P, Result]:
-        signature = inspect.signature(function)
-
-        @functools.wraps(function)
-        def holding(*args: P.args, **keywords: P.kwargs) -> Result:
-            with held_folder(Path(signature.bind(*args, **keywords).arguments[argument])):
-                return function(*args, **keywords)
-
-        return holding
-
-    return decorate
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -252,17 +197,3 @@ def _runs(pid: int) -> bool:
     except PermissionError:
         return True
     return True
-
-
-def _holder(descriptor: int) -> str:
-    """Who holds a folder, as Linux's /proc tells."""
-    status = os.fstat(descriptor)
-    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}"
-    with contextlib.suppress(OSError, IndexError, ValueError):
-        for line in Path("/proc/locks").read_text().splitlines():
-            words = line.split()
-            if words[1] == "FLOCK" and words[5] == f"{device}:{status.st_ino}":
-                pid = int(words[4])
-                command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-                return f"process {pid} ({b' '.join(command[:8]).decode(errors='replace').strip()})"
-    return "another process"

@@ -9,7 +9,8 @@ from typing import Any
 from splatpilot.analysis.benchmark.run import Row, conclude, flights_there
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.systems.files import holds_folder, written_atomically
+from splatpilot.systems.files import written_atomically
+from splatpilot.systems.output_folders import holds_folder
 
 
 @holds_folder("out")

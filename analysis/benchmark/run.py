@@ -20,7 +20,7 @@ from splatpilot.analysis.benchmark.workers import fly_all
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
 from splatpilot.systems.cores import available_cores
-from splatpilot.systems.files import holds_folder
+from splatpilot.systems.output_folders import holds_folder
 from splatpilot.systems.provenance import program
 
 Row = dict[str, Any]

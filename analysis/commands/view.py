@@ -33,7 +33,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     view.add_argument("--seed", type=int, help="seed of a generated world")
     add_overwrite(view)
     view.add_argument(
-        "--viser", action="store_true", help="serve it with viser instead, over the network"
+        "--viser", action="store_true", help="serve it with viser instead of writing a page"
     )
     add_overrides(view, ("world.spacing=2.4", "world.height=8"), _scenario_defaults)
 

@@ -14,8 +14,8 @@ from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import claim_folder
-from splatpilot.systems.files import holds_folder, written_atomically
+from splatpilot.systems.files import written_atomically
+from splatpilot.systems.output_folders import claim_folder, holds_folder
 
 
 def _scenario() -> Scenario:

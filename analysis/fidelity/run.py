@@ -28,8 +28,9 @@ from splatpilot.diagrams.worlds.scene_metadata import (
     write_scene_metadata,
 )
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.configuration import claim_folder, dump_config
-from splatpilot.systems.files import holds_folder, written_atomically
+from splatpilot.systems.configuration import dump_config
+from splatpilot.systems.files import written_atomically
+from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render_capture import true_camera
 from splatpilot.training.reconstruction.measures import mean_measure

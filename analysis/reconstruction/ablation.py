@@ -27,8 +27,9 @@ from splatpilot.analysis.reconstruction.scene_measures import (
 )
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.configuration import claim_folder, dump_config
-from splatpilot.systems.files import holds_folder, written_atomically
+from splatpilot.systems.configuration import dump_config
+from splatpilot.systems.files import written_atomically
+from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_of_scene import read_capture_of

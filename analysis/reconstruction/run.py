@@ -6,7 +6,8 @@ from splatpilot.analysis.reconstruction.measure_scene import SHEET, measure_scen
 from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.files import held_folder, require_unused
+from splatpilot.systems.files import require_unused
+from splatpilot.systems.output_folders import held_folder
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.analysis import view
+from splatpilot.analysis import shown_place, view
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import scenario_file
@@ -86,7 +86,7 @@ def test_scene_without_scale_or_capture_is_shown(place, of_room, monkeypatch):
     def lost(path, metadata):
         raise FileNotFoundError("room: no such folder")
 
-    monkeypatch.setattr(view, "read_capture_of", lost)
+    monkeypatch.setattr(shown_place, "read_capture_of", lost)
     scene = place.scene("scene")
     write_scene_metadata(scene, replace(read_scene_metadata(scene), metric=False))
     data = of_room(scene)
@@ -103,7 +103,7 @@ def test_capture_shows_what_it_measured(place, monkeypatch, tmp_path):
     """Depth becomes Gaussians on the walls; without depth the points of the registration do."""
     folder = tmp_path / "capture"
     folder.mkdir()
-    monkeypatch.setattr(view, "read_capture", lambda path, config: place.capture)
+    monkeypatch.setattr(shown_place, "read_capture", lambda path, config: place.capture)
     data = data_of(view.run(what=str(folder), out=tmp_path / "page.html"))
     assert data["grid"] is None and len(data["cameras"]["poses"]) == 16
     gaussians = capture_gaussians(place.capture, range(16))

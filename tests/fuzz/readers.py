@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ class Reader:
     """Whether a message says what it is about: of the file in a folder."""
 
 
-def _finite(*arrays: Any) -> None:
+def require_finite(*arrays: Any) -> None:
     for array in arrays:
         assert np.isfinite(np.asarray(array, dtype=float)).all(), "values are not finite"
 
@@ -38,25 +37,25 @@ def _see(scene: Any) -> None:
 
     K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
     view = BakedScene(scene).render(K, 16, 12, RigidTransform([1.5, 1.5, -3.0]))
-    _finite(view.color, view.alpha)
+    require_finite(view.color, view.alpha)
     assert not np.isnan(view.depth).any() and view.color.min() >= 0, "the picture is none"
 
 
 def _query(esdf: Any) -> None:
     p_WQ = (esdf.lower_W + esdf.upper_W) / 2
     sample = esdf.query(p_WQ[None])
-    _finite(sample.distance, sample.gradient, esdf.lower_W, esdf.upper_W)
+    require_finite(sample.distance, sample.gradient, esdf.lower_W, esdf.upper_W)
     assert (esdf.upper_W > esdf.lower_W).all(), "the box is empty"
 
 
 def _use_world(world: Any) -> None:
     _see(world.gaussians)
     _query(world.esdf)
-    _finite(world.p_WS, world.p_WG)
+    require_finite(world.p_WS, world.p_WG)
 
 
 def _use_capture(capture: Any) -> None:
-    _finite(capture.K, *(X_WC.GetAsMatrix4() for X_WC in capture.X_WCs))
+    require_finite(capture.K, *(X_WC.GetAsMatrix4() for X_WC in capture.X_WCs))
     assert capture.K[0, 0] > 0 and capture.K[1, 1] > 0, "a focal length is not positive"
     assert len(capture) >= 2 and capture.width > 0 and capture.height > 0, "there is no image"
     for i in range(len(capture)):
@@ -69,7 +68,7 @@ def _use_capture(capture: Any) -> None:
         assert frame.depth.shape == (capture.height, capture.width), "sizes differ"
         assert (frame.depth >= 0).all(), "a depth is negative or none"
     if capture.points is not None:
-        _finite(capture.points.p_WQ, capture.points.colors)
+        require_finite(capture.points.p_WQ, capture.points.colors)
 
 
 def _write_ply(text: bool) -> Callable[[Path], None]:
@@ -166,105 +165,6 @@ def _use_mesh(mesh: Any) -> None:
     assert not np.isnan(frame.depth).any(), "the picture is none"
 
 
-def _scenario(folder: Path) -> Any:
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.systems.configuration import load_config
-
-    scenario = load_config(Scenario(), folder / "scenario.yaml")
-    scenario.validate()
-    return scenario
-
-
-def _write_scenario(folder: Path) -> None:
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.systems.configuration import dump_config
-
-    (folder / "scenario.yaml").write_text(dump_config(Scenario()))
-
-
-def _names_field(message: str, folder: Path) -> bool:
-    """Fields of configurations say which they are: overrides may have set them, and no file."""
-    value = r" (?:is|are|=|times|would|of|leaves|must|has no place) "
-    return str(folder) in message or re.match(rf"^[\w.' ]*?[\w.]+{value}", message) is not None
-
-
-def _use_config(config: Any) -> None:
-    from splatpilot.systems.configuration import dump_config, parse_config
-
-    again = parse_config(type(config)(), dump_config(config), "its own text")
-    assert dump_config(again) == dump_config(config), "it is not what it writes"
-    again.validate()
-
-
-def _write_training(folder: Path) -> None:
-    from splatpilot.systems.configuration import dump_config
-    from splatpilot.training.reconstruction.config import ReconstructConfig
-
-    (folder / "config.yaml").write_text(dump_config(ReconstructConfig()))
-
-
-def _training(folder: Path) -> Any:
-    from splatpilot.systems.configuration import load_config
-    from splatpilot.training.reconstruction.config import ReconstructConfig
-
-    config = load_config(ReconstructConfig(), folder / "config.yaml")
-    config.validate()
-    return config
-
-
-def _write_weights(folder: Path) -> None:
-    from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-    from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-
-    rng = np.random.default_rng(0)
-    weights = {
-        name: rng.normal(scale=0.1, size=shape).astype(np.float32)
-        for name, shape in DIFFAERO_NETWORK.weight_shapes().items()
-    }
-    checkpoint = PolicyCheckpoint("diffaero", DIFFAERO_NETWORK, weights, {"seed": 3})
-    checkpoint.save(folder / "diffaero.npz")
-
-
-def _read_weights(folder: Path) -> Any:
-    from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-    from splatpilot.systems.policies.recurrent_network import load_network
-
-    return load_network(str(folder / "diffaero.npz"), "diffaero", DIFFAERO_NETWORK)
-
-
-def _use_weights(network: Any) -> None:
-    spec = network.spec
-    image = np.ones((spec.image_height, spec.image_width), np.float32)
-    state, hidden = np.ones(spec.state_size, np.float32), np.zeros(spec.hidden_size, np.float32)
-    for _ in range(3):
-        output, hidden = network.step(image, state, hidden)
-        _finite(output, hidden)
-
-
-def _read_study(folder: Path) -> Any:
-    from splatpilot.analysis.benchmark.study_folder import StudyFolder
-    from splatpilot.analysis.benchmark.study_inputs import kept_flights
-
-    study = StudyFolder(folder / "study")
-    specs = study.config().rollouts()
-    assert study.program() and study.shard() is None
-    flights = [study.read(spec) for spec in specs]
-    return study, flights, list(kept_flights(study, specs))
-
-
-def _use_study(read: Any) -> None:
-    from splatpilot.analysis.benchmark.tables import policy_table
-
-    study, flights, kept = read
-    policy_table([row for row, _ in flights], study.config(), 0)
-    for (spec, scenario), (row, arrays) in zip(kept, flights, strict=True):
-        assert row["id"] == spec.id
-        study.read_timing(spec.id)
-        scenario.validate()
-        if arrays:
-            _finite(arrays["times"], arrays["states"])
-
-
 def _read_capture(folder: Path) -> Any:
     from splatpilot.training.captures.read_capture import read_capture
 
@@ -280,15 +180,6 @@ READERS = {
     ),
     "OctoMap": Reader(samples.write_octomap, "*", _read_octomap, _query),
     "glTF": Reader(_write_mesh, "*", _read_mesh, _use_mesh),
-    "scenario": Reader(_write_scenario, "*", _scenario, _use_config, _names_field),
-    "configuration": Reader(_write_training, "*", _training, _use_config, _names_field),
-    "weights": Reader(_write_weights, "*", _read_weights, _use_weights),
-    "study": Reader(
-        samples.write_study,
-        "study/study.yaml study/rollouts/* study/scenarios/* study/timings/*",
-        _read_study,
-        _use_study,
-    ),
     "TartanAir": Reader(samples.write_tartanair, "* */*", _read_capture, _use_capture),
     "TUM": Reader(samples.write_tum, "* */*", _read_capture, _use_capture),
     "7-Scenes": Reader(samples.write_seven_scenes, "*", _read_capture, _use_capture),

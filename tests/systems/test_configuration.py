@@ -8,7 +8,7 @@ from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.make_world import SceneConfig, make_world, register_world
-from splatpilot.systems.configuration import claim_folder, dump_config, load_config, parse_config
+from splatpilot.systems.configuration import dump_config, load_config, parse_config
 
 
 def test_file_and_overrides_set_only_what_they_name(tmp_path):
@@ -190,23 +190,3 @@ def test_type_of_another_package_is_read_and_written():
     assert "world: !DerivedForestConfig" in text
     assert parse_config(Scenario(), text, "dump").world == scenario.world
     assert "!ForestConfig" not in dump_config(Scenario())
-
-
-def test_a_folder_is_of_one_configuration(tmp_path):
-    """A folder is one configuration's, whatever a kill has left in it; for another one, or where
-    something else is, it is refused unless that may be overwritten."""
-    file, other = tmp_path / "mine" / "flight.yaml", tmp_path / "other"
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / ".flight.1.partial.yaml").touch()
-    text = claim_folder(file, Scenario(seed=1))
-    assert claim_folder(file, Scenario(seed=1)) == text == file.read_text()
-    with pytest.raises(ValueError, match=r"flight.yaml holds another configuration; choose"):
-        claim_folder(file, Scenario(seed=2))
-    assert file.read_text() == text
-    claim_folder(file, Scenario(seed=2), overwrite=True)
-    assert load_config(Scenario(), file).seed == 2
-    other.mkdir()
-    (other / "letters").touch()
-    with pytest.raises(ValueError, match=r"other holds letters and no flight.yaml; choose"):
-        claim_folder(other / "flight.yaml", Scenario())
-    assert [path.name for path in other.iterdir()] == ["letters"]

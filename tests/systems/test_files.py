@@ -1,7 +1,6 @@
 """Atomic files."""
 
 import errno
-import os
 import subprocess
 import sys
 import threading
@@ -10,8 +9,6 @@ import pytest
 
 from splatpilot.systems.files import (
     folder_written_atomically,
-    held_folder,
-    holds_folder,
     remove_leftovers,
     require_existing,
     require_unused,
@@ -187,42 +184,3 @@ def test_what_a_kill_has_left_goes_with_the_next_run(tmp_path):
         assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".mine.partial", partial])
     remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".mine.partial", "mine.txt"]
-
-
-def test_second_process_learns_who_holds_a_folder(tmp_path):
-    """A folder is one process's at a time; another is told which, and a kill sets it free."""
-    holding = (
-        "import sys, time; from pathlib import Path\n"
-        "from splatpilot.systems.files import held_folder\n"
-        "with held_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
-    )
-    folder = tmp_path / "out" / "folder"
-    words = [sys.executable, "-c", holding, str(folder)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None and other.stdout.readline() == b"held\n"
-        told = rf"folder is in use by (process {other.pid} \(.*python|another process)"
-        with pytest.raises(OSError, match=told), held_folder(folder):
-            pass
-        other.kill()
-        other.wait()
-    with held_folder(folder):
-        (folder / "file").touch()
-    assert folder.is_dir()
-
-
-def test_folder_that_stays_empty_goes_again(tmp_path):
-    """A run that fails before it has written anything leaves no folder, and none above it."""
-
-    @holds_folder("out")
-    def run(*, out, text):
-        assert out.is_dir()
-        if not text:
-            raise ValueError("nothing to write")
-        (out / "file").write_text(text)
-
-    with pytest.raises(ValueError, match="nothing to write"):
-        run(out=tmp_path / "a" / "b", text="")
-    assert list(tmp_path.iterdir()) == []
-    run(out=tmp_path / "a" / "b", text="something")
-    assert (tmp_path / "a" / "b" / "file").read_text() == "something"
-    assert os.access(tmp_path / "a", os.W_OK)

@@ -20,7 +20,8 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 from splatpilot.systems.configuration import dump_config, load_config
-from splatpilot.systems.files import held_folder, require_writable_folder, written_atomically
+from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.output_folders import held_folder
 from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame

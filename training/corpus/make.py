@@ -6,10 +6,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from splatpilot.systems.configuration import claim_folder
 from splatpilot.systems.cores import available_cores
-from splatpilot.systems.files import holds_folder, require_writable_folder
+from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.provenance import revision
 from splatpilot.training.corpus.config import CorpusConfig

@@ -22,9 +22,9 @@ from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.configuration import claim_folder
-from splatpilot.systems.files import folder_written_atomically, holds_folder, written_atomically
+from splatpilot.systems.files import folder_written_atomically, written_atomically
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.corpus import Corpus

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 import torch
 
-from splatpilot.systems.configuration import claim_folder
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.output_folders import claim_folder
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.provenance import revision
 

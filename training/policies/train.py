@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from splatpilot.systems.files import holds_folder
+from splatpilot.systems.output_folders import holds_folder
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.device import require_device
 from splatpilot.training.event_log import event_log

@@ -83,18 +83,11 @@ def surface_loss_torch(
 
 
 class _NativeSurfaceLoss(torch.autograd.Function):
+    """`surface_loss_torch`."""
+
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        seen: Tensor,
-        draws: Tensor,
-        viewmat: Tensor,
-        K: Tensor,
-        depth: Tensor,
-    ) -> Tensor:
+    def forward(ctx: Any, *arguments: Tensor) -> Tensor:
+        means, quats, scales, seen, draws, viewmat, K, depth = arguments
         gaussians = [values.detach().contiguous() for values in (means, quats, scales)]
         ctx.gradients = [torch.zeros_like(values) for values in gaussians]
         arrays = [values.numpy() for values in (*gaussians, *ctx.gradients)]

@@ -11,7 +11,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import Cylinder, HalfSpace, Shape
-from splatpilot.systems.configuration import claim_folder
+from splatpilot.systems.output_folders import claim_folder
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import CONFIG

@@ -18,7 +18,8 @@ import torch
 
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.policies import policy_named
-from splatpilot.systems.configuration import claim_folder, load_config
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.output_folders import claim_folder
 from splatpilot.systems.policies import policy_checkpoint
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
