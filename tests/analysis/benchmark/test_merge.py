@@ -64,7 +64,7 @@ def test_killed_shard_is_refused_until_it_is_finished(study, shards, tmp_path, c
     command += ["benchmark", "--scenarios", config.scenarios[0], "--seeds", "3", "--jobs", "1"]
     command += ["--policies", ",".join(config.policies), "--shard", "1/2", "--out", str(killed)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while process.poll() is None and not list(killed.glob("rollouts/*.npz")):
+    while process.poll() is None and not list(killed.glob("rollouts/[!.]*.npz")):
         time.sleep(0.005)
     process.kill()
     assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"

@@ -60,11 +60,11 @@ def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_pat
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    while process.poll() is None and not list(out.glob("rollouts/*.npz")):
+    while process.poll() is None and not list(out.glob("rollouts/[!.]*.npz")):
         time.sleep(0.005)
     process.kill()
     assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
-    flown = {path.name: path.stat().st_mtime_ns for path in out.glob("rollouts/*.npz")}
+    flown = {path.name: path.stat().st_mtime_ns for path in out.glob("rollouts/[!.]*.npz")}
     assert 0 < len(flown) < 6
     assert not (out / "report.html").exists()
 
