@@ -171,6 +171,22 @@ def _read_capture(folder: Path) -> Any:
     return read_capture(folder)
 
 
+def _read_photographs(folder: Path) -> Any:
+    from splatpilot.training.captures.capture_config import CaptureConfig
+    from splatpilot.training.captures.photographs import read_photographs
+
+    config = CaptureConfig(cache=str(folder / "cache"))
+    return folder, read_photographs(folder, config)
+
+
+def _use_photographs(read: Any) -> None:
+    from splatpilot.training.captures.photographs import one_camera, photographs_in
+
+    folder, capture = read
+    one_camera([file for file in photographs_in(folder) if file.name in capture.frame_names])
+    _use_capture(capture)
+
+
 READERS = {
     "PLY, binary": Reader(_write_ply(False), "*", _read_ply, _see),
     "PLY, ASCII": Reader(_write_ply(True), "*", _read_ply, _see),
@@ -194,6 +210,12 @@ READERS = {
         "sparse/0/*",
         _read_capture,
         _use_capture,
+    ),
+    "photographs": Reader(
+        samples.write_photographs,
+        "images/* cache/model/*",
+        _read_photographs,
+        _use_photographs,
     ),
 }
 """By name."""

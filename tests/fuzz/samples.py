@@ -118,6 +118,22 @@ def write_colmap(folder: Path, *, text: bool = False) -> None:
         model.write(folder / "sparse" / "0")
 
 
+def write_photographs(folder: Path) -> None:
+    """Photographs that say what took them, and the registration that is kept of them."""
+    from PIL import Image
+
+    write_colmap(folder)
+    (folder / "cache").mkdir()
+    (folder / "sparse" / "0").rename(folder / "cache" / "model")
+    (folder / "sparse").rmdir()
+    exif = Image.Exif()
+    exif[0x0110] = "a camera"
+    exif.get_ifd(0x8769)[0x920A] = 4.5
+    for file in (folder / "images").iterdir():
+        with Image.open(file) as photograph:
+            photograph.save(file, exif=exif)
+
+
 def write_octomap(folder: Path) -> None:
     """A tree with an occupied voxel, free ones beside it and a free cube, by hand."""
     masks = [3 << 14] + [3] * 13 + [3 | 1 << 2] + [2 | 1 << 2 | 1 << 4 | 1 << 6]

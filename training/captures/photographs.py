@@ -60,7 +60,7 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     names = [file.name for file in files]
     model = _cache(files, config) / "model"
     if not model.is_dir():
-        _register(folder, names, _one_camera(files), model)
+        _register(folder, names, one_camera(files), model)
     reconstruction = read_model(model)
     registered = {image.name for image in reconstruction.images.values() if image.has_pose}
     dropped += [
@@ -89,7 +89,7 @@ def _cache(files: list[Path], config: CaptureConfig) -> Path:
     return Path(home) / "splatpilot" / "photographs" / key.hexdigest()[:16]
 
 
-def _one_camera(files: list[Path]) -> bool:
+def one_camera(files: list[Path]) -> bool:
     """Tells whether size, camera model and focal length are the same in all photographs."""
     kinds = set()
     for file in files:
