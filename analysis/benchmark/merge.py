@@ -35,7 +35,8 @@ def run(*, out: Path, shards: list[Path]) -> list[Row]:
     parts = _by_number([StudyFolder(path) for path in shards])
     first = next(iter(parts.values()))
     config, program = first.config(), first.program()
-    flown = {file.stem for part in parts.values() for file in part.path.glob("scenarios/[!.]*.yaml")}
+    files = (file for part in parts.values() for file in part.path.glob("scenarios/[!.]*.yaml"))
+    flown = {file.stem for file in files}
     if not flown:
         raise FileNotFoundError("nothing was flown: no shard had the scene of any scenario")
     rows: dict[str, Row] = {}

@@ -79,6 +79,12 @@ class Esdf:
         if lower_W.shape != (3,) or not np.isfinite(lower_W).all():
             raise ValueError(f"Esdf: lower_W is {lower_W}; needed are 3 finite coordinates [m].")
         upper_W = lower_W + voxel_size * np.array(distances.shape)
+        # A grid whose voxels vanish beside its coordinates has no inside.
+        if not (upper_W - lower_W > voxel_size).all() or not np.isfinite(upper_W).all():
+            raise ValueError(
+                f"Esdf: voxels of {voxel_size} m at {lower_W} m make no box; the numbers cannot "
+                "tell its ends apart."
+            )
         for array in (distances, states, lower_W, upper_W):
             array.flags.writeable = False
         set_field = object.__setattr__  # The class is frozen; these are its construction.

@@ -148,8 +148,8 @@ def _decode(file: Path, flags: int) -> NDArray:
 def _require_content(file: Path) -> None:
     try:
         there = file.is_file()
-    except OSError as error:  # its name is too long
-        raise ValueError(f"{file.parent}, {file.name[:40]}...: {error.strerror}") from None
+    except OSError as error:  # its name is too long, or that of a folder
+        raise ValueError(f"{str(file)[:200]}...: {error.strerror}; name it as it is") from None
     if not there:
         raise FileNotFoundError(f"{file}: the file is missing")
     if file.stat().st_size == 0:

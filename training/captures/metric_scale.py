@@ -18,6 +18,10 @@ from splatpilot.training.captures.upright import (
 
 _FEWEST = 20
 """Points whose depth must be known for a scale."""
+_MAX_TILT = 10.0
+"""[deg] of a ground against what level cameras call level."""
+_MAX_SPREAD = 0.25
+"""Of the cameras' heights over a ground, 10 to 90 %, relative to their median."""
 
 
 def make_metric(
@@ -81,12 +85,23 @@ def camera_height(capture: Capture) -> float:
     """Returns the median height of the cameras above the ground, in the capture's units.
 
     Raises:
-        ValueError: if no ground can be found, see `fit_ground` and `known_points`.
+        ValueError: if no ground can be found, see `fit_ground` and `known_points`; or if it is
+            none that the cameras were carried over at one height, each about level.
     """
     cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     up = up_of_cameras(list(capture.X_WCs))
     n, d = fit_ground(known_points(capture), cameras, up)
-    return float(np.median(cameras @ n - d))
+    tilt = float(np.rad2deg(np.arccos(min(n @ up, 1.0))))
+    low, median, high = np.quantile(cameras @ n - d, [0.1, 0.5, 0.9])
+    spread = float((high - low) / median)
+    if tilt > _MAX_TILT or not (median > 0 and spread < _MAX_SPREAD):
+        raise ValueError(
+            f"{capture.source}: what looks most like ground tilts by {tilt:.0f} degrees against "
+            f"the cameras, whose heights over it vary by {spread:.0%} (at most {_MAX_TILT:g} "
+            f"degrees and {_MAX_SPREAD:.0%} are believed), so that a height gives no scale; "
+            "measure a length: scale.between and scale.distance"
+        )
+    return float(median)
 
 
 def _factor_from_depth(capture: Capture) -> float:

@@ -127,7 +127,7 @@ class ReconstructConfig:
     """CPU threads of the renderer, which do not change the result; 0 for all cores."""
     checkpoint_every: int = 1000
     """Steps between checkpoints, from which an interrupted run goes on."""
-    measure_every: int = 500
+    measure_every: int = 1000
     """Steps between measurements on the withheld frames."""
     tensorboard: str = ""
     """Folder for these measurements in the format of tensorboard, which must be installed; empty

@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 
@@ -7,7 +8,9 @@ import pycolmap
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
+from splatpilot.training.captures.metric_scale import camera_height
 from splatpilot.training.captures.photographs import read_photographs
 from splatpilot.training.captures.read_capture import read_capture
 
@@ -94,6 +97,24 @@ def test_camera_height(model, room_poses):
     height = np.median([X_WC.translation()[2] for X_WC in room_poses])
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(camera_height=float(height))))
     np.testing.assert_allclose(lengths(capture), true_lengths(room_poses), rtol=1e-3)
+
+
+@pytest.mark.parametrize("turn", [RotationMatrix.MakeXRotation, RotationMatrix.MakeYRotation])
+def test_ground_that_cameras_contradict(model, turn):
+    """A slope of 20 degrees under cameras that are level and at one height gives no scale; one of 5
+    degrees far below them does, and is as far as it is.
+    """
+    level = read_capture(model)
+    centre = np.mean([X_WC.translation() for X_WC in level.X_WCs], axis=0)
+
+    def over_slope(degrees: float, depth: float) -> Capture:
+        p_SQ = np.random.default_rng(0).uniform([-5, -5, 0], [5, 5, 0], (500, 3))
+        p_WQ = centre + turn(np.deg2rad(degrees)).multiply(p_SQ.T).T - [0, 0, depth]
+        return dataclasses.replace(level, points=SfmPoints(p_WQ, np.zeros((500, 3))))
+
+    assert camera_height(over_slope(5, 2.0)) == pytest.approx(2.0, rel=0.05)
+    with pytest.raises(ValueError, match=r"castle: what looks .* tilts by (19|20|21) degrees"):
+        camera_height(over_slope(20, 2.0))
 
 
 def test_distance_between_points(model, K, room_views, room_poses):
