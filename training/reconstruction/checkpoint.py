@@ -43,8 +43,7 @@ class Checkpoint:
     def __init__(self, out: Path, config: ReconstructConfig, views: ReconstructionViews):
         self.folder = work_folder(out)
         self.file = self.folder / "checkpoint.pt"
-        fields = asdict(config)
-        self._config = {name: fields[name] for name in fields if name not in _INDIFFERENT}
+        self._config = _deciding(config)
         digest = hashlib.sha256()
         for tensor in (views.images, views.depths, views.viewmats, views.K, views.gains):
             digest.update(tensor.numpy().tobytes())
@@ -67,24 +66,9 @@ class Checkpoint:
         Raises:
             ValueError: if the file is damaged, or belongs to another configuration or capture.
         """
-        if not self.file.exists():
+        content = _read(self.file, self._config)
+        if content is None:
             return None
-        try:
-            content = torch.load(self.file, weights_only=True)
-        except Exception as error:  # of a damaged file, the unpickler may raise anything
-            reason = (str(error) or type(error).__name__).splitlines()[0]
-            raise ValueError(
-                f"{self.file}: not a readable checkpoint ({reason}); {_REMEDY}"
-            ) from None
-        if content.get("version") != VERSION:
-            raise ValueError(f"{self.file}: written by another version of the program; {_REMEDY}")
-        for name, value in self._config.items():
-            kept = content["config"].get(name)
-            if kept != value:
-                raise ValueError(
-                    f"{self.file}: an interrupted run with {name} {kept}, not {value}; "
-                    f"set it so to go on; or {_REMEDY}"
-                )
         if content["capture"] != self._capture:
             raise ValueError(
                 f"{self.file}: an interrupted run on another capture, or its files have changed; "
@@ -95,6 +79,41 @@ class Checkpoint:
     def remove(self) -> None:
         """Removes the work folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def require_same_run(out: Path, config: ReconstructConfig) -> None:
+    """Checks what an interrupted run has left beside `out`, before anything slow is prepared.
+
+    Raises:
+        ValueError: if that is damaged, or of another configuration.
+    """
+    _read(work_folder(out) / "checkpoint.pt", _deciding(config))
+
+
+def _deciding(config: ReconstructConfig) -> dict[str, Any]:
+    fields = asdict(config)
+    return {name: fields[name] for name in fields if name not in _INDIFFERENT}
+
+
+def _read(file: Path, config: dict[str, Any]) -> dict[str, Any] | None:
+    """What a file holds, which must be of a run with `config`; None if there is no file."""
+    if not file.exists():
+        return None
+    try:
+        content = torch.load(file, weights_only=True)
+    except Exception as error:  # of a damaged file, the unpickler may raise anything
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{file}: not a readable checkpoint ({reason}); {_REMEDY}") from None
+    if content.get("version") != VERSION:
+        raise ValueError(f"{file}: written by another version of the program; {_REMEDY}")
+    for name, value in config.items():
+        kept = content["config"].get(name)
+        if kept != value:
+            raise ValueError(
+                f"{file}: an interrupted run with {name} {kept}, not {value}; "
+                f"set it so to go on; or {_REMEDY}"
+            )
+    return content
 
 
 _REMEDY = "start anew with --restart, which discards it"

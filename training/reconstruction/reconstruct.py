@@ -16,7 +16,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.reconstruction.checkpoint import Checkpoint
+from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_same_run
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.environment import learn_background
 from splatpilot.training.reconstruction.initialization import (
@@ -102,6 +102,8 @@ def reconstruct(
     config.validate()
     check_scene_target(out)
     config = resolve_config(config, capture)
+    if not restart and config.iterations:
+        require_same_run(out, config)
     every = config.hold_out if config.iterations else 0
     held_out = list(range(0, len(capture), every)) if every else []
     fitted = [i for i in range(len(capture)) if i not in held_out]

@@ -84,12 +84,14 @@ def assert_same_scene(tmp_path, room, out) -> None:
 
 
 def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_room, monkeypatch):
-    """After `kill -9`, another configuration or capture is refused, and the same command goes on
-    from the checkpoint and writes the same bytes as a run that was not interrupted."""
+    """After `kill -9`, another configuration is refused before an image is read, another capture
+    too, and the same command goes on from the checkpoint and writes the same bytes as a run that
+    was not interrupted."""
     out = tmp_path / "scene"
     kill_a_run(tmp_path, room, out, "step")
+    unread = replace(read_capture(room), load_image=lambda i: pytest.fail("an image was read"))
     with pytest.raises(ValueError, match=r"with depth_weight 0\.2, not 0\.3; .* --restart"):
-        reconstruct(read_capture(room), out, replace(CONFIG, depth_weight=0.3))
+        reconstruct(unread, out, replace(CONFIG, depth_weight=0.3))
     other = write_room(tmp_path / "other", brightness=lambda i, rho: np.full(1, 0.9))
     with pytest.raises(ValueError, match="an interrupted run on another capture"):
         reconstruct(read_capture(other), out, CONFIG)
