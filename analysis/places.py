@@ -36,8 +36,11 @@ PLACES = {
     "bookstore": Place(
         "worlds/bookstore.gltf", ("render.up=z", "reconstruct.initial_gaussians=160000")
     ),
+    # Halls and buildings: colours push Gaussians about in steps that grow with the cameras' extent,
+    # and those that start from exact depth have hardly to move.
     "warehouse": Place(
-        "worlds/warehouse.gltf", ("render.up=z", "reconstruct.initial_gaussians=160000")
+        "worlds/warehouse.gltf",
+        ("render.up=z", "reconstruct.initial_gaussians=160000", "reconstruct.means_rate=4e-5"),
     ),
     "hospital_building": Place(
         "worlds/hospital_building.gltf",
@@ -49,6 +52,7 @@ PLACES = {
             "reconstruct.initial_gaussians=300000",
             "reconstruct.max_gaussians=300000",
             "reconstruct.iterations=10000",
+            "reconstruct.means_rate=4e-5",
         ),
     ),
     "forest_splat": Place("P02"),

@@ -22,10 +22,9 @@ class TourConfig:
 
     render: RenderConfig = field(default_factory=lambda: RenderConfig(spacing=0.8, apart=4.0))
     # Places through which one flies are larger than those that one looks at: voxels of which the
-    # planner can search a whole hall in seconds. Rendered depth is exact, so that Gaussians which
-    # start from it have hardly to move.
+    # planner can search a whole hall in seconds.
     reconstruct: ReconstructConfig = field(
-        default_factory=lambda: ReconstructConfig(voxel_size=0.1, means_rate=4e-5)
+        default_factory=lambda: ReconstructConfig(voxel_size=0.1)
     )
     flight: Scenario = field(default_factory=Scenario)  # its world is the reconstruction
 
