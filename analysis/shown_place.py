@@ -19,10 +19,7 @@ from splatpilot.diagrams.worlds.scene_metadata import FRONTIER, read_scene_metad
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.splats.gaussian_ply import read_ply
-from splatpilot.systems.visualization.drawing import (
-    GOAL_COLOR,
-    START_COLOR,
-)
+from splatpilot.systems.visualization.drawing import GOAL_COLOR, START_COLOR
 from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -43,7 +40,6 @@ def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownP
         what: a scene folder, a PLY, the folder of a capture, or a scenario.
         seed: of a generated world; that of its scenario if None.
         overrides: FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
-
 
     Raises:
         FileNotFoundError, ValueError, OSError: if there is no such place or it is damaged, or

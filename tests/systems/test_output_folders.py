@@ -1,3 +1,5 @@
+"""Folders that commands write into: whose they are, and who holds them."""
+
 import os
 import subprocess
 import sys

@@ -36,7 +36,7 @@ _MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "../images", "../../images", "")
 _NEAREST = 20.0
 """[px], how far a point that is meant by a pixel may be from it."""
-_FARTHEST = 1e12
+_LARGEST_COORDINATE = 1e12
 """Coordinates of points, beyond which they are a mistake of the file and left out."""
 
 
@@ -160,7 +160,7 @@ def capture_of_model(
         return reconstruction.points3D[seen[int(np.argmin(distance))].point3D_id].xyz
 
     points = list(reconstruction.points3D.values())
-    points = [point for point in points if (np.abs(point.xyz) < _FARTHEST).all()]
+    points = [point for point in points if (np.abs(point.xyz) < _LARGEST_COORDINATE).all()]
     if points:
         capture = dataclasses.replace(
             capture,

@@ -149,7 +149,9 @@ def _require_content(file: Path) -> None:
     try:
         there = file.is_file()
     except OSError as error:  # its name is too long, or that of a folder
-        raise ValueError(f"{str(file)[:200]}...: {error.strerror}; name it as it is") from None
+        raise ValueError(
+            f"{str(file)[:200]}...: {error.strerror}; correct the name where it is listed"
+        ) from None
     if not there:
         raise FileNotFoundError(f"{file}: the file is missing")
     if file.stat().st_size == 0:

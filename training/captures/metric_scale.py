@@ -93,13 +93,12 @@ def camera_height(capture: Capture) -> float:
     n, d = fit_ground(known_points(capture), cameras, up)
     tilt = float(np.rad2deg(np.arccos(min(n @ up, 1.0))))
     low, median, high = np.quantile(cameras @ n - d, [0.1, 0.5, 0.9])
-    spread = float((high - low) / median)
-    if tilt > _MAX_TILT or not (median > 0 and spread < _MAX_SPREAD):
+    if tilt > _MAX_TILT or not high - low < _MAX_SPREAD * median:
         raise ValueError(
             f"{capture.source}: what looks most like ground tilts by {tilt:.0f} degrees against "
-            f"the cameras, whose heights over it vary by {spread:.0%} (at most {_MAX_TILT:g} "
-            f"degrees and {_MAX_SPREAD:.0%} are believed), so that a height gives no scale; "
-            "measure a length: scale.between and scale.distance"
+            f"the cameras (at most {_MAX_TILT:g} are believed), which are {low:.3g} to {high:.3g} "
+            f"units above it, {median:.3g} in the middle (less than {_MAX_SPREAD:.0%} of it apart); "
+            "a height gives no scale; measure a length: scale.between and scale.distance"
         )
     return float(median)
 

@@ -13,6 +13,7 @@ from splatpilot.training.reconstruction.views import ReconstructionViews
 from splatpilot.training.tensor_files import save_tensors
 
 VERSION = 2
+_REMEDY = "start anew with --restart, which discards it"
 # What may differ when an interrupted run goes on, for it changes nothing that is computed.
 _INDIFFERENT = (
     "threads",
@@ -31,6 +32,10 @@ def work_folder(out: Path) -> Path:
     return out.with_name(f".{out.name}.partial")
 
 
+def _checkpoint_file(out: Path) -> Path:
+    return work_folder(out) / "checkpoint.pt"
+
+
 class Checkpoint:
     """The one file in which an optimisation is kept while it runs, in a work folder beside `out`.
 
@@ -42,8 +47,8 @@ class Checkpoint:
 
     def __init__(self, out: Path, config: ReconstructConfig, views: ReconstructionViews):
         self.folder = work_folder(out)
-        self.file = self.folder / "checkpoint.pt"
-        self._config = _deciding(config)
+        self.file = _checkpoint_file(out)
+        self._config = _compared_fields(config)
         digest = hashlib.sha256()
         for tensor in (views.images, views.depths, views.viewmats, views.K, views.gains):
             digest.update(tensor.numpy().tobytes())
@@ -87,10 +92,10 @@ def require_same_run(out: Path, config: ReconstructConfig) -> None:
     Raises:
         ValueError: if that is damaged, or of another configuration.
     """
-    _read(work_folder(out) / "checkpoint.pt", _deciding(config))
+    _read(_checkpoint_file(out), _compared_fields(config))
 
 
-def _deciding(config: ReconstructConfig) -> dict[str, Any]:
+def _compared_fields(config: ReconstructConfig) -> dict[str, Any]:
     fields = asdict(config)
     return {name: fields[name] for name in fields if name not in _INDIFFERENT}
 
@@ -114,6 +119,3 @@ def _read(file: Path, config: dict[str, Any]) -> dict[str, Any] | None:
                 f"set it so to go on; or {_REMEDY}"
             )
     return content
-
-
-_REMEDY = "start anew with --restart, which discards it"

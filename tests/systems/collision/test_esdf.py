@@ -249,6 +249,7 @@ CONSERVATIVE = half_known_field().conservative()
         ({"voxel_size": np.nan}, "voxel size is nan"),
         ({"lower_W": np.zeros(2)}, "3 finite coordinates"),
         ({"lower_W": np.array([0.0, np.inf, 0.0])}, "3 finite coordinates"),
+        ({"lower_W": np.full(3, 1e20)}, "make no box"),
     ],
 )
 def test_bad_grids_are_refused(change, message):

@@ -196,6 +196,26 @@ def test_missing_parts(model):
         read_capture(model)
 
 
+def test_points_beyond_all_measure_are_left_out(model):
+    """A point at 1e300, of a damaged file, is left out; the others stay."""
+    count = len(read_capture(model).points.p_WQ)
+    reconstruction = pycolmap.Reconstruction(model / "sparse" / "0")
+    next(iter(reconstruction.points3D.values())).xyz = [0, 1e300, 0]
+    reconstruction.write(model / "sparse" / "0")
+    assert len(read_capture(model).points.p_WQ) == count - 1
+
+
+def test_image_name_that_no_file_system_takes(model):
+    """A name of 5000 letters, of a damaged file, is told shortened."""
+    reconstruction = pycolmap.Reconstruction(model / "sparse" / "0")
+    for image in list(reconstruction.images.values())[1:]:
+        image.name = "n" * 5000
+    reconstruction.write(model / "sparse" / "0")
+    with pytest.raises(ValueError, match="File name too long") as caught:
+        read_capture(model)
+    assert len(str(caught.value)) < 1000
+
+
 def test_registered_photographs_are_not_registered_again(tmp_path, K, room_views):
     """Photographs whose registration lies in the cache open as its model, and those that it lacks
     are left out by name."""
