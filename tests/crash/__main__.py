@@ -34,7 +34,11 @@ def main() -> int:
                 if each.wrong:
                     print(f"    {each.way} at {each.moment}: {each.wrong}", flush=True)
     wrong = sum(bool(each.wrong) for each in rounds)
-    print(f"{len(rounds) - wrong} of {len(rounds)} rounds lost nothing")
+    missed = sum(each.missed for each in rounds)
+    print(
+        f"{len(rounds) - wrong} of {len(rounds)} rounds lost nothing; in {missed} of them the "
+        "command had ended by itself before its moment"
+    )
     return 1 if wrong else 0
 
 

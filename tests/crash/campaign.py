@@ -34,6 +34,8 @@ class Round(NamedTuple):
     there was room for, as a fraction of the largest that the command writes."""
     wrong: str
     """What is wrong; empty where nothing is."""
+    missed: bool
+    """Whether the command had ended by itself before that moment, or had room enough."""
 
 
 class Campaign:
@@ -96,7 +98,7 @@ class Campaign:
             wrong = f"differs: {differing[:3]}" if differing else ""
         left = [path.name for path in folder.rglob("*.partial*")]
         wrong = wrong or (f"left: {left[:3]}" if left else "")
-        return Round(name, way, round(moment, 3), wrong)
+        return Round(name, way, round(moment, 3), wrong, ended.returncode == 0)
 
 
 def digests(verb: Verb, folder: Path) -> dict[str, str]:

@@ -97,7 +97,7 @@ def camera_height(capture: Capture) -> float:
         raise ValueError(
             f"{capture.source}: what looks most like ground tilts by {tilt:.0f} degrees against "
             f"the cameras (at most {_MAX_TILT:g} are believed), which are {low:.3g} to {high:.3g} "
-            f"units above it, {median:.3g} in the middle (less than {_MAX_SPREAD:.0%} of it apart); "
+            f"units above it, {median:.3g} in the middle (at most {_MAX_SPREAD:.0%} of it apart); "
             "a height gives no scale; measure a length: scale.between and scale.distance"
         )
     return float(median)
