@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.soft_barrier import soft_barrier
-from splatpilot.systems.policies.trajectory_lattice import rotation_to, velocity_fan
+from splatpilot.systems.policies.motion_primitives import rotation_to, velocity_fan
 from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS

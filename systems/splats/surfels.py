@@ -1,6 +1,6 @@
 """2D Gaussian splatting (surfels; Huang et al. 2024): native on the CPU, gsplat on CUDA."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,12 +10,7 @@ from splatpilot import _native
 from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import check_camera, create_renderer
 from splatpilot.systems.splats.depth_normals import depth_to_normals
-from splatpilot.systems.splats.rasterization_autograd import (
-    gradient_arguments,
-    joined,
-    scene_arguments,
-    scene_arrays,
-)
+from splatpilot.systems.splats.rasterization_autograd import joined
 from splatpilot.systems.splats.rasterization_checks import (
     by_name,
     check_device,
@@ -24,10 +19,14 @@ from splatpilot.systems.splats.rasterization_checks import (
     check_values,
     pair_meta,
 )
+from splatpilot.systems.splats.surfels_autograd import (
+    RasterizeSurfels,
+    SurfelView,
+    draw_surfels,
+)
 
 DEPTH_MODES = ("expected", "median")
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-IMAGES = {"color": 3, "normal": 3, "depth": 1, "alpha": 1, "median": 1, "distort": 1}  # channels
 
 
 def rasterize_surfels(
@@ -116,7 +115,7 @@ def rasterize_surfels(
     check_device(means)
     if Ks.requires_grad:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
-    view = _View(
+    view = SurfelView(
         renderer=create_renderer() if renderer is None else renderer,
         intrinsics=[
             check_camera(K, width, height, near_plane, far_plane) for K in Ks.detach().numpy()
@@ -134,10 +133,10 @@ def rasterize_surfels(
     # The third scale is not read; whatever it is, it is no error.
     check_values(arrays, view.renderer, scale_axes=2)
     wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
-    drawing = _draw(view, arrays, keep=wants_gradients)
+    drawing = draw_surfels(view, arrays, keep=wants_gradients)
     images = drawing.images
     if wants_gradients:
-        images = _Rasterize.apply(view, drawing, *scene)
+        images = RasterizeSurfels.apply(view, drawing, *scene)
     color, normal, depth, alpha, median, distort = images
 
     parts, surface = [], None
@@ -153,107 +152,6 @@ def rasterize_surfels(
     meta = _meta(drawing.projected, arrays["opacities"], width, height)
     meta["render_distort"] = distort
     return image, alpha, normal, surface, distort, median, meta
-
-
-class _View(NamedTuple):
-    """C cameras and how to render them."""
-
-    renderer: _native.Renderer
-    intrinsics: list[np.ndarray]  # C x (3, 3) float64 [px]
-    poses: np.ndarray  # (C, 4, 4) X_CW, float64
-    width: int
-    height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    sh_degree: int | None
-    distort: bool
-
-
-class _Drawing(NamedTuple):
-    """Images of C cameras, and what remains of them."""
-
-    images: tuple[Tensor, ...]  # (C, H, W, channels) in the order of IMAGES
-    frames: list[_native.SurfelFrame]
-    projected: list[tuple]  # of each camera, see `_native.projected_surfels`
-
-
-def _draw(view: _View, arrays: dict[str, np.ndarray], keep: bool) -> _Drawing:
-    """Renders; with `keep`, a backward pass can start from the frames."""
-    size = (len(view.poses), view.height, view.width)
-    images = {name: torch.empty((*size, channels)) for name, channels in IMAGES.items()}
-    if not view.distort:
-        images["distort"].zero_()
-    drawing = _Drawing(tuple(images.values()), [], [])
-    for c in range(len(view.poses)):
-        outputs: dict[str, Any] = {name: image[c].numpy() for name, image in images.items()}
-        if not view.distort:
-            outputs["distort"] = None
-        frame = _native.render_surfels(
-            view.renderer,
-            **scene_arguments(arrays, view.sh_degree, c),
-            K=view.intrinsics[c],
-            X_CW=view.poses[c],
-            width=view.width,
-            height=view.height,
-            near_plane=view.near_plane,
-            far_plane=view.far_plane,
-            radius_clip=view.radius_clip,
-            **outputs,
-            keep=keep,
-        )
-        drawing.frames.append(frame)
-        drawing.projected.append(_native.projected_surfels(view.renderer, frame))
-    return drawing
-
-
-class _Rasterize(torch.autograd.Function):
-    """(means, quats, scales, opacities, colors, viewmats) -> images in the order of IMAGES."""
-
-    @staticmethod
-    def forward(ctx, view: _View, drawing: _Drawing, *inputs: Tensor) -> tuple[Tensor, ...]:
-        # The frames alone: an output that its own node refers to is never freed.
-        ctx.view, ctx.frames = view, drawing.frames
-        ctx.save_for_backward(*inputs)
-        ctx.set_materialize_grads(False)
-        if not view.distort:
-            ctx.mark_non_differentiable(drawing.images[-1])
-        return drawing.images
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *v_images: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
-        view: _View = ctx.view
-        inputs = ctx.saved_tensors
-        v_inputs = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
-        arrays, gradients = scene_arrays(inputs), scene_arrays(v_inputs)
-        if not view.distort:
-            v_images = (*v_images[:-1], None)
-        given = [None if v is None else v.contiguous() for v in v_images]
-        for c, X_CW in enumerate(view.poses):
-            of_camera: dict[str, Any] = {
-                f"v_{name}": None if v is None else v[c].numpy()
-                for name, v in zip(IMAGES, given, strict=True)
-            }
-            by_camera = _native.surfels_backward(
-                view.renderer,
-                ctx.frames[c],
-                **scene_arguments(arrays, view.sh_degree, c),
-                **of_camera,
-                **gradient_arguments(gradients, view.sh_degree, c),
-            )
-            v_inputs[5][c] = torch.from_numpy(_viewmat_gradient(by_camera, X_CW))
-        return None, None, *v_inputs
-
-
-def _viewmat_gradient(by_camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:
-    """Adds to the gradient of R and t that of the camera centre, -R^-1 t."""
-    gradient = np.zeros((4, 4))
-    R_inverse = np.linalg.inv(X_CW[:3, :3])
-    through_centre = -R_inverse.T @ by_camera[4]
-    gradient[:3, :3] = by_camera[:3] + np.outer(through_centre, -R_inverse @ X_CW[:3, 3])
-    gradient[:3, 3] = by_camera[3] + through_centre
-    return gradient
 
 
 def _check_options(render_mode: str, depth_mode: str, distloss: bool, radius_clip: float) -> None:

@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -127,22 +127,31 @@ def _run(
         if limit:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    with tempfile.TemporaryFile("w+") as err:
-        process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=err, env=environment, preexec_fn=forbid
-        )
-        if way:
-            try:
-                process.wait(after)
-            except subprocess.TimeoutExpired:
-                if way == "no permission":
-                    _set_writable(folder, False)
-                else:
-                    process.send_signal(signal.SIGKILL if way == "kill -9" else signal.SIGTERM)
-        process.wait()
-        _set_writable(folder, True)
-        err.seek(0)
-        return subprocess.CompletedProcess(words, process.returncode, "", err.read())
+    # What it says goes through a pipe: a file would be as full as any other.
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        preexec_fn=forbid,
+    )
+    said: list[str] = []
+    assert process.stderr is not None
+    listener = threading.Thread(target=said.extend, args=(process.stderr,), daemon=True)
+    listener.start()
+    if way:
+        try:
+            process.wait(after)
+        except subprocess.TimeoutExpired:
+            if way == "no permission":
+                _set_writable(folder, False)
+            else:
+                process.send_signal(signal.SIGKILL if way == "kill -9" else signal.SIGTERM)
+    process.wait()
+    listener.join(1.0)  # longer where something that it has started lives on
+    _set_writable(folder, True)
+    return subprocess.CompletedProcess(words, process.returncode, "", "".join(said))
 
 
 def _set_writable(folder: Path, writable: bool) -> None:

@@ -8,6 +8,7 @@ import dataclasses
 import signal
 import sys
 import threading
+from os.path import isfile  # false, too, of names that no file system takes
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -80,7 +81,7 @@ def read_colmap(path: Path, config: CaptureConfig) -> Capture:
     if not names:
         raise ValueError(f"{model}: the COLMAP model has no images")
     for folder in _IMAGE_FOLDERS:
-        if any((path / folder / name).is_file() for name in names):
+        if any(isfile(path / folder / name) for name in names):
             return capture_of_model(path, "COLMAP model", reconstruction, path / folder, config)
     raise FileNotFoundError(
         f"{path}: none of the model's images, such as {names[0]}, is in {path / 'images'} or here"
@@ -186,4 +187,4 @@ def _lens(camera: "pycolmap.Camera", config: CaptureConfig) -> Lens:
 def _depth_file(folder: Path, name: str) -> Path | None:
     stem = folder / Path(name).stem
     files = (stem.with_name(stem.name + suffix) for suffix in (".npy", ".png"))
-    return next((file for file in files if file.is_file()), None)
+    return next((file for file in files if isfile(file)), None)

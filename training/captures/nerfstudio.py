@@ -9,6 +9,7 @@ Whether lengths are metres the file does not say: they are taken to be if there 
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
+from os.path import isfile  # false, too, of names that no file system takes
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +124,9 @@ def _image_file(path: Path, name: str) -> Path:
     """Returns the file of an image, whose name may lack its suffix."""
     file = path / name
     try:
-        if file.is_file() or file.suffix:
+        if isfile(file) or file.suffix:
             return file
-        return next((f for f in sorted(file.parent.glob(file.name + ".*")) if f.is_file()), file)
+        return next((f for f in sorted(file.parent.glob(file.name + ".*")) if isfile(f)), file)
     except (OSError, ValueError, NotImplementedError):  # no name of a file: it is left out
         return file
 
@@ -180,7 +181,7 @@ def _smaller_depth_camera(
     """Returns the camera of depth of another resolution than the images; None if it is the same."""
     for frame in frames:
         lens = frame.lens
-        if frame.depth is None or lens is None or not frame.depth.is_file():
+        if frame.depth is None or lens is None or not isfile(frame.depth):
             continue
         if depth_size(frame.depth) == (lens.width, lens.height):
             return None

@@ -9,6 +9,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.depth_fusion import DepthFusion
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_from_depth import (
     bounds_of_depth_images,
@@ -118,13 +119,11 @@ def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
 @pytest.mark.parametrize("voxel_size", [0.1, 0.037])
 def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch, voxel_size):
     """The field is the same, bit for bit, when no block is skipped."""
-    from splatpilot.systems.collision import esdf_from_depth
-
     depths, X_WCs = capture
     box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
     skipping = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
     monkeypatch.setattr(
-        esdf_from_depth.DepthFusion,
+        DepthFusion,
         "visible_blocks",
         lambda self, depth, K, center_C, max_range: np.arange(len(center_C)),
     )

@@ -1,40 +1,15 @@
 import numpy as np
 import pytest
-from numpy.polynomial import Polynomial
 
+from splatpilot.systems.policies.motion_primitives import rotation_to
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import (
     LatticeConfig,
     Trajectories,
     TrajectoryLattice,
     final_velocities,
-    quintic_basis,
-    rotation_to,
-    select_distinct,
 )
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-
-
-@pytest.mark.parametrize("derivative", [0, 1, 2])
-def test_quintics_meet_their_boundary_states(derivative):
-    """At both ends position, velocity and acceleration are those asked for."""
-    basis = quintic_basis(np.array([0.0, 1.7]), 1.7, derivative)
-    expected = np.zeros((2, 6))
-    expected[0, derivative] = expected[1, 3 + derivative] = 1.0
-    np.testing.assert_allclose(basis, expected, atol=1e-13)
-
-
-@pytest.mark.parametrize("derivative", [0, 1, 2, 3])
-def test_quintics_equal_the_polynomial(derivative):
-    """Any quintic polynomial is reproduced, with its derivatives, from its boundary states."""
-    polynomial = Polynomial([0.3, -1.0, 2.0, 0.7, -0.4, 0.09])
-    times, horizon = np.linspace(0.0, 2.0, 21), 2.0
-    boundary = [polynomial.deriv(order)(t) for t in (0.0, horizon) for order in range(3)]
-    np.testing.assert_allclose(
-        quintic_basis(times, horizon, derivative) @ boundary,
-        polynomial.deriv(derivative)(times) if derivative else polynomial(times),
-        atol=1e-11,
-    )
 
 
 def test_fan_of_final_velocities():
@@ -50,17 +25,6 @@ def test_fan_of_final_velocities():
     pitch = np.arcsin(velocities[:-1, 2] / speeds)
     assert pitch.max() == pytest.approx(0.5) == pytest.approx(-pitch.min())
     assert np.any(np.all(np.abs(velocities - [1, 0, 0]) < 1e-12, axis=1))
-
-
-@pytest.mark.parametrize("direction", [[3, 0, 0], [-1, 2, 0.5], [0, 0, 2], [0, 0, -1], [0, 0, 0]])
-def test_lattice_frame(direction):
-    """The frame is a rotation whose x axis is the direction and whose y axis is level."""
-    direction = np.array(direction, dtype=float)
-    R_WL = rotation_to(direction)
-    np.testing.assert_allclose(R_WL.T @ R_WL, np.eye(3), atol=1e-14)
-    assert np.linalg.det(R_WL) == pytest.approx(1.0)
-    np.testing.assert_allclose(R_WL[:, 0] * np.linalg.norm(direction), direction, atol=1e-14)
-    assert R_WL[2, 1] == 0.0
 
 
 def test_trajectories_keep_their_ends(pillar):
@@ -117,16 +81,6 @@ def test_best_are_in_order_and_distinct(pillar):
     for i in range(5):
         for j in range(i):
             assert np.linalg.norm(positions[i] - positions[j], axis=1).mean() > 0.35
-
-
-def test_selection_falls_back_to_the_most_distant():
-    """Where no trajectory is distinct any more the most distant ones fill up, none twice."""
-    positions = np.array([0.0, 0.01, 0.02, 1.0, 0.03])[:, None, None] * np.ones((5, 4, 3))
-    costs = np.array([1.0, 2.0, 3.0, 9.0, 4.0])
-    np.testing.assert_array_equal(select_distinct(positions, costs, 3, 0.35), [0, 4, 3])
-    np.testing.assert_array_equal(select_distinct(positions, costs, 5, 0.35), [0, 1, 2, 4, 3])
-    alike = np.zeros((3, 4, 3))
-    np.testing.assert_array_equal(select_distinct(alike, costs[:3], 3, 0.35), [0, 1, 2])
 
 
 @pytest.mark.parametrize(

@@ -198,3 +198,14 @@ def test_bad_matrix_is_left_out(write):
     (path / "transforms.json").write_text(json.dumps(content))
     capture = read_capture(path)
     assert len(capture) == 9 and "frame 2 (./02.png): transform_matrix" in capture.dropped[0]
+
+
+def test_depth_name_that_no_file_system_takes(write):
+    """A frame whose depth has a name of 5000 letters is left out, and told shortened."""
+    path = write()
+    content = json.loads((path / "transforms.json").read_text())
+    content["frames"][0]["depth_file_path"] = "n" * 5000
+    (path / "transforms.json").write_text(json.dumps(content))
+    capture = read_capture(path)
+    assert len(capture) == 9
+    assert "File name too long" in capture.dropped[0] and len(capture.dropped[0]) < 1000

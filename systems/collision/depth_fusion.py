@@ -1,0 +1,169 @@
+"""Fusion of depth images into truncated signed distances on a grid (Curless and Levoy 1996)."""
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
+
+# Voxels along the edge of a block, the unit in which what a camera cannot see is skipped.
+_BLOCK = 8
+# Blocks fused at once.
+_CHUNK = 1024
+# Surfaces seen at a grazing angle count as if seen at this cosine at least.
+_MIN_COSINE = 0.15
+# Truncations behind a surface, along the optical axis, in which a pixel still speaks.
+_MAX_DEPTH_BEHIND = 2.0
+
+
+class DepthFusion:
+    """Weighted averages of truncated signed distances, kept in blocks of _BLOCK^3 voxels."""
+
+    def __init__(
+        self, lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float, truncation: float
+    ) -> None:
+        self.shape = grid_shape(lower_W, upper_W, voxel_size)
+        self.truncation = truncation
+        self.blocks = tuple(-(-n // _BLOCK) for n in self.shape)
+        count = int(np.prod(self.blocks))
+        self.weighted = np.zeros((count, _BLOCK**3), dtype=np.float32)  # sum of weight * distance
+        self.weight = np.zeros((count, _BLOCK**3), dtype=np.float32)
+        edge = _BLOCK * voxel_size
+        block = np.stack(np.unravel_index(np.arange(count), self.blocks), -1)
+        voxel = np.stack(np.unravel_index(np.arange(_BLOCK**3), (_BLOCK,) * 3), -1)
+        self.block_center_W = np.asarray(lower_W, float) + (block + 0.5) * edge  # (B, 3) [m]
+        self.from_center_W = (voxel + 0.5) * voxel_size - 0.5 * edge  # (_BLOCK^3, 3) [m]
+        self.block_radius = 0.5 * np.sqrt(3.0) * edge
+
+    def add(self, depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, max_range: float) -> None:
+        R_CW = X_WC.rotation().matrix().T
+        center_C = (self.block_center_W - X_WC.translation()) @ R_CW.T  # (B, 3)
+        from_center_C = (self.from_center_W @ R_CW.T).astype(np.float32)
+        visible = self.visible_blocks(depth, K, center_C, max_range)
+        cosine = _cosine_of_incidence(depth, K).ravel()
+        height, width = depth.shape
+        depth = depth.ravel()
+        truncation = np.float32(self.truncation)
+        for start in range(0, len(visible), _CHUNK):
+            block = visible[start : start + _CHUNK]
+            center = center_C[block].astype(np.float32)
+            x, y, z = (center[:, axis, None] + from_center_C[:, axis] for axis in range(3))
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                column = x * (np.float32(K[0, 0]) / z) + np.float32(K[0, 2])
+                row = y * (np.float32(K[1, 1]) / z) + np.float32(K[1, 2])
+            seen = (z > 0.0) & (x * x + y * y + z * z <= max_range**2)
+            seen &= (column >= 0.0) & (column < width) & (row >= 0.0) & (row < height)
+            pixel = np.where(seen, row, 0.0).astype(np.intp) * width
+            pixel += np.where(seen, column, 0.0).astype(np.intp)
+            surface, weight = depth.take(pixel), cosine.take(pixel)
+            before = surface - z
+            distance = np.minimum(before * weight, truncation)
+            seen &= (surface > 0.0) & (distance >= -truncation)
+            # Far behind a grazing tangent plane is not behind the surface any more.
+            seen &= before >= np.float32(-_MAX_DEPTH_BEHIND) * truncation
+            weight *= seen
+            self.weight[block] += weight
+            distance *= weight
+            self.weighted[block] += distance
+
+    def grids(self) -> tuple[np.ndarray, np.ndarray]:
+        """The average distance (nx, ny, nz) [m] and where there is one (nx, ny, nz)."""
+        seen = self.weight > 0.0
+        np.divide(self.weighted, self.weight, out=self.weighted, where=seen)
+        return self._as_grid(self.weighted), self._as_grid(seen)
+
+    def _as_grid(self, values: np.ndarray) -> np.ndarray:
+        bx, by, bz = self.blocks
+        nx, ny, nz = self.shape
+        values = values.reshape(bx, by, bz, _BLOCK, _BLOCK, _BLOCK).transpose(0, 3, 1, 4, 2, 5)
+        values = values.reshape(bx * _BLOCK, by * _BLOCK, bz * _BLOCK)
+        return np.ascontiguousarray(values[:nx, :ny, :nz])
+
+    def visible_blocks(
+        self, depth: np.ndarray, K: np.ndarray, center_C: np.ndarray, max_range: float
+    ) -> np.ndarray:
+        """The indices of the blocks that may hold a voxel the image sees.
+
+        A block is a ball that covers at most 2 x 2 pixels in one of the images of farthest depths,
+        each of which halves the one before.
+        """
+        height, width = depth.shape
+        radius = self.block_radius
+        near, far = center_C[:, 2] - radius, center_C[:, 2] + radius
+        in_range = np.linalg.norm(center_C, axis=1) < max_range + radius
+        possible = np.flatnonzero((far > 0.0) & in_range)
+        x, y, z = center_C[possible].T
+        near = near[possible]
+        # In the plane z > 0 the ball lies between the rays of slope (x +- s) / z; one that reaches
+        # behind the camera may cover any pixel.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.where(near > 0.0, radius / near, np.inf)
+            spread_x = K[0, 0] * reach * np.sqrt(1.0 + (x / z) ** 2)
+            spread_y = K[1, 1] * reach * np.sqrt(1.0 + (y / z) ** 2)
+            column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+            around = near <= 0.0
+            left = np.where(around, 0.0, np.clip(column - spread_x, 0.0, width))
+            right = np.where(around, width, np.clip(column + spread_x, 0.0, width))
+            top = np.where(around, 0.0, np.clip(row - spread_y, 0.0, height))
+            bottom = np.where(around, height, np.clip(row + spread_y, 0.0, height))
+        in_view = (right > left) & (bottom > top)
+        possible, near = possible[in_view], near[in_view]
+        left, right, top, bottom = (side[in_view] for side in (left, right, top, bottom))
+        size = np.maximum(right - left, bottom - top)
+        level_of = np.ceil(np.log2(np.maximum(size, 1.0))).astype(int)
+        seen = np.zeros(len(possible), dtype=bool)
+        farthest = depth
+        for level in range(int(level_of.max(initial=0)) + 1):
+            of_level = np.flatnonzero(level_of == level)
+            last_row, last_column = farthest.shape[0] - 1, farthest.shape[1] - 1
+            rows = [np.minimum(side[of_level] / 2**level, last_row) for side in (top, bottom)]
+            columns = [np.minimum(side[of_level] / 2**level, last_column) for side in (left, right)]
+            for r in rows:
+                for c in columns:
+                    reached = farthest[r.astype(int), c.astype(int)]
+                    seen[of_level] |= near[of_level] < reached + _MAX_DEPTH_BEHIND * self.truncation
+            farthest = _halve(farthest)
+        return possible[seen]
+
+
+def _halve(image: np.ndarray) -> np.ndarray:
+    """The maximum over squares of 2 x 2 pixels, ((H + 1) // 2, (W + 1) // 2)."""
+    image = np.pad(image, [(0, n % 2) for n in image.shape])
+    image = np.maximum(image[::2], image[1::2])
+    return np.maximum(image[:, ::2], image[:, 1::2])
+
+
+def ray_slopes(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x / z (W,) and y / z (H,) of the rays through the pixels of an image of shape (H, W)."""
+    height, width = shape
+    x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+    return x, y
+
+
+def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """n . (u, v, 1) at each pixel, with n the surface's unit normal and (u, v, 1) the pixel's ray.
+
+    It turns a difference in depth into a distance from the surface's tangent plane. In normalised
+    image coordinates (u, v) a plane n . X = c has the inverse depth w = n . (u, v, 1) / c, so
+    n / c = (w_u, w_v, w - u w_u - v w_v). Of the slopes to the two neighbours along each axis the
+    smaller is taken, which stays on the pixel's own surface at a silhouette.
+
+    Returns:
+        (H, W) float32, from _MIN_COSINE to the length of the ray; the former where unknown.
+    """
+    valid = (depth > 0.0) & np.isfinite(depth)
+    w = np.where(valid, 1.0 / np.where(valid, depth, 1.0), np.float32(np.nan)).astype(np.float32)
+    u, v = (slopes.astype(np.float32) for slopes in ray_slopes(depth.shape, K))
+    v = v[:, None]
+
+    def slope(axis: int, focal_length: float) -> np.ndarray:
+        missing = np.full_like(w.take([0], axis), np.nan)
+        step = np.diff(w, axis=axis) * np.float32(focal_length)
+        ahead = np.concatenate([step, missing], axis)
+        behind = np.concatenate([missing, step], axis)
+        ahead = np.where(np.isnan(ahead), behind, ahead)
+        return np.where(np.abs(behind) < np.abs(ahead), behind, ahead)
+
+    w_u, w_v = slope(1, K[0, 0]), slope(0, K[1, 1])
+    length = np.sqrt(w_u**2 + w_v**2 + (w - u * w_u - v * w_v) ** 2)
+    return np.fmax(w / length, np.float32(_MIN_COSINE))
