@@ -102,7 +102,10 @@ def read_model(model: Path) -> "pycolmap.Reconstruction":
 
     check_records(model, num_params)
     try:
-        return pycolmap.Reconstruction(model)
+        reconstruction = pycolmap.Reconstruction(model)
+        for image in reconstruction.images.values():
+            _ = image.name  # which may be no UTF-8
+        return reconstruction
     except Exception as error:  # pycolmap raises what its C++ raises
         raise ValueError(f"{model}: not a readable COLMAP model ({reason_of(error)})") from None
 

@@ -207,6 +207,17 @@ def test_points_beyond_all_measure_are_left_out(model):
     assert len(after.p_WQ) == len(before.p_WQ) - 1
 
 
+def test_image_name_that_is_no_text(model):
+    """A name that is no UTF-8 is a mistake of the model, which is named."""
+    pycolmap.Reconstruction(model / "sparse" / "0").write_text(model / "sparse" / "0")
+    for file in (model / "sparse" / "0").glob("*.bin"):
+        file.unlink()
+    listed = model / "sparse/0/images.txt"
+    listed.write_bytes(listed.read_bytes().replace(b"03.png", b"\xb5.png"))
+    with pytest.raises(ValueError, match=r"sparse/0: not a readable COLMAP model \(.*utf-8"):
+        read_capture(model)
+
+
 def test_image_name_that_no_file_system_takes(model):
     """A name of 5000 letters, of a damaged file, is told shortened."""
     reconstruction = pycolmap.Reconstruction(model / "sparse" / "0")
