@@ -40,8 +40,15 @@ class _ImportModule(argparse.Action):
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
-class _TerminatedError(KeyboardInterrupt):
-    """SIGTERM has come: ends everything as Ctrl-C does."""
+_ENDED = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 130)}
+
+
+class _EndedError(KeyboardInterrupt):
+    """A signal has come that ends everything."""
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.number = signal.Signals(number)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -90,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.getLogger("drake").addFilter(_is_warning)
     verb = "splatpilot"
     try:
-        with _ended_by_sigterm():
+        with _ended_by_signals():
             options = parser.parse_args(arguments)
             verb = options.verb_name
             if not getattr(options, "json", False):
@@ -119,10 +126,10 @@ def main(arguments: list[str] | None = None) -> int:
         )
     except OverflowError as error:
         return _say(f"a number given to {verb} is too large ({error}); give a smaller one", 1)
-    except _TerminatedError:
-        return _say("terminated", 143)
+    except _EndedError as ended:
+        return _say(*_ENDED[ended.number])
     except KeyboardInterrupt:
-        return _say("interrupted", 130)
+        return _say(*_ENDED[signal.SIGINT])
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error, verb)):
             return _say(missing, 1)
@@ -143,17 +150,30 @@ def _is_warning(record: logging.LogRecord) -> bool:
 
 
 @contextlib.contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """Within, SIGTERM ends what runs as Ctrl-C does; signals reach the main thread alone."""
+def _ended_by_signals() -> Iterator[None]:
+    """Within, SIGTERM and Ctrl-C raise `_EndedError`; signals reach the main thread alone."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    came: list[int] = []
 
     def end(number: int, frame: FrameType | None) -> None:
-        raise _TerminatedError
+        came.append(number)
+        raise _EndedError(number)
 
-    before = signal.signal(signal.SIGTERM, end)
+    # Whoever started this may have it ignore Ctrl-C, as a shell does with what runs behind it.
+    heeded = [
+        number
+        for number in _ENDED
+        if number != signal.SIGINT or signal.getsignal(number) is signal.default_int_handler
+    ]
+    before = {number: signal.signal(number, end) for number in heeded}
     try:
         yield
+    except Exception as error:
+        if came:  # native code has made another exception of it, as imports do
+            raise _EndedError(came[0]) from error
+        raise
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

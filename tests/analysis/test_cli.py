@@ -263,6 +263,29 @@ def test_signals_end_with_one_line(number, status, tmp_path):
     assert not out.exists() or not list(out.iterdir())
 
 
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signal_of_which_an_import_makes_another_error(
+    number, status, tmp_path, monkeypatch, capsys
+):
+    """A signal that comes while native code is imported, which answers with an error of its own,
+    is a signal all the same."""
+    (tmp_path / "interrupted.py").write_text(
+        "import signal\n"
+        "try:\n"
+        f"    signal.raise_signal({int(number)})\n"
+        "except KeyboardInterrupt:\n"
+        "    raise ImportError('a core of it failed to import')\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["--import", "interrupted", "doctor"]) == status
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_drake_says_nothing_but_warnings(tmp_path):
     """Pages are written by a Meshcat that nobody is to connect to, so its address is not told."""
     script = (
