@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from splatpilot.analysis.bug_report import write_report
 from splatpilot.analysis.commands import COMMANDS
@@ -77,6 +77,14 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def run() -> NoReturn:
+    """The command `splatpilot`: `main`, before and after which signals end the process in the same
+    way, but at once."""
+    for number in _heeded():
+        signal.signal(number, _leave)
+    sys.exit(main())
+
+
 def main(arguments: list[str] | None = None) -> int:
     """
     Runs `splatpilot VERB ...`.
@@ -138,6 +146,18 @@ def main(arguments: list[str] | None = None) -> int:
         return _say(f"{verb} met a mistake of the program ({kind}); the report is {report}", 70)
 
 
+def _heeded() -> list[int]:
+    """The signals that end this process. Whoever started it may have it ignore them, as shells do
+    with what runs behind them."""
+    return [number for number in _ENDED if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    message, status = _ENDED[signal.Signals(number)]
+    os.write(2, f"splatpilot: {message}\n".encode())
+    os._exit(status)
+
+
 def _say(message: str, status: int) -> int:
     """Prints a message as one line; returns the status."""
     print(f"splatpilot: {' '.join(message.split())}", file=sys.stderr)
@@ -161,13 +181,7 @@ def _ended_by_signals() -> Iterator[None]:
         came.append(number)
         raise _EndedError(number)
 
-    # Whoever started this may have it ignore Ctrl-C, as a shell does with what runs behind it.
-    heeded = [
-        number
-        for number in _ENDED
-        if number != signal.SIGINT or signal.getsignal(number) is signal.default_int_handler
-    ]
-    before = {number: signal.signal(number, end) for number in heeded}
+    before = {number: signal.signal(number, end) for number in _heeded()}
     try:
         yield
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What is shown of a scene, a PLY, a capture or a generated world."""
+"""What is shown of a scene, a file of Gaussians, a capture or a generated world."""
 
 import shlex
 from collections.abc import Sequence
@@ -13,12 +13,14 @@ from pydrake.geometry import Rgba
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.make_world import make_world, place_config
+from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_folder
 from splatpilot.diagrams.worlds.scene_metadata import FRONTIER, read_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.splats.gaussian_ply import read_ply
+from splatpilot.systems.splats.splat_files import SUFFIXES, read_splats
 from splatpilot.systems.visualization.drawing import GOAL_COLOR, START_COLOR
 from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace
 from splatpilot.training.captures.capture import Capture
@@ -37,7 +39,8 @@ def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownP
     """What is shown of a place.
 
     Args:
-        what: a scene folder, a PLY, the folder of a capture, or a scenario.
+        what: a scene folder, a file of Gaussians, an OctoMap, the folder of a capture, or a
+            scenario.
         seed: of a generated world; that of its scenario if None.
         overrides: FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
 
@@ -50,23 +53,27 @@ def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownP
         return _generated(scenario)
     if seed is not None:
         raise ValueError(f"--seed {seed}: {what} is no generated world; leave the seed out")
-    scene = path.suffix.lower() == ".ply" or (path / "scene.yaml").is_file()
+    scene = path.suffix.lower() in SUFFIXES or (path / "scene.yaml").is_file()
     if not scene:
         return _capture(path, overrides)
     if overrides:
         raise ValueError(f"--set {overrides[0]}: a finished scene has no settings; leave it out")
-    return _scene(path) if path.is_dir() else _ply(path)
+    return _scene(path) if path.is_dir() else _gaussians(path)
 
 
 def generated_scenario(path: Path, seed: int | None, overrides: Sequence[str]) -> Scenario | None:
-    """The scenario whose generated world is meant, or None for a folder or a PLY.
+    """The scenario whose generated world or OctoMap is meant, or None for a folder or a file of
+    Gaussians.
 
     Raises:
         FileNotFoundError, ValueError: see `load_config`.
     """
-    if path.is_dir() or path.suffix.lower() == ".ply":
+    if path.is_dir() or path.suffix.lower() in SUFFIXES:
         return None
-    scenario = load_config(Scenario(), scenario_file(str(path)), list(overrides))
+    if path.suffix.lower() == OCTOMAP:
+        scenario = load_config(Scenario(world=place_config(path)), None, list(overrides))
+    else:
+        scenario = load_config(Scenario(), scenario_file(str(path)), list(overrides))
     return scenario if seed is None else replace(scenario, seed=seed)
 
 
@@ -100,11 +107,11 @@ def _scene(path: Path) -> ShownPlace:
     )
 
 
-def _ply(path: Path) -> ShownPlace:
+def _gaussians(path: Path) -> ShownPlace:
     try:
         world = read_scene(path)
     except ValueError as error:
-        gaussians = read_ply(path)
+        gaussians = read_splats(path)
         lower_W, upper_W = _bounds(gaussians.means)
         notes = (f"Without distances, start and goal: {error}.",)
         return ShownPlace(

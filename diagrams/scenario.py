@@ -120,7 +120,12 @@ def _check_camera(camera: CameraConfig) -> None:
     valid = camera.width > 1 and camera.height > 1 and pixels <= _MAX_PIXELS
     size = f"{camera.width}x{camera.height} pixels"
     _check("camera", size, valid, f"at least 2x2 and at most {_MAX_PIXELS} pixels")
-    focal = (camera.focal_x(), camera.focal_y())
+    try:
+        focal = (camera.focal_x(), camera.focal_y())
+    except RuntimeError:  # Drake's way to say that there is neither
+        raise ValueError(
+            "camera.focal is without x and y; it must have one of them at least"
+        ) from None
     _check("camera.focal", focal, all(0 < f < inf for f in focal), "positive and finite [pixels]")
     center = camera.principal_point()
     valid = np.all((center > 0) & (center < [camera.width, camera.height]))

@@ -49,7 +49,7 @@ if [ ! -e "$work/site/torch" ]; then
 fi
 
 mkdir -p "$work/package/splatpilot"
-for part in "$root"/api/splatpilot/*.py "$root/systems" "$root/diagrams" "$root/training" \
+for part in "$root"/api/splatpilot/*.py* "$root/systems" "$root/diagrams" "$root/training" \
   "$root/analysis"; do
   ln -sfn "$part" "$work/package/splatpilot/$(basename "$part")"
 done

@@ -142,6 +142,7 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
     """
     require_shallow(text, source)
     try:
+        _require_finite(text)
         tokens = [token for token in yaml.scan(text) if isinstance(token, yaml.TagToken)]
         _resolve_open_fields(config, {token.value[1] for token in tokens})
         _check_names(config, yaml.load(text, _NamesLoader), "")
@@ -156,6 +157,18 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
         unknown = _UNKNOWN_TAG.fullmatch(str(error).partition("\n")[0])
         reason = _known_tags(unknown) if unknown else reason_of(error)
         raise ValueError(f"{source}: {reason}") from None
+
+
+def _require_finite(text: str) -> None:
+    """Raises ValueError for a YAML text in which something stands within itself."""
+    open_nodes: list[str | None] = []
+    for event in yaml.parse(text):
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append(event.anchor)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            open_nodes.pop()
+        elif isinstance(event, yaml.AliasEvent) and event.anchor in open_nodes:
+            raise ValueError(f"line {event.start_mark.line + 1}: *{event.anchor} is within itself")
 
 
 _UNKNOWN_TAG = re.compile(r"The yaml type tag value '(.*)' did not match .* for '(.*)' \((.*)\)$")

@@ -35,8 +35,9 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scene",
         type=Path,
-        metavar="DIR_OR_PLY",
-        help="fly in this scene folder, or PLY in metres, z up",
+        metavar="DIR_OR_FILE",
+        help="fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; metres, z up) or "
+        "OctoMap (.bt)",
     )
     parser.add_argument("--seed", type=int, help="seed of the world and the start")
     add_overrides(
@@ -72,7 +73,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     from splatpilot.diagrams.policies import DEFAULT_SPEED, at_speed
     from splatpilot.diagrams.scenario import Scenario
     from splatpilot.diagrams.scenario_files import scenario_file
-    from splatpilot.diagrams.worlds.make_world import SceneConfig
+    from splatpilot.diagrams.worlds.make_world import place_config
     from splatpilot.systems.configuration import load_config
 
     file = None if options.scenario is None else scenario_file(options.scenario)
@@ -82,7 +83,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     if options.speed is not None:
         scenario.policy = at_speed(scenario.policy, options.speed)
     if options.scene is not None:
-        scenario.world = SceneConfig(path=str(require_scene(str(options.scene)).absolute()))
+        scenario.world = place_config(require_scene(str(options.scene)).absolute())
     if options.seed is not None:
         scenario.seed = options.seed
     return load_config(scenario, overrides=options.overrides)

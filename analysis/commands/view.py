@@ -17,7 +17,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "view",
         _view,
-        help="look at a scene, a PLY, a capture or a generated world, and measure in it",
+        help="look at a scene, a map, a capture or a generated world, and measure in it",
         description="Writes a page that any browser opens, without a server or a network: the "
         "Gaussians, distances to surfaces, the captured images where they were taken, a ruler.",
         examples=(
@@ -27,7 +27,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         ),
     )
     view.add_argument(
-        "what", help="scene folder, PLY, folder of a capture, or a scenario: P02 or a file"
+        "what",
+        help="scene folder, file of Gaussians (PLY, SPZ, .splat), OctoMap (.bt), folder of a "
+        "capture, or a scenario: P02 or a file",
     )
     view.add_argument("--out", type=Path, help="page to write (default: out/view/NAME.html)")
     view.add_argument("--seed", type=int, help="seed of a generated world")
@@ -48,7 +50,7 @@ def _scenario_defaults(options: argparse.Namespace) -> Any:
 
 
 def _view(options: argparse.Namespace) -> None:
-    check_place(Path(options.what), "a scene folder, a PLY, a capture or a scenario")
+    check_place(Path(options.what), "a scene, an OctoMap, a capture or a scenario")
     if options.viser and options.out is not None:
         raise ValueError(f"--out {options.out} and --viser: viser writes no page; keep one of them")
     if options.viser:

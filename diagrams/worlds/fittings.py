@@ -165,7 +165,10 @@ def check_ground(config: Any) -> None:
     if not config.height <= MAX_HEIGHT:
         raise ValueError(f"height = {config.height:g} m must be at most {MAX_HEIGHT:g} m")
     upper = np.array([config.length, config.width, config.height])
-    grid_shape(np.zeros(3), upper, config.voxel_size)
+    try:
+        grid_shape(np.zeros(3), upper, config.voxel_size)
+    except ValueError as error:
+        raise ValueError(f"voxel_size = {config.voxel_size:g} m does not fit: {error}") from None
 
 
 def check_count(config: object, *names: str) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.worlds.branches import BranchesConfig, branches_blueprint
@@ -10,7 +11,7 @@ from splatpilot.diagrams.worlds.dodgedrone.dodgedrone import DodgeDroneConfig, d
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.forest.forest import forest_blueprint
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
-from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
+from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.over_under import OverUnderConfig, over_under_blueprint
 from splatpilot.diagrams.worlds.room import RoomConfig, room_blueprint
 from splatpilot.diagrams.worlds.scene import SceneConfig, read_scene_world
@@ -85,6 +86,12 @@ def make_world(config: WorldConfig, seed: int) -> World:
         FileNotFoundError: for a scene that is not there.
     """
     return WORLDS.kind_of(config).make(config, seed)
+
+
+def place_config(path: Path) -> SceneConfig | OctomapConfig:
+    """The world of a place on disk: an OctoMap by its suffix, or else a scene."""
+    kind = OctomapConfig if path.suffix.lower() == OCTOMAP else SceneConfig
+    return kind(path=str(path))
 
 
 def is_procedural(config: WorldConfig) -> bool:

@@ -1,9 +1,11 @@
 """Worlds from OctoMaps: maps that robots made, as coloured blocks."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
@@ -19,17 +21,28 @@ from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, dra
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.octomap import esdf_from_octomap
+from splatpilot.systems.collision.octomap import Octomap, read_octomap
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+OCTOMAP = ".bt"
+"""Suffix of binary OctoMaps."""
+
+_MOST_VOXELS = 2e7
+"""Of a map that is flown in whole: some 90 bytes each."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
 class OctomapConfig(SceneSource):
     """A binary OctoMap (.bt) on disk; `path` is found as that of a scene."""
 
-    lower: list[float] | None = None  # [m] lower corner of the part that is flown in
-    upper: list[float] | None = None  # [m] upper corner of that part
+    # [m] Lower corner of the part that is flown in; without corners all of the map, or of a map of
+    # more than 20 million voxels so many about the middle of what is free.
+    lower: list[float] | None = None
+    # [m] Upper corner of that part.
+    upper: list[float] | None = None
 
     def validate(self) -> None:
         """Raises ValueError for an empty path, or a box with one corner or none in order."""
@@ -50,8 +63,17 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
     """
     config.validate()
     path = find_scene(config)
-    corners = (None if c is None else np.array(c, float) for c in (config.lower, config.upper))
-    esdf = esdf_from_octomap(path, *corners)
+    octomap = read_octomap(path)
+    lower_W, upper_W = _flown_part(config, octomap)
+    try:
+        esdf = octomap.esdf(lower_W, upper_W)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not (esdf.states == FieldState.FREE).any():
+        raise ValueError(
+            f"{path}: no space from {lower_W} to {upper_W} m is known to be free; there is nowhere "
+            "to fly: choose another map, or another part of it by world.lower and world.upper"
+        )
     if config.draw_ends:
         p_WS, p_WG, _ = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed)
     else:
@@ -66,6 +88,21 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
         p_WS=p_WS,
         p_WG=p_WG,
     )
+
+
+def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArray]:
+    """The corners of the part that is flown in (3,) [m]; says so if it is not what is known."""
+    if config.lower is not None and config.upper is not None:
+        return np.array(config.lower, float), np.array(config.upper, float)
+    lower_W, upper_W = octomap.part(_MOST_VOXELS)
+    if (upper_W - lower_W < octomap.upper_W - octomap.lower_W).any():
+        _log.warning(
+            "%s is large: flown in is the part from %s to %s of %s to %s m; world.lower and "
+            "world.upper choose another",
+            config.path,
+            *(c.round(1).tolist() for c in (lower_W, upper_W, octomap.lower_W, octomap.upper_W)),
+        )
+    return lower_W, upper_W
 
 
 def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:

@@ -15,8 +15,8 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 class SceneSource:
     """A place on disk."""
 
-    # A scene folder, or a PLY file of Gaussians; one that is not there is looked for in the folder
-    # that the environment variable SPLATPILOT_SCENES names, or in `scenes`.
+    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat); one that is not there is looked
+    # for in the folder that the environment variable SPLATPILOT_SCENES names, or in `scenes`.
     path: str = ""
     # How to get the scene: what the error says if it is not there.
     source: str = ""
@@ -31,7 +31,7 @@ class SceneSource:
             ValueError: if no path is given, or the least way is negative or infinite.
         """
         if not self.path:
-            raise ValueError("world.path is empty; name a scene folder or a PLY file")
+            raise ValueError("world.path is empty; name a scene folder or a file of Gaussians")
         if not 0 <= self.least_way < math.inf:
             raise ValueError(
                 f"world.least_way is {self.least_way} m; it must be finite and at least 0"

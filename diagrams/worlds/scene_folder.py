@@ -27,6 +27,7 @@ from splatpilot.systems.files import folder_written_atomically, require_writable
 from splatpilot.systems.splats.background import Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.splat_files import read_splats
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 _MAX_VOXELS = 2e7
@@ -34,13 +35,13 @@ _COARSEST = 0.25  # [m], voxels at which a vehicle of 0.354 m radius still finds
 
 
 def read_scene(path: str | Path) -> World:
-    """Reads a scene folder, or a PLY file of Gaussians alone.
+    """Reads a scene folder, or a file of Gaussians alone, see `read_splats`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no scene at `path`, or a damaged one.
     """
     path = Path(path)
-    return read_scene_folder(path) if path.is_dir() else _read_bare_ply(path)
+    return read_scene_folder(path) if path.is_dir() else _read_bare_gaussians(path)
 
 
 def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
@@ -176,9 +177,9 @@ def write_scene_folder(
     return metadata
 
 
-def _read_bare_ply(path: Path) -> World:
+def _read_bare_gaussians(path: Path) -> World:
     """Builds a world from Gaussians alone: every place that no Gaussian fills counts as free."""
-    gaussians = read_ply(path)
+    gaussians = read_splats(path)
     # A few stray Gaussians far away must not stretch the grid; beyond it all counts as occupied.
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
     lower_W, upper_W = lower_W - 0.1, upper_W + 0.1

@@ -40,6 +40,42 @@ class Octomap:
         """Upper corner of the known space, (3,) [m]."""
         return self.resolution * (self.corners + self.sizes[:, None]).max(axis=0)
 
+    def part(self, most_voxels: float) -> tuple[np.ndarray, np.ndarray]:
+        """The known space, or a box in it of at most so many voxels, as high as all of it and of
+        its proportions, about the middle of what is free.
+
+        Returns:
+            lower_W, upper_W: (3,) each [m].
+        """
+        lower, upper = self.corners.min(axis=0), (self.corners + self.sizes[:, None]).max(axis=0)
+        shape = (upper - lower).astype(float)
+        shrunk = np.sqrt(min(1.0, most_voxels / shape.prod())) * shape[:2]
+        free = ~self.occupied if not self.occupied.all() else self.occupied
+        volume = self.sizes[free].astype(float) ** 3
+        centers = self.corners[free] + 0.5 * self.sizes[free, None]
+        for axis in range(2):
+            order = np.argsort(centers[:, axis])
+            filled = np.cumsum(volume[order])
+            middle = centers[order[np.searchsorted(filled, 0.5 * filled[-1])], axis]
+            half = 0.5 * shrunk[axis]
+            middle = np.clip(middle, lower[axis] + half, upper[axis] - half)
+            lower[axis], upper[axis] = np.ceil(middle - half), np.floor(middle + half)
+        return self.resolution * lower, self.resolution * upper
+
+    def esdf(self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None) -> Esdf:
+        """The distance field, at the map's resolution, of a part of it, see `states`.
+
+        The surface is the faces of occupied voxels, see `esdf_from_occupancy`: the map knows no
+        better.
+
+        Raises:
+            ValueError: see `states`.
+        """
+        states, lower_W = self.states(lower_W, upper_W)
+        return esdf_from_occupancy(
+            states == FieldState.OCCUPIED, states == FieldState.UNKNOWN, lower_W, self.resolution
+        )
+
     def states(
         self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -133,9 +169,7 @@ def esdf_from_octomap(
     lower_W: np.ndarray | None = None,
     upper_W: np.ndarray | None = None,
 ) -> Esdf:
-    """The distance field of a binary OctoMap, at the map's resolution.
-
-    The surface is the faces of occupied voxels, see `esdf_from_occupancy`: the map knows no better.
+    """The distance field of a binary OctoMap, see `Octomap.esdf`.
 
     Args:
         path: of the .bt file.
@@ -146,13 +180,7 @@ def esdf_from_octomap(
     """
     octomap = read_octomap(path)
     try:
-        states, lower_W = octomap.states(lower_W, upper_W)
-        return esdf_from_occupancy(
-            states == FieldState.OCCUPIED,
-            states == FieldState.UNKNOWN,
-            lower_W,
-            octomap.resolution,
-        )
+        return octomap.esdf(lower_W, upper_W)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -12,7 +12,9 @@ from plyfile import PlyData, PlyElement
 
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.ply_files import read_ply_file
+from splatpilot.systems.splats.compressed_ply import is_compressed, unpack
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.sound_gaussians import sound_gaussians
 
 _NORMALS = ["nx", "ny", "nz"]
 _MEANS = ["x", "y", "z"]
@@ -24,6 +26,8 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 # The largest float32 below 1 is 1 - 2^-24. An opacity of exactly 1 has no finite logit; it is
 # written as that of 1 - 2^-26, which comes back as 1.
 _OPAQUE = 1 - 2.0**-26
+# Of surfels, beside the smaller of their extents.
+_THICKNESS = 0.01
 # Below this logit the opacity is no longer a normal float32; it is invisible anyway.
 _INVISIBLE_LOGIT = -87.0
 
@@ -31,11 +35,15 @@ _INVISIBLE_LOGIT = -87.0
 def read_ply(path: str | Path) -> GaussianScene:
     """Reads the Gaussians in a PLY file: binary of either byte order, or ASCII.
 
+    Surfels, whose files have two scales (2DGS), get a third of `_THICKNESS` times the smaller one;
+    what PlayCanvas has compressed is unpacked. A few damaged Gaussians are left out, see
+    `sound_gaussians`.
+
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if the file is no PLY, is truncated, holds no Gaussians (a mesh or a plain point
             cloud), has a number of spherical-harmonic coefficients that belongs to no degree, or
-            holds values that are no Gaussians (see `GaussianScene`).
+            holds values that are no Gaussians.
     """
     path = Path(path)
     if not path.is_file():
@@ -43,13 +51,15 @@ def read_ply(path: str | Path) -> GaussianScene:
     ply = read_ply_file(path)
     if "vertex" not in ply:
         raise ValueError(f"{path}: no element 'vertex'; a PLY file with Gaussians is needed")
+    if is_compressed(ply):
+        return unpack(path, ply)
     vertex = ply["vertex"]
     names = {p.name for p in vertex.properties}
-    required = _MEANS + _DC + _OPACITY + _SCALES + _QUATS
-    if missing := [name for name in required if name not in names]:
+    if missing := [n for n in (*_MEANS, *_DC, *_OPACITY, *_SCALES[:2], *_QUATS) if n not in names]:
+        what = "a mesh" if "face" in ply else "a point cloud"
         raise ValueError(
-            f"{path}: the vertices lack {', '.join(missing)}: a mesh or point cloud, no Gaussians; "
-            "export the scene in the layout of 3D Gaussian splatting"
+            f"{path}: {what}, no Gaussians: the vertices lack {', '.join(missing)}; export the "
+            "scene in the layout of 3D Gaussian splatting"
         )
     if vertex.count == 0:
         raise ValueError(f"{path}: holds no Gaussians; export the scene again")
@@ -75,17 +85,18 @@ def read_ply(path: str | Path) -> GaussianScene:
         higher = columns(rest).reshape(vertex.count, 3, -1).transpose(0, 2, 1)
         sh = np.concatenate([sh, higher], axis=1)
     logits = np.maximum(columns(_OPACITY)[:, 0], _INVISIBLE_LOGIT)
-    with np.errstate(over="ignore"):  # what overflows is infinite, and GaussianScene says so
-        try:
-            return GaussianScene(
-                means=columns(_MEANS).astype(np.float32),
-                quats=columns(_QUATS).astype(np.float32),
-                scales=np.exp(columns(_SCALES)).astype(np.float32),
-                opacities=(1 / (1 + np.exp(-logits))).astype(np.float32),
-                sh=sh.astype(np.float32),
-            )
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is damaged
+        scales = np.exp(columns([name for name in _SCALES if name in names]))
+        if scales.shape[1] == 2:
+            scales = np.column_stack([scales, _THICKNESS * scales.min(axis=1)])
+        return sound_gaussians(
+            path,
+            means=columns(_MEANS),
+            quats=columns(_QUATS),
+            scales=scales,
+            opacities=1 / (1 + np.exp(-logits)),
+            sh=sh,
+        )
 
 
 def write_ply(scene: GaussianScene, path: str | Path) -> None:

@@ -286,6 +286,22 @@ def test_signal_of_which_an_import_makes_another_error(
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signal_after_the_last_result(number, status):
+    """A signal that comes while the process is about to end, its workers too, says the same."""
+    script = (
+        "import atexit, signal; from splatpilot.analysis.cli import run\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"atexit.register(signal.raise_signal, {int(number)})\n"
+        "run()"
+    )
+    words = [sys.executable, "-c", script, "--version"]
+    ended = subprocess.run(words, capture_output=True, text=True)
+    assert ended.returncode == status
+    word = {143: "terminated", 130: "interrupted"}[status]
+    assert ended.stderr == f"splatpilot: {word}\n" and ended.stdout.startswith("splatpilot ")
+
+
 def test_drake_says_nothing_but_warnings(tmp_path):
     """Pages are written by a Meshcat that nobody is to connect to, so its address is not told."""
     script = (

@@ -15,8 +15,11 @@ from splatpilot.analysis import shown_place, view
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.diagrams.worlds import octomap_world
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.octomap import Octomap
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.splats.gaussian_ply import write_ply
 from splatpilot.training.captures.capture_gaussians import capture_gaussians
@@ -117,13 +120,31 @@ def test_capture_shows_what_it_measured(place, monkeypatch, tmp_path):
 
 
 def test_bare_gaussians(place, tmp_path):
-    """A PLY has distances where they can be had, and is shown without where not."""
+    """A file of Gaussians has distances where they can be had, and is shown without where not."""
     path = tmp_path / "room.ply"
     write_ply(place.gaussians, path)
     assert data_of(view.run(what=str(path), out=tmp_path / "a.html"))["grid"] is not None
     write_ply(place.gaussians.scaled_by(1000.0), path)
     data = data_of(view.run(what=str(path), out=tmp_path / "b.html"))
     assert data["grid"] is None and "Without distances" in data["notes"][0]
+    records = np.zeros(100, [("p", "<f4", 3), ("s", "<f4", 3), ("rgba_q", "u1", 8)])
+    records["p"], records["s"] = place.gaussians.means[:100], place.gaussians.scales[:100]
+    records["rgba_q"] = 200
+    records.tofile(tmp_path / "room.splat")
+    data = data_of(view.run(what=str(tmp_path / "room.splat"), out=tmp_path / "c.html"))
+    assert data["name"] == "room"
+
+
+def test_map(tmp_path, monkeypatch):
+    """An OctoMap is shown as the world that is flown in."""
+    hall = np.full((20, 12, 10), FieldState.FREE, np.uint8)
+    hall[0] = hall[:, 0] = hall[:, :, 0] = FieldState.OCCUPIED
+    corners = np.argwhere(np.ones_like(hall))
+    octomap = Octomap(0.3, corners, np.ones(len(corners), int), hall.ravel() == FieldState.OCCUPIED)
+    monkeypatch.setattr(octomap_world, "read_octomap", lambda path: octomap)
+    (tmp_path / "hall.bt").touch()
+    data = data_of(view.run(what=str(tmp_path / "hall.bt"), out=tmp_path / "page.html"))
+    assert grid_of(data).shape == (20, 12, 10)
 
 
 def test_looking_needs_no_extras():

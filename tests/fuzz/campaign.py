@@ -23,13 +23,14 @@ from fuzz.mutations import PICKLE_LEFT, damage, replace_file
 from fuzz.packets import PACKETS
 from fuzz.readers import READERS, Reader
 from fuzz.run_readers import RUN_READERS
+from fuzz.splat_readers import SPLAT_READERS
 
 TIME_LIMIT = 10.0
 """[s] for a case."""
 _MEMORY = 3 << 30  # [bytes] for a case, beside what the libraries take
 _LINKS = 0.03  # fraction of cases in which a file becomes something that is no file
 
-ALL = READERS | RUN_READERS | PACKETS
+ALL = READERS | SPLAT_READERS | RUN_READERS | PACKETS
 
 
 class Outcome(NamedTuple):

@@ -32,7 +32,7 @@ def require_finite(*arrays: Any) -> None:
         assert np.isfinite(np.asarray(array, dtype=float)).all(), "values are not finite"
 
 
-def _see(scene: Any) -> None:
+def see(scene: Any) -> None:
     from splatpilot.systems.splats.baked_scene import BakedScene
 
     K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
@@ -49,7 +49,7 @@ def _query(esdf: Any) -> None:
 
 
 def _use_world(world: Any) -> None:
-    _see(world.gaussians)
+    see(world.gaussians)
     _query(world.esdf)
     require_finite(world.p_WS, world.p_WG)
 
@@ -188,8 +188,8 @@ def _use_photographs(read: Any) -> None:
 
 
 READERS = {
-    "PLY, binary": Reader(_write_ply(False), "*", _read_ply, _see),
-    "PLY, ASCII": Reader(_write_ply(True), "*", _read_ply, _see),
+    "PLY, binary": Reader(_write_ply(False), "*", _read_ply, see),
+    "PLY, ASCII": Reader(_write_ply(True), "*", _read_ply, see),
     "scene folder": Reader(_write_scene, "scene/*", _read_scene, _use_world),
     "distance field": Reader(
         lambda folder: _esdf().save(folder / "esdf.npz"), "*", _read_esdf, _query

@@ -94,6 +94,11 @@ def test_files_are_not_repeated_in_errors(tmp_path):
     path.write_text("start: " + "[" * 5000 + "]" * 5000)
     with pytest.raises(ValueError, match=r"secret.yaml: fields are nested too deeply"):
         load_config(Scenario(), path)
+    path.write_text("start: &a [1, *a]")
+    with pytest.raises(ValueError, match=r"secret.yaml: line 1: \*a is within itself"):
+        load_config(Scenario(), path)
+    path.write_text("start: &a [1, 2, 3]\ngoal: *a")
+    assert load_config(Scenario(), path).goal == [1, 2, 3]
     with path.open("wb") as file:
         file.truncate(100_000_000)
     with pytest.raises(ValueError, match=r"secret.yaml has 100 MB; .* at most 64 MB"):
@@ -127,7 +132,9 @@ def test_fields_that_may_be_empty_may_be_null(tmp_path):
         ("policy.lattice.speed=1e300", "speed is 1e[+]300 but must be positive and at most 20"),
         ("world.length=1000000", "is 1.6e[+]07 m² of ground; it must be at most"),
         ("world.width=1e9", "m² of ground; it must be at most"),
-        ("world.voxel_size=1e-9", "distance field: a box of .* the limit is"),
+        ("world.voxel_size=1e-9", "voxel_size = 1e-09 m does not fit: .* the limit is"),
+        ("world.width=1e-320", r"voxel_size = 0.15 m does not fit: .* fewer than 2 voxels"),
+        ("camera.focal=!FovDegrees {x: null}", "camera.focal is without x and y"),
         ("camera.fps=.inf", "camera.fps is inf; it must be 0.01 to 1000 Hz"),
         ("camera.focal=!FocalLength {x: 0}", "camera.focal is .*; it must be positive"),
         ("camera.lcm_bus=other", "camera.lcm_bus is 'other'; it must be left out"),

@@ -136,10 +136,14 @@ def test_foreign_file(tmp_path, content):
 
 
 def test_mesh(tmp_path):
-    """A mesh is told from Gaussians by what its vertices lack."""
+    """Points and meshes are told from Gaussians by what their vertices lack."""
     table = np.zeros(3, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("nx", "f4")])
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "mesh.ply"))
-    with pytest.raises(ValueError, match=r"mesh\.ply: the vertices lack f_dc_0.*no Gaussians"):
+    with pytest.raises(ValueError, match=r"mesh\.ply: a point cloud, no Gaussians: .*lack f_dc_0"):
+        read_ply(tmp_path / "mesh.ply")
+    face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))]), "face")
+    PlyData([PlyElement.describe(table, "vertex"), face]).write(str(tmp_path / "mesh.ply"))
+    with pytest.raises(ValueError, match=r"mesh\.ply: a mesh, no Gaussians"):
         read_ply(tmp_path / "mesh.ply")
     PlyData([PlyElement.describe(table, "face")]).write(str(tmp_path / "faces.ply"))
     with pytest.raises(ValueError, match=r"faces\.ply: no element 'vertex'"):
@@ -173,13 +177,29 @@ def test_odd_number_of_coefficients(tmp_path, without):
         ("f_rest_3", np.nan, r"sh\[4, .*finite"),
     ],
 )
-def test_bad_values_name_file_and_index(tmp_path, column, value, message):
-    """Values that are no Gaussian are refused with file, array and index."""
+def test_damaged_gaussians(tmp_path, caplog, column, value, message):
+    """One of seven that is damaged is left out and counted; of two the file is refused, with array
+    and index of the first."""
     table = vertices(random_scene(), tmp_path / "a.ply")
     table[column][4] = value
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
-    with pytest.raises(ValueError, match=r"b\.ply: " + message):
+    others = [0, 1, 2, 3, 5, 6]
+    scene = read_ply(tmp_path / "b.ply")
+    np.testing.assert_array_equal(scene.means, read_ply(tmp_path / "a.ply").means[others])
+    assert "b.ply: 1 of 7 Gaussians are damaged and left out" in caplog.text
+    table[column][5] = value
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
+    with pytest.raises(ValueError, match=r"b\.ply: 2 of 7 Gaussians are damaged; " + message):
         read_ply(tmp_path / "b.ply")
+
+
+def test_surfels(tmp_path):
+    """A file of surfels, which has two scales, gives Gaussians that are next to flat."""
+    table = vertices(random_scene(), tmp_path / "a.ply", without=("scale_2",))
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
+    scene, flat = read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
+    np.testing.assert_array_equal(flat.scales[:, :2], scene.scales[:, :2])
+    np.testing.assert_allclose(flat.scales[:, 2], 0.01 * scene.scales[:, :2].min(1), rtol=1e-6)
 
 
 def test_failed_write_leaves_the_old_file_alone(tmp_path, monkeypatch):

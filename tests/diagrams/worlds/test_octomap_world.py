@@ -1,0 +1,61 @@
+"""Worlds of OctoMaps."""
+
+import numpy as np
+import pytest
+
+from splatpilot.diagrams.worlds import octomap_world as module
+from splatpilot.diagrams.worlds.make_world import place_config
+from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
+from splatpilot.diagrams.worlds.scene import SceneConfig
+from splatpilot.systems.collision.octomap import Octomap
+
+
+def hall(length: int, width: int) -> Octomap:
+    """A hall of voxels of 0.25 m, four metres high, free within its floor and walls."""
+    x, y, z = np.meshgrid(range(length), range(width), range(16), indexing="ij")
+    corners = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    walls = (corners[:, 0] == 0) | (corners[:, 1] == 0) | (corners[:, 2] == 0)
+    return Octomap(0.25, corners, np.ones(len(corners), int), walls)
+
+
+@pytest.fixture
+def in_map(tmp_path, monkeypatch):
+    """Makes the world of a map as if it stood in a file."""
+    (tmp_path / "map.bt").touch()
+
+    def make(octomap: Octomap, **fields):
+        monkeypatch.setattr(module, "read_octomap", lambda path: octomap)
+        return octomap_world(OctomapConfig(path=str(tmp_path / "map.bt"), **fields), 0)
+
+    return make
+
+
+def test_large_maps_are_cropped_about_free_space(in_map, monkeypatch, caplog):
+    """Of a map of more voxels than are flown in whole, a part of its proportions and height is, and
+    which is said; a part that is named is taken as it is."""
+    octomap = hall(80, 40)
+    whole = in_map(octomap)
+    np.testing.assert_allclose(whole.esdf.upper_W - whole.esdf.lower_W, [20, 10, 4])
+    assert not caplog.text
+    monkeypatch.setattr(module, "_MOST_VOXELS", 80 * 40 * 16 / 4)
+    world = in_map(octomap)
+    np.testing.assert_allclose(world.esdf.upper_W - world.esdf.lower_W, [10, 5, 4], atol=0.5)
+    middle = 0.5 * (world.esdf.lower_W + world.esdf.upper_W)
+    np.testing.assert_allclose(middle, [10, 5, 2], atol=0.3)
+    assert "map.bt is large: flown in is the part from [5." in caplog.text
+    named = in_map(octomap, lower=[0, 0, 0], upper=[10, 10, 4])
+    np.testing.assert_allclose(named.esdf.upper_W, [10, 10, 4])
+
+
+def test_maps_without_free_space_are_refused(in_map):
+    """Where nothing is known to be free there is nowhere to fly."""
+    octomap = hall(20, 20)
+    octomap.occupied[:] = True
+    with pytest.raises(ValueError, match=r"map\.bt: no space from .* is known to be free"):
+        in_map(octomap)
+
+
+def test_places_are_told_apart_by_suffix(tmp_path):
+    """A `.bt` is a map, and anything else a scene."""
+    assert place_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
+    assert place_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))
