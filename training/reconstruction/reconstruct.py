@@ -50,6 +50,7 @@ class ReconstructSummary:
     gaussians: int
     vignetting: float
     gain_range: tuple[float, float]
+    metric: bool  # lengths are in units of their own where it is false
     lower_W: NDArray[np.float64]  # (3,) [m]
     upper_W: NDArray[np.float64]  # (3,) [m]
     observed_free_volume: float  # [m^3]
@@ -64,18 +65,23 @@ class ReconstructSummary:
         def vector(p: NDArray) -> str:
             return "(" + ", ".join(f"{x:.2f}" for x in p) + ")"
 
+        unit = "m" if self.metric else "units of an unknown length"
+        size = " x ".join(f"{length:.3g}" for length in self.upper_W - self.lower_W)
         rows = {
             "scene": self.scene,
             "frames": self.frames,
             "Gaussians": self.gaussians,
-            "bounds [m]": f"{vector(self.lower_W)} to {vector(self.upper_W)}",
-            "seen free [m^3]": f"{self.observed_free_volume:.1f}",
+            "size": f"{size} {unit}, from {vector(self.lower_W)} to {vector(self.upper_W)}",
             "image gains": f"{self.gain_range[0]:.3f} to {self.gain_range[1]:.3f}",
             "corner brightness": f"{np.exp(self.vignetting):.3f}",
-            "default start [m]": vector(self.p_WS),
-            "default goal [m]": vector(self.p_WG),
-            "shortest path [m]": f"{self.geodesic:.1f}",
         }
+        if self.metric:
+            rows |= {
+                "seen free [m^3]": f"{self.observed_free_volume:.1f}",
+                "default start [m]": vector(self.p_WS),
+                "default goal [m]": vector(self.p_WG),
+                "shortest path [m]": f"{self.geodesic:.1f}",
+            }
         if self.held_out is not None:
             rows["held-out frames"] = self.held_out
         if self.field_difference is not None:
@@ -177,6 +183,7 @@ def reconstruct(
         gaussians=len(gaussians),
         vignetting=photometry.vignetting,
         gain_range=(float(gains[fitted].min()), float(gains[fitted].max())),
+        metric=capture.metric,
         lower_W=field.lower_W,
         upper_W=field.upper_W,
         observed_free_volume=field.volume(FieldState.FREE),

@@ -28,6 +28,8 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W):
     room = write_room(tmp_path / "room", width=128, height=96)
     summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
     assert f"Gaussians          {summary.gaussians}\n" in str(summary)
+    size = " x ".join(f"{length:.3g}" for length in summary.upper_W - summary.lower_W)
+    assert f"size               {size} m, from (" in str(summary)
     world = read_scene(tmp_path / "scene")
     metadata = read_scene_metadata(tmp_path / "scene")
     assert (world.name, metadata.frontier) == ("room", True)
