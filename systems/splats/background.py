@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.png_chunks import require_whole_chunks
 from splatpilot.systems.splats.baked_scene import RenderedView
 
 if TYPE_CHECKING:
@@ -41,8 +42,10 @@ class EnvironmentMap:
         """
         if not file.exists():
             raise FileNotFoundError(f"{file}: does not exist; reconstruct the scene again")
+        content = file.read_bytes()
+        require_whole_chunks(file, content)
         try:
-            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         except cv2.error:  # more pixels than OpenCV decodes
             image = None
         if image is None:

@@ -77,6 +77,11 @@ class CaptureConfig:
     images are level on average; `ground`: across the largest plane below the cameras."""
     scale: ScaleConfig = field(default_factory=ScaleConfig)
     """Where metres come from when images alone were registered."""
+    partners: int = 0
+    """With how many others a photograph is compared: half of them next to it by name, half those
+    that look most alike; 0: with all, of more than 60 photographs with 20."""
+    video_rate: float = 2.0
+    """[Hz] Of each so long part of a video the sharpest frame is taken."""
     cache: str = ""
     """Folder that keeps the registration of photographs, which takes minutes; empty: a folder
     of their own in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`."""
@@ -96,6 +101,12 @@ class CaptureConfig:
         if self.up and self.up not in UP_AXES | {"cameras", "ground"}:
             raise ValueError(
                 f"capture.up is {self.up!r}; known are x, y, z, -x, -y, -z, cameras and ground"
+            )
+        if self.partners < 0:
+            raise ValueError(f"capture.partners is {self.partners}; it must be at least 0")
+        if not 0 < self.video_rate <= 100:
+            raise ValueError(
+                f"capture.video_rate is {self.video_rate}; more than 0 and at most 100 Hz is needed"
             )
         self.scale.validate()
 

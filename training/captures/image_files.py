@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatpilot.systems.array_files import array_layout, read_array, reason_of
+from splatpilot.systems.png_chunks import require_whole_chunks
 from splatpilot.systems.read_limit import require_readable_size
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
@@ -135,7 +136,9 @@ def _clean(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _decode(file: Path, flags: int) -> NDArray:
-    raw = np.fromfile(file, dtype=np.uint8)
+    content = file.read_bytes()
+    require_whole_chunks(file, content)
+    raw = np.frombuffer(content, np.uint8)
     try:
         image = cv2.imdecode(raw, flags) if len(raw) else None
     except cv2.error:  # more pixels than OpenCV decodes

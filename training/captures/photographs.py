@@ -1,4 +1,4 @@
-"""Photographs alone, registered with pycolmap: SIFT, exhaustive matching, incremental mapping.
+"""Photographs alone, registered with pycolmap: SIFT, matching, incremental mapping.
 
 The registration is kept in a cache under a name made from the photographs, so that it happens once.
 """
@@ -17,11 +17,16 @@ from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap, read_model
 from splatpilot.training.captures.image_files import IMAGE_SUFFIXES, image_size
+from splatpilot.training.captures.image_pairs import all_pairs, likely_pairs, similarity
 
 _MAX_SIZE = 1600
 """[px], longer side of the images in which features are sought."""
 _SMALL = 1200
 """[px], longer side below which photographs are enlarged for it."""
+_ALL_OF = 60
+"""Photographs of which, if not told otherwise, each is compared with all others."""
+_PARTNERS = 20
+"""With how many each of more is compared."""
 _SEED = 0
 _EXIF_MODEL, _EXIF_IFD, _EXIF_FOCAL_LENGTH = 0x0110, 0x8769, 0x920A
 
@@ -60,7 +65,7 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     names = [file.name for file in files]
     model = _cache(files, config) / "model"
     if not model.is_dir():
-        _register(folder, names, one_camera(files), model)
+        _register(folder, names, one_camera(files), config.partners, model)
     reconstruction = read_model(model)
     registered = {image.name for image in reconstruction.images.values() if image.has_pose}
     dropped += [
@@ -78,15 +83,21 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     )
 
 
-def _cache(files: list[Path], config: CaptureConfig) -> Path:
+def cache_folder(config: CaptureConfig, *parts: str) -> Path:
+    """The folder that a capture keeps what is made of it in: what it names, or in the user's."""
     if config.cache:
         return Path(config.cache)
-    key = hashlib.sha256(f"{import_pycolmap().__version__} {_MAX_SIZE} {_SEED}".encode())
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home, "splatpilot", *parts)
+
+
+def _cache(files: list[Path], config: CaptureConfig) -> Path:
+    version = import_pycolmap().__version__
+    key = hashlib.sha256(f"{version} {_MAX_SIZE} {_SEED} {config.partners}".encode())
     for file in files:
         status = file.stat()
         key.update(f"{file.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "splatpilot" / "photographs" / key.hexdigest()[:16]
+    return cache_folder(config, "photographs", key.hexdigest()[:16])
 
 
 def one_camera(files: list[Path]) -> bool:
@@ -100,7 +111,7 @@ def one_camera(files: list[Path]) -> bool:
     return len(kinds) == 1
 
 
-def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> None:
+def _register(folder: Path, names: list[str], one_camera: bool, partners: int, model: Path) -> None:
     """Registers photographs and writes the largest model that results, whole or not at all."""
     try:
         model.parent.mkdir(parents=True, exist_ok=True)
@@ -111,10 +122,12 @@ def _register(folder: Path, names: list[str], one_camera: bool, model: Path) -> 
         ) from None
     remove_leftovers(model.parent)
     with folder_written_atomically(model) as written:
-        _write_model(folder, names, one_camera, written)
+        _write_model(folder, names, one_camera, partners, written)
 
 
-def _write_model(folder: Path, names: list[str], one_camera: bool, written: Path) -> None:
+def _write_model(
+    folder: Path, names: list[str], one_camera: bool, partners: int, written: Path
+) -> None:
     """Seeds are fixed and images get their numbers in order, so that the result does not depend on
     which thread is first."""
     work = written / "work"
@@ -139,13 +152,13 @@ def _write_model(folder: Path, names: list[str], one_camera: bool, written: Path
                 progress.update(len(some))
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = _SEED
-        pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+        pairs = _pairs(database, names, partners)
         block = max(1, len(pairs) // 20)
         with tqdm(total=len(pairs), desc="matching", unit="pair") as progress:
             for start in range(0, len(pairs), block):
                 some = pairs[start : start + block]
                 listed = work / "pairs.txt"
-                listed.write_text("".join(f"{a} {b}\n" for a, b in some))
+                listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some))
                 pycolmap.match_image_pairs(
                     database,
                     matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
@@ -176,6 +189,18 @@ def _write_model(folder: Path, names: list[str], one_camera: bool, written: Path
         shutil.rmtree(work)
     finally:
         pycolmap.logging.minloglevel = level
+
+
+def _pairs(database: Path, names: list[str], partners: int) -> list[tuple[int, int]]:
+    if partners == 0:
+        partners = len(names) if len(names) <= _ALL_OF else _PARTNERS
+    if partners >= len(names) - 1:
+        return all_pairs(len(names))
+    opened = import_pycolmap().Database.open(database)
+    try:
+        return likely_pairs(similarity(opened, names), partners)
+    finally:
+        opened.close()
 
 
 def _advance(progress: tqdm, count: int) -> None:

@@ -18,6 +18,7 @@ from splatpilot.training.captures.tartanair import (
     read_tartanair_v2,
 )
 from splatpilot.training.captures.tum import is_tum, read_tum
+from splatpilot.training.captures.video import is_video, read_video
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class CaptureKind:
     """How captures of one kind are told from others, and opened."""
 
     recognizes: Callable[[Path], bool]
-    """Tells whether a folder looks like one, whole or not."""
+    """Tells whether a path looks like one, whole or not: a folder, or a file."""
     read: Callable[[Path, CaptureConfig], Capture]
     """Opens the capture in a folder. Raises FileNotFoundError, OSError or ValueError that names the
     file where it is damaged."""
@@ -96,27 +97,29 @@ register_capture(
     description="photographs alone",
 )
 
+register_capture("video", is_video, read_video, description="a video (.mp4, .mov, ...)")
+
 _OURS = CAPTURES.registered()
 
 
 def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Capture:
-    """Opens the capture in a folder, whose kind is told from what lies in it.
+    """Opens the capture in a folder, or a video, whose kind is told from what lies in it.
 
     Kinds of other packages are asked first: any folder of images passes for photographs.
 
     Args:
-        path: the folder.
+        path: the folder or the video.
         config: what the files leave open; a file `capture.yaml` in the folder gives what it does
             not.
 
     Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if the folder is no capture of a known kind, or a damaged one, or `config` makes
+        FileNotFoundError: if there is nothing there.
+        ValueError: if it is no capture of a known kind, or a damaged one, or `config` makes
             no sense.
     """
     path = Path(path)
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such folder; a capture is a folder")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such folder or video")
     said = config or CaptureConfig()
     if said.cache:  # found again from wherever the capture is opened with these settings
         said = replace(said, cache=str(Path(said.cache).absolute()))

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
+from splatpilot.training.reconstruction.squeezenet import squeezenet_features
+
 # ImageNet's, which LPIPS applies as a shift and a scale of images in [-1, 1].
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # Layers of SqueezeNet 1.1 after which features are compared.
@@ -106,15 +108,12 @@ def _find(weights: Path | None) -> tuple[Path, ...]:
 @cache
 def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential, list[Tensor]]:
     """Returns the layers of the backbone and the weights of the linear layers, (1, C, 1, 1)."""
-    from torchvision.models import squeezenet1_1  # slow to import
-
     try:
         files = [torch.load(file, map_location="cpu", weights_only=True) for file in source]
         backbone, linear = (
             (files[0]["squeezenet1_1"], files[0]["lin"]) if len(files) == 1 else files
         )
-        # The classifier is not needed.
-        layers = squeezenet1_1().features
+        layers = squeezenet_features()
         layers.load_state_dict(
             {
                 name.removeprefix("features."): tensor.float()
@@ -139,8 +138,5 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
             f"{' and '.join(map(str, source))}: no LPIPS-squeeze weights ({str(error)[:200]}); "
             "get them again"
         ) from error
-    for module in layers.modules():
-        if isinstance(module, nn.ReLU):
-            module.inplace = False
     layers.requires_grad_(False).eval().to(device)
     return layers, [w.to(device) for w in weights]

@@ -92,7 +92,9 @@ def test_registered_kinds_are_listed(folder):
         "cubes", lambda path: False, lambda path, config: None, description="cubes (*)"
     )
     (folder / "0.png").unlink()
-    with pytest.raises(ValueError, match=r"known are TartanAir V1 .*, photographs alone, cubes"):
+    with pytest.raises(
+        ValueError, match=r"known are TartanAir V1 .*, photographs alone, a video .*, cubes"
+    ):
         read_capture(folder)
     with pytest.raises(ValueError, match="there is a kind of capture 'tum' already"):
         register_capture("tum", lambda path: True, lambda path, config: None)

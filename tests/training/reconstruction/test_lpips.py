@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -204,3 +206,14 @@ def test_real_weights_rank_what_people_see():
     a, b, c = (torch.tensor(x.copy(), dtype=torch.float32) for x in (image, blurred, brighter))
     lpips = Lpips()
     assert lpips(b, a) > 5 * lpips(c, a) > 0
+
+
+def test_nothing_large_is_imported(weights_file):
+    """Neither torchvision nor Triton, which ends processes in which Mesa's OpenGL is, is loaded."""
+    script = (
+        "import sys, torch; from pathlib import Path\n"
+        "from splatpilot.training.reconstruction.lpips import Lpips\n"
+        f"Lpips(Path({str(weights_file)!r}))(torch.rand(20, 20, 3), torch.rand(20, 20, 3))\n"
+        "sys.exit(bool({'torchvision', 'triton'} & set(sys.modules)))"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
