@@ -83,7 +83,14 @@ def _ablate(folder: Path) -> list[str]:
 
 def _fidelity(folder: Path) -> list[str]:
     words = ["fidelity", f"{folder}/scene", "--overwrite", "--out", f"{folder}/out"]
-    return [*words, *_set(*_RECONSTRUCT, prefix="reconstruct."), "--set", "stretches=[1, 3]"]
+    return [
+        *words,
+        *_set(*_RECONSTRUCT, prefix="reconstruct."),
+        "--set",
+        "stretches=[1, 2]",
+        "--set",
+        "kept=2",
+    ]
 
 
 VERBS = {

@@ -1,0 +1,47 @@
+"""Which photographs are compared."""
+
+import numpy as np
+import pytest
+
+from splatpilot.training.captures.image_pairs import all_pairs, likely_pairs, vlad_similarity
+
+
+def test_all_pairs():
+    """Of few, every two are compared."""
+    assert all_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+
+
+@pytest.mark.parametrize("partners", [4, 8])
+def test_likely_pairs(partners):
+    """Neighbours in the order of names, and of the others those most alike, are compared; nothing
+    twice, and nothing with itself."""
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0, 0.1, (40, 40))
+    similarity = noise + noise.T
+    for a in range(20):  # The second half goes the way of the first again.
+        similarity[a, a + 20] = similarity[a + 20, a] = 1.0
+    pairs = likely_pairs(similarity, partners)
+    assert pairs == sorted(set(pairs)) and all(a < b for a, b in pairs)
+    assert {(a, a + 1) for a in range(39)} <= set(pairs)
+    assert {(a, a + 20) for a in range(20)} <= set(pairs)
+    assert 40 * partners / 2 - partners**2 <= len(pairs) <= 40 * partners
+
+
+def test_images_of_one_place_look_alike():
+    """Images that share descriptors are more alike than others, in whatever order and number they
+    come; an image without descriptors is like nothing."""
+    rng = np.random.default_rng(1)
+    places = [rng.normal(size=(400, 16)).astype(np.float32) for _ in range(3)]
+    features = [
+        place[rng.choice(400, 250, replace=False)] + rng.normal(0, 0.05, (250, 16))
+        for place in places
+        for _ in range(2)
+    ]
+    features = [each.astype(np.float32) for each in features] + [np.zeros((0, 16), np.float32)]
+    similarity = vlad_similarity(features)
+    np.testing.assert_allclose(similarity, similarity.T, atol=1e-12)
+    np.testing.assert_allclose(np.diag(similarity)[:6], 1.0)
+    for i in range(6):
+        others = np.delete(similarity[i], [i, i ^ 1])
+        assert similarity[i, i ^ 1] > others.max() + 0.2
+    assert np.abs(similarity[6]).max() < 1e-6
