@@ -28,6 +28,7 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_gaussians import capture_gaussians
 from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.video import is_video
 
 _MAX_IMAGES = 60
 _IMAGE_WIDTH = 480  # [px]
@@ -39,8 +40,8 @@ def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownP
     """What is shown of a place.
 
     Args:
-        what: a scene folder, a file of Gaussians, an OctoMap, the folder of a capture, or a
-            scenario.
+        what: a scene folder, a file of Gaussians, an OctoMap, the folder of a capture, a video,
+            or a scenario.
         seed: of a generated world; that of its scenario if None.
         overrides: FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
 
@@ -62,13 +63,13 @@ def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownP
 
 
 def generated_scenario(path: Path, seed: int | None, overrides: Sequence[str]) -> Scenario | None:
-    """The scenario whose generated world or OctoMap is meant, or None for a folder or a file of
-    Gaussians.
+    """The scenario whose generated world or OctoMap is meant, or None for a folder, a file of
+    Gaussians or a video.
 
     Raises:
         FileNotFoundError, ValueError: see `load_config`.
     """
-    if path.is_dir() or path.suffix.lower() in SUFFIXES:
+    if path.is_dir() or path.suffix.lower() in SUFFIXES or is_video(path):
         return None
     if path.suffix.lower() == OCTOMAP:
         scenario = load_config(Scenario(world=place_config(path)), None, list(overrides))

@@ -50,11 +50,13 @@ def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[i
 def similarity(database: "pycolmap.Database", names: list[str]) -> NDArray[np.float64]:
     """How alike images are that a database of features holds, (N, N) from -1 to 1."""
     numbers = [database.read_image_with_name(name).image_id for name in names]
-    features = [
-        np.sqrt(np.asarray(database.read_descriptors(number).data, dtype=np.float32))
-        for number in numbers
-    ]
-    return vlad_similarity(features)
+    return vlad_similarity([_descriptors(database, number) for number in numbers])
+
+
+def _descriptors(database: "pycolmap.Database", number: int) -> NDArray[np.float32]:
+    """RootSIFT (n, 128) of an image."""
+    held = database.read_descriptors(number)  # its `data` is a view, which does not keep it
+    return np.sqrt(np.array(held.data, dtype=np.float32))
 
 
 def vlad_similarity(features: list[NDArray[np.float32]]) -> NDArray[np.float64]:

@@ -1,9 +1,16 @@
 """Which photographs are compared."""
 
+import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.image_pairs import all_pairs, likely_pairs, vlad_similarity
+from splatpilot.training.captures.colmap import import_pycolmap
+from splatpilot.training.captures.image_pairs import (
+    all_pairs,
+    likely_pairs,
+    similarity,
+    vlad_similarity,
+)
 
 
 def test_all_pairs():
@@ -45,3 +52,27 @@ def test_images_of_one_place_look_alike():
         others = np.delete(similarity[i], [i, i ^ 1])
         assert similarity[i, i ^ 1] > others.max() + 0.2
     assert np.abs(similarity[6]).max() < 1e-6
+
+
+def test_features_of_a_database(tmp_path):
+    """Images whose features pycolmap keeps are compared: shifted ones are alike, others not."""
+    pycolmap = import_pycolmap()
+    rng = np.random.default_rng(2)
+    places = [
+        cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (320, 240)) for _ in range(2)
+    ]
+    names = [f"{i}.png" for i in range(4)]
+    for name, image in zip(
+        names, [p[:, s : s + 280] for p in places for s in (0, 40)], strict=True
+    ):
+        cv2.imwrite(str(tmp_path / name), image)
+    file = tmp_path / "features.db"
+    pycolmap.Database.open(file).close()
+    pycolmap.import_images(file, tmp_path, pycolmap.CameraMode.SINGLE, names)
+    pycolmap.extract_features(
+        file, tmp_path, names, extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False)
+    )
+    database = pycolmap.Database.open(file)
+    found = similarity(database, names)
+    database.close()
+    assert min(found[0, 1], found[2, 3]) > found[:2, 2:].max() + 0.2
