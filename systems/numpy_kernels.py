@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 
 KERNELS = {
-    "OPENBLAS_CORETYPE": "Haswell",
+    # Those of Haswell, which have AVX2, overwrite their stack in the OpenBLAS of numpy 2.5.5.
+    "OPENBLAS_CORETYPE": "Sandybridge",
     # All beyond AVX2, by the names of numpy before 2.4 and since.
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX "
     "AVX512_CLX AVX512_CNL",
