@@ -152,8 +152,21 @@ def _heeded() -> list[int]:
     return [number for number in _ENDED if signal.getsignal(number) is not signal.SIG_IGN]
 
 
+def _imports(frame: FrameType | None) -> bool:
+    """Whether a module is being imported: native ones abort, or say that they cannot be imported,
+    where an exception of others goes through them."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
 def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    """Ends the process at once. What it was writing goes when the next begins in that folder."""
     message, status = _ENDED[signal.Signals(number)]
+    with contextlib.suppress(RuntimeError, OSError):  # it may be in the midst of printing
+        sys.stdout.flush()
     os.write(2, f"splatpilot: {message}\n".encode())
     os._exit(status)
 
@@ -175,19 +188,15 @@ def _ended_by_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came: list[int] = []
 
     def end(number: int, frame: FrameType | None) -> None:
-        came.append(number)
+        if _imports(frame):
+            _leave(number, frame)
         raise _EndedError(number)
 
     before = {number: signal.signal(number, end) for number in _heeded()}
     try:
         yield
-    except Exception as error:
-        if came:  # native code has made another exception of it, as imports do
-            raise _EndedError(came[0]) from error
-        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
