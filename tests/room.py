@@ -24,7 +24,14 @@ def room_color(p_N: np.ndarray) -> np.ndarray:
     )
 
 
-def trace_room(p_N: np.ndarray, R_NB: np.ndarray, width: int, height: int):
+def tiled_color(p_N: np.ndarray) -> np.ndarray:
+    """The same with tiles of 8 cm, each of a brightness of its own: something to match."""
+    i, j, k = np.moveaxis(np.floor(p_N / 0.08 + 1e-6).astype(np.int64), -1, 0)
+    brightness = (i * 73856093 ^ j * 19349663 ^ k * 83492791) % 1009 / 1009
+    return 0.5 * room_color(p_N) + 0.5 * brightness[..., None]
+
+
+def trace_room(p_N: np.ndarray, R_NB: np.ndarray, width: int, height: int, color_at=room_color):
     """Depth (H, W) [m] along the body's x axis and colour (H, W, 3) of the room from inside."""
     f = width / 2
     v, u = np.mgrid[0:height, 0:width] + 0.5
@@ -33,7 +40,7 @@ def trace_room(p_N: np.ndarray, R_NB: np.ndarray, width: int, height: int):
     with np.errstate(divide="ignore"):
         to_walls = np.where(d_N > 0, (UPPER_N - p_N) / d_N, (LOWER_N - p_N) / d_N)
     depth = to_walls.min(axis=-1)
-    return depth, room_color(p_N + depth[..., None] * d_N)
+    return depth, color_at(p_N + depth[..., None] * d_N)
 
 
 def rotation_from_yaw_pitch(yaw: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -62,8 +69,10 @@ def write_room_capture(
     height: int = 48,
     poses: list = ROOM_POSES,
     brightness: Callable[[int, np.ndarray], np.ndarray] = lambda i, rho_squared: np.ones(1),
+    color_at: Callable[[np.ndarray], np.ndarray] = room_color,
 ) -> Path:
-    """Writes the room as a TartanAir V1 sequence, image i times brightness(i, (H, W) rho^2)."""
+    """Writes the room, coloured as `color_at` says, as a TartanAir V1 sequence, image i times
+    brightness(i, (H, W) rho^2)."""
     (path / "image_left").mkdir(parents=True)
     (path / "depth_left").mkdir()
     v, u = np.mgrid[0:height, 0:width] + 0.5
@@ -71,7 +80,7 @@ def write_room_capture(
     lines = []
     for i, (p_N, yaw, pitch) in enumerate(poses):
         R_NB, xyzw = rotation_from_yaw_pitch(yaw, pitch)
-        depth, color = trace_room(np.array(p_N), R_NB, width, height)
+        depth, color = trace_room(np.array(p_N), R_NB, width, height, color_at)
         color = np.clip(color * brightness(i, rho_squared)[..., None], 0, 1)
         bgr = np.round(color[..., ::-1] * 255).astype(np.uint8)
         cv2.imwrite(str(path / "image_left" / f"{i:06d}_left.png"), bgr)

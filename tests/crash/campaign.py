@@ -21,7 +21,7 @@ WAYS = "kill -9", "SIGTERM", "full disk", "no permission"
 _BLOCKS = ",".join(f"-{name}" for name in ("dac_override", "dac_read_search"))
 _MARK = "SPLATPILOT_CRASH_ROUND"
 _PROGRAM = "from splatpilot.analysis.cli import run; run()"
-_PATIENCE = 5.0  # [s], after which what a command has started must have ended with it
+_PATIENCE = 20.0  # [s], after which what a command has started must have ended with it
 
 
 class Round(NamedTuple):

@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from room import write_room_capture
+from room import tiled_color, write_room_capture
 
 _RECONSTRUCT = ("iterations=24", "image_width=0", "hold_out=6", "voxel_size=0.2", "threads=1")
 _RECONSTRUCT = (*_RECONSTRUCT, "checkpoint_every=8", "initial_gaussians=1500", "lpips_weight=0")
@@ -38,6 +38,8 @@ class Verb:
 def prepare(folder: Path) -> None:
     """Makes what the commands read."""
     write_room_capture(folder / "room")
+    along = [((0.8 + 0.15 * i, 0.2 * (i % 3) - 0.2, -1.2), 0.1 * (i % 2), 0.0) for i in range(12)]
+    write_room_capture(folder / "tiles", width=160, height=120, poses=along, color_at=tiled_color)
     (folder / "short.yaml").write_text(_SHORT)
 
 
@@ -77,7 +79,7 @@ def _tour(folder: Path) -> list[str]:
 
 
 def _ablate(folder: Path) -> list[str]:
-    words = ["ablate", f"{folder}/room", "--out", f"{folder}/out"]
+    words = ["ablate", f"{folder}/tiles", "--out", f"{folder}/out"]
     return [*words, *_set(*_RECONSTRUCT)]
 
 
@@ -102,7 +104,7 @@ VERBS = {
     ),
     "train": Verb(_train, "*.npz curves.csv config.yaml"),
     "tour": Verb(_tour, "capture/*/* scene/* flight/trajectory.npz"),
-    "ablate": Verb(_ablate, "*.csv *.md room/*/*"),
+    "ablate": Verb(_ablate, "*.csv *.md tiles/*/*"),
     "fidelity": Verb(_fidelity, "*.csv */*/*", "scene/*", reads_scene=True),
 }
 """By name."""
