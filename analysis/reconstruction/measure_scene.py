@@ -87,12 +87,14 @@ def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None
     numbers = list(measures.frames)
     picked = sorted({numbers[k] for k in np.linspace(0, len(numbers) - 1, _SHEET_ROWS).astype(int)})
     frames = [views.frame(i) for i in picked]
-    depths = depth_scale([frame.depth for frame in frames])
+    seen = [views.render(frame) for frame in frames]
+    true = [frame.depth for frame in frames if has_true_depth(frame.depth).any()]
+    depths = depth_scale(true or [view.depth for view in seen])
     middle = np.median([np.median(frame.depth) for frame in frames])
     errors = error_scale(_ERROR_LIMIT * float(middle) if 0 < middle < np.inf else 0.1)
     rows = []
-    for i, frame in zip(picked, frames, strict=True):
-        found, view = measures.frames[i], views.render(frame)
+    for i, frame, view in zip(picked, frames, seen, strict=True):
+        found = measures.frames[i]
         image, _ = fit_exposure(view.color, frame.image / 255, views.metadata.vignetting)
         row = [Panel(frame.image / 255), Panel(image, f"{found.psnr_db:.1f} dB")]
         rows.append(row + depth_panels(frame, view, found.depth_mae_m, depths, errors))

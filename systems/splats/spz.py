@@ -12,8 +12,8 @@ z back, where a PLY of the same place has x right, y down and z forward; the lat
 
 import struct
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,8 @@ _LARGEST_BITS = 24
 _X_PS = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])))  # SPZ's axes in a PLY's
 
 
-class _Header(NamedTuple):
+@dataclass(frozen=True)
+class _Header:
     version: int
     count: int
     bits: int  # fractional, of positions

@@ -49,8 +49,8 @@ def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[i
 
 def similarity(database: "pycolmap.Database", names: list[str]) -> NDArray[np.float64]:
     """How alike images are that a database of features holds, (N, N) from -1 to 1."""
-    numbers = [database.read_image_with_name(name).image_id for name in names]
-    return vlad_similarity([_descriptors(database, number) for number in numbers])
+    number_of = {image.name: image.image_id for image in database.read_all_images()}
+    return vlad_similarity([_descriptors(database, number_of[name]) for name in names])
 
 
 def _descriptors(database: "pycolmap.Database", number: int) -> NDArray[np.float32]:

@@ -4,7 +4,6 @@ import hashlib
 from pathlib import Path
 
 import cv2
-import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -77,7 +76,7 @@ def _extract(path: Path, rate: float, folder: Path) -> None:
         )
 
 
-def _sharpness(frame: NDArray[np.uint8]) -> float:
+def _sharpness(frame: NDArray) -> float:
     """The variance of the Laplacian of a frame in small."""
     width = min(_SHARPNESS_WIDTH, frame.shape[1])
     size = width, max(1, frame.shape[0] * width // frame.shape[1])

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures import video
+from splatpilot.training.captures import image_files, video
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.read_capture import read_capture
 
@@ -37,7 +37,7 @@ def registered(monkeypatch):
 
     def read(path, config):
         files = sorted(path.iterdir())
-        seen[path] = [cv2.imread(str(file)).mean() for file in files]
+        seen[path] = [image_files.read_image(file).mean() for file in files]
         seen["names"] = [file.name for file in files]
         raise ValueError(f"{path}: enough")
 
