@@ -22,6 +22,7 @@ _SERVED = {
     "px4": "`splatpilot px4`",
     "tensorboard": "curves in TensorBoard",
     "train": "training, reconstruction and measures of scenes",
+    "spz": "Gaussians in SPZ of version 4",
     "viser": "`splatpilot view --viser`",
 }
 """What each extra is for."""

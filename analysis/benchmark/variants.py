@@ -7,8 +7,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from splatpilot.systems.array_files import reason_of
-
 SCENARIO = "scenario"
 """The policy that is the scenario's own: what stands in its `policy` block."""
 
@@ -86,9 +84,8 @@ def parse_variant(text: str) -> Variant:
         label = "-".join([name, *(override.replace("=", "-", 1) for override in overrides)])
     if not _LABEL.fullmatch(label):
         raise ValueError(
-            f"the policy {reason_of(repr(text))} would be labelled {reason_of(repr(label))}, but "
-            "labels name files: give it one of at most 80 letters, digits and _ . + - in front, "
-            "LABEL=POLICY"
+            f"the policy {text[:100]!r} would be labelled {label[:100]!r}, but labels name files: "
+            "give it one of at most 80 letters, digits and _ . + - in front, LABEL=POLICY"
         )
     return Variant(label, policy, tuple(overrides))
 

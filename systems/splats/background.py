@@ -9,6 +9,7 @@ import numpy as np
 
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.png_chunks import require_whole_chunks
+from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.systems.splats.baked_scene import RenderedView
 
 if TYPE_CHECKING:
@@ -40,8 +41,9 @@ class EnvironmentMap:
         Raises:
             FileNotFoundError, ValueError: if there is no file, or it is no image.
         """
-        if not file.exists():
-            raise FileNotFoundError(f"{file}: does not exist; reconstruct the scene again")
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: there is no such file; reconstruct the scene again")
+        require_readable_size(file, file.stat().st_size)
         content = file.read_bytes()
         require_whole_chunks(file, content)
         try:

@@ -66,5 +66,5 @@ def test_files(tmp_path):
     (tmp_path / "bad.png").write_text("no image")
     with pytest.raises(ValueError, match=r"bad\.png: cannot be read as an image"):
         EnvironmentMap.load(tmp_path / "bad.png")
-    with pytest.raises(FileNotFoundError, match=r"none\.png: does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"none\.png: there is no such file"):
         EnvironmentMap.load(tmp_path / "none.png")
