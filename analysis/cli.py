@@ -1,6 +1,7 @@
 """The command line. It stands on the top floor because it may reach every other."""
 
 import argparse
+import atexit
 import contextlib
 import json
 import logging
@@ -80,8 +81,11 @@ def build_parser() -> argparse.ArgumentParser:
 def run() -> NoReturn:
     """The command `splatpilot`: `main`, before and after which signals end the process in the same
     way, but at once."""
-    for number in _heeded():
+    heeded = _heeded()
+    for number in heeded:
         signal.signal(number, _leave)
+    # Registered first, it is done last: Python then takes modules apart, and answers no signal.
+    atexit.register(signal.pthread_sigmask, signal.SIG_BLOCK, heeded)
     sys.exit(main())
 
 
