@@ -10,6 +10,10 @@ from typing import Any
 _WATCH_PERIOD = 0.5  # [s]
 
 
+class WorkerEndedError(OSError):
+    """A process that worked for this one was ended from outside, or by native code."""
+
+
 def map_processes[Work, Result](
     function: Callable[[Work], Result], work: Iterable[Work], jobs: int
 ) -> Iterator[Result]:
@@ -23,7 +27,7 @@ def map_processes[Work, Result](
         jobs: processes, 1 or more; with one, all is done in this one.
 
     Raises:
-        OSError: if a process was killed; all that was yielded before is good.
+        WorkerEndedError: if a process was killed; all that was yielded before is good.
     """
     from joblib import Parallel, delayed
     from joblib.externals.loky import get_reusable_executor
@@ -35,13 +39,35 @@ def map_processes[Work, Result](
     try:
         yield from parallel(map(delayed(function), work))
     except TerminatedWorkerError:
-        raise OSError(
+        raise WorkerEndedError(
             "a worker process was killed, perhaps for want of memory; what had ended is kept: run "
             "the same command again, with fewer --jobs if it repeats"
         ) from None
     finally:
         if jobs > 1:
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
+
+
+def run_apart[Work, Result](what: str, function: Callable[[Work], Result], work: Work) -> Result:
+    """
+    Returns `function` of `work`, called in a process of its own: native code may end it where it
+    should raise, as pycolmap does when the disk is full.
+
+    Args:
+        what: it does, and where, for messages.
+        function: of the module's level, as the process receives it by name.
+
+    Raises:
+        OSError: if the process was ended.
+    """
+    try:
+        [result] = map_processes(function, [work], 2)
+    except WorkerEndedError:
+        raise OSError(
+            f"{what}: its process was ended, for want of room on the disk or of memory; make room "
+            "and run the same command again"
+        ) from None
+    return result
 
 
 def _attended[Work, Result](parent: int, function: Callable[[Work], Result], work: Work) -> Result:

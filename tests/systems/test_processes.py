@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.processes import map_processes
+from splatpilot.systems.processes import map_processes, run_apart
 
 
 def _square(number: int) -> tuple[int, int]:
@@ -69,3 +69,22 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
     while any(map(_is_running, workers)):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.1)
+
+
+def _abort(work):
+    if work == "abort":
+        os.abort()
+    if work == "refuse":
+        raise ValueError(f"{work}: no")
+    return work, os.getpid()
+
+
+def test_work_apart():
+    """What is done in a process of its own comes back, with its exceptions; where native code ends
+    that process, an error says what was done."""
+    work, process = run_apart("a: counting", _abort, "count")
+    assert work == "count" and process != os.getpid()
+    with pytest.raises(ValueError, match="refuse: no"):
+        run_apart("a: counting", _abort, "refuse")
+    with pytest.raises(OSError, match="a: counting: its process was ended, for want of room"):
+        run_apart("a: counting", _abort, "abort")

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from splatpilot.systems.cores import available_cores
 from splatpilot.systems.files import folder_written_atomically, remove_leftovers
+from splatpilot.systems.processes import run_apart
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap, read_model
@@ -122,21 +123,24 @@ def _register(folder: Path, names: list[str], one_camera: bool, partners: int, m
         ) from None
     remove_leftovers(model.parent)
     with folder_written_atomically(model) as written:
-        _write_model(folder, names, one_camera, partners, written)
+        work = folder, names, one_camera, partners, written
+        run_apart(f"{model}: registration", _write_model, work)
 
 
-def _write_model(
-    folder: Path, names: list[str], one_camera: bool, partners: int, written: Path
-) -> None:
-    """Seeds are fixed and images get their numbers in order, so that the result does not depend on
+def _write_model(work: tuple[Path, list[str], bool, int, Path]) -> None:
+    """Writes the model of the images of a folder by name, of one camera or several, each compared
+    with so many partners, into a folder.
+
+    Seeds are fixed and images get their numbers in order, so that the result does not depend on
     which thread is first."""
-    work = written / "work"
-    work.mkdir()
+    folder, names, one_camera, partners, written = work
+    kept = written / "work"
+    kept.mkdir()
     pycolmap = import_pycolmap()
     pycolmap.set_random_seed(_SEED)
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 2
     try:
-        database = work / "database.db"
+        database = kept / "database.db"
         mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
         pycolmap.Database.open(database).close()
         pycolmap.import_images(database, folder, mode, names)
@@ -157,7 +161,7 @@ def _write_model(
         with tqdm(total=len(pairs), desc="matching", unit="pair") as progress:
             for start in range(0, len(pairs), block):
                 some = pairs[start : start + block]
-                listed = work / "pairs.txt"
+                listed = kept / "pairs.txt"
                 listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some))
                 pycolmap.match_image_pairs(
                     database,
@@ -174,7 +178,7 @@ def _write_model(
             models = pycolmap.incremental_mapping(
                 database,
                 folder,
-                work,
+                kept,
                 options,
                 initial_image_pair_callback=lambda: _advance(progress, 2),
                 next_image_callback=lambda: _advance(progress, 1),
@@ -186,7 +190,7 @@ def _write_model(
             )
         largest = max(models.values(), key=lambda each: each.num_reg_images())
         largest.write(written)
-        shutil.rmtree(work)
+        shutil.rmtree(kept)
     finally:
         pycolmap.logging.minloglevel = level
 
