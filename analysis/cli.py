@@ -171,14 +171,22 @@ def _leave(number: int, frame: FrameType | None) -> NoReturn:
     message, status = _ENDED[signal.Signals(number)]
     with contextlib.suppress(RuntimeError, OSError):  # it may be in the midst of printing
         sys.stdout.flush()
-    os.write(2, f"splatpilot: {message}\n".encode())
+    line = "\n" if _progress_bars() else ""
+    os.write(2, f"{line}splatpilot: {message}\n".encode())
     os._exit(status)
 
 
 def _say(message: str, status: int) -> int:
-    """Prints a message as one line; returns the status."""
+    """Prints a message as one line, the last; returns the status."""
+    for bar in _progress_bars():
+        bar.close()
     print(f"splatpilot: {' '.join(message.split())}", file=sys.stderr)
     return status
+
+
+def _progress_bars() -> list[Any]:
+    """Those of tqdm that are open: they end when somebody lets go of them, which may be later."""
+    return list(getattr(getattr(sys.modules.get("tqdm"), "tqdm", None), "_instances", ()))
 
 
 def _is_warning(record: logging.LogRecord) -> bool:

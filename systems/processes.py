@@ -51,22 +51,23 @@ def map_processes[Work, Result](
 def run_apart[Work, Result](what: str, function: Callable[[Work], Result], work: Work) -> Result:
     """
     Returns `function` of `work`, called in a process of its own: native code may end it where it
-    should raise, as pycolmap does when the disk is full.
+    should raise, or raise a RuntimeError of any meaning, as pycolmap does when the disk is full.
 
     Args:
         what: it does, and where, for messages.
         function: of the module's level, as the process receives it by name.
 
     Raises:
-        OSError: if the process was ended.
+        OSError: if the process was ended or raised a RuntimeError.
     """
     try:
         [result] = map_processes(function, [work], 2)
-    except WorkerEndedError:
+    except (WorkerEndedError, RuntimeError) as error:
+        why = "its process was ended" if isinstance(error, WorkerEndedError) else f"{error}"
         raise OSError(
-            f"{what}: its process was ended, for want of room on the disk or of memory; make room "
-            "and run the same command again"
-        ) from None
+            f"{what}: {why}, perhaps for want of room on the disk or of memory; make room and run "
+            "the same command again"
+        ) from error
     return result
 
 

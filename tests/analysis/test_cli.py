@@ -318,6 +318,29 @@ def test_signal_while_modules_are_taken_apart(number):
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
+@pytest.mark.parametrize(
+    ("how", "status", "message"),
+    [
+        (f"signal.raise_signal({int(signal.SIGTERM)})", 143, "terminated"),
+        ("raise ValueError('no')", 1, "no"),
+    ],
+)
+def test_what_is_said_stands_below_progress_bars(how, status, message, tmp_path):
+    """Neither in the line of a progress bar that nobody has closed, nor above its last state."""
+    (tmp_path / "working.py").write_text(
+        f"import signal; from tqdm import tqdm\nbar = tqdm(total=3)\nbar.update()\n{how}\n"
+    )
+    script = (
+        "import sys; from splatpilot.analysis.cli import main\n"
+        "sys.exit(main(['--import', 'working', 'doctor']))"
+    )
+    words = [sys.executable, "-c", script]
+    ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == status
+    assert ended.stderr.replace("\r", "\n").splitlines()[-1] == f"splatpilot: {message}"
+    assert "/3" in ended.stderr
+
+
 def test_drake_says_nothing_but_warnings(tmp_path):
     """Pages are written by a Meshcat that nobody is to connect to, so its address is not told."""
     script = (

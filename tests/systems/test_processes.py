@@ -76,15 +76,18 @@ def _abort(work):
         os.abort()
     if work == "refuse":
         raise ValueError(f"{work}: no")
+    if work == "fail":
+        raise RuntimeError("no factory")
     return work, os.getpid()
 
 
 def test_work_apart():
     """What is done in a process of its own comes back, with its exceptions; where native code ends
-    that process, an error says what was done."""
+    that process or raises what it always does, an error says what was done."""
     work, process = run_apart("a: counting", _abort, "count")
     assert work == "count" and process != os.getpid()
     with pytest.raises(ValueError, match="refuse: no"):
         run_apart("a: counting", _abort, "refuse")
-    with pytest.raises(OSError, match="a: counting: its process was ended, for want of room"):
-        run_apart("a: counting", _abort, "abort")
+    for work, why in (("abort", "its process was ended"), ("fail", "no factory")):
+        with pytest.raises(OSError, match=f"a: counting: {why}, perhaps for want of room"):
+            run_apart("a: counting", _abort, work)
