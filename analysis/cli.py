@@ -84,8 +84,9 @@ def run() -> NoReturn:
     heeded = _heeded()
     for number in heeded:
         signal.signal(number, _leave)
-    # Registered first, it is done last: Python then takes modules apart, and answers no signal.
-    atexit.register(signal.pthread_sigmask, signal.SIG_BLOCK, heeded)
+    # Registered first, it is done last: Python then takes modules apart, and answers no signal. To
+    # block them would do for this thread alone.
+    atexit.register(_ignore, heeded)
     sys.exit(main())
 
 
@@ -154,6 +155,11 @@ def _heeded() -> list[int]:
     """The signals that end this process. Whoever started it may have it ignore them, as shells do
     with what runs behind them."""
     return [number for number in _ENDED if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def _ignore(numbers: list[int]) -> None:
+    for number in numbers:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _imports(frame: FrameType | None) -> bool:

@@ -306,10 +306,14 @@ def test_signal_after_the_last_result(number, status):
 def test_signal_while_modules_are_taken_apart(number):
     """A signal that comes when Python answers none any more does not make a failure of success."""
     script = (
-        "import signal; from splatpilot.analysis.cli import run\n"
+        "import os, signal, threading, time; from splatpilot.analysis.cli import run\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        # What the main thread does not take goes to any other.
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
         "class Late:\n"
-        f"    def __del__(self, signal=signal): signal.raise_signal({int(number)})\n"
+        "    def __del__(self, kill=os.kill, process=os.getpid(), sleep=time.sleep):\n"
+        f"        kill(process, {int(number)})\n"
+        "        sleep(0.1)\n"
         "late = Late()\n"
         "run()"
     )
