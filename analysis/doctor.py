@@ -17,6 +17,7 @@ _DRIVER = Path("/proc/driver/nvidia")
 
 _SERVED = {
     "cluster": "`splatpilot benchmark --cluster`",
+    "mesh": "`splatpilot mesh`",
     "mocap": "OptiTrack in `splatpilot px4`",
     "photos": "photographs without poses, and COLMAP models",
     "px4": "`splatpilot px4`",

@@ -37,10 +37,10 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     view.add_argument(
         "--viser", action="store_true", help="serve it with viser instead of writing a page"
     )
-    add_overrides(view, ("world.spacing=2.4", "world.height=8"), _scenario_defaults)
+    add_overrides(view, ("world.spacing=2.4", "world.height=8"), scenario_defaults)
 
 
-def _scenario_defaults(options: argparse.Namespace) -> Any:
+def scenario_defaults(options: argparse.Namespace) -> Any:
     """Of the scenario that is named; of a capture other fields are set."""
     from splatpilot.diagrams.scenario import Scenario
     from splatpilot.systems.configuration import load_config

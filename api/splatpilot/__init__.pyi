@@ -9,6 +9,7 @@ from .diagrams.worlds.make_world import make_world, register_world
 from .diagrams.worlds.world import World
 from .systems.collision.esdf import Esdf
 from .systems.collision.esdf_collision import EsdfCollision
+from .systems.collision.field_mesh import field_mesh, write_mesh
 from .systems.configuration import dump_config, load_config
 from .systems.policies.hypothesis_selector import HypothesisSelector
 from .systems.policies.privileged_planner import PrivilegedPlanner
@@ -55,6 +56,7 @@ __all__ = [
     "World",
     "__version__",
     "dump_config",
+    "field_mesh",
     "fly",
     "hover_state",
     "load_config",
@@ -71,6 +73,7 @@ __all__ = [
     "register_trainer",
     "register_world",
     "sample_initial_state",
+    "write_mesh",
     "write_ply",
 ]
 

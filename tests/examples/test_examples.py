@@ -71,6 +71,16 @@ def test_splats_behind_drake(opengl, tmp_path):
     assert red[1] == 0 and 0 < red[0] < 0.6 * red[2]
 
 
+def test_bouncing_ball(tmp_path):
+    """It falls on the ground that the distance field knows, bounces, and comes to rest on it."""
+    run("bouncing_ball.py", "--out", tmp_path / "ball.csv", cwd=tmp_path)
+    _, _, _, z, clearance = np.loadtxt(tmp_path / "ball.csv", delimiter=",", skiprows=1).T
+    first = np.flatnonzero(np.diff(z) > 0)[0]
+    assert z[0] - z[first] > 1.0
+    assert z[first:].max() > z[first] + 0.05
+    assert np.abs(clearance[-25:]).max() < 0.05 and clearance.min() > -0.1
+
+
 def test_own_policy(tmp_path):
     """Copied anywhere and installed nowhere, it flies in the benchmark to its goal."""
     (tmp_path / "own_policy.py").write_text((EXAMPLES / "own_policy.py").read_text())

@@ -1,0 +1,74 @@
+"""A place that is touched: a ball bounces on the surfaces of a world, in Drake's MultibodyPlant.
+
+    python examples/bouncing_ball.py --place scenes/hospital --out ball.csv
+
+PLACE is a scene folder or an OctoMap, by default a generated forest. `splatpilot mesh` writes the
+same mesh as a file. Needs `pip install 'splatpilot[mesh]'`.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    Mesh,
+    ProximityProperties,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput
+
+import splatpilot as sp
+from splatpilot.diagrams.worlds.make_world import place_config
+
+RADIUS = 0.15  # [m]
+
+
+def main(place: Path | None, seconds: float, out: Path) -> None:
+    world = sp.make_world(sp.Scenario().world if place is None else place_config(place), seed=0)
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    rigid, elastic = ProximityProperties(), ProximityProperties()
+    AddRigidHydroelasticProperties(rigid)
+    AddCompliantHydroelasticProperties(0.5 * RADIUS, 2e5, elastic)
+    friction = CoulombFriction(0.8, 0.6)
+    AddContactMaterial(friction=friction, properties=rigid)
+    AddContactMaterial(dissipation=0.1, friction=friction, properties=elastic)
+    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(0.4, RADIUS))
+    plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(RADIUS), "ball", elastic)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "place.obj"
+        # Conservative, so that what nobody has seen is no hole in the floor.
+        sp.write_mesh(path, sp.field_mesh(world.esdf, conservative=True))
+        touched, X_WM = Mesh(path), RigidTransform()
+        plant.RegisterCollisionGeometry(plant.world_body(), X_WM, touched, "place", rigid)
+        plant.Finalize()
+        log = LogVectorOutput(plant.get_state_output_port(), builder, publish_period=0.02)
+        simulator = Simulator(builder.Build())
+
+    root = simulator.get_mutable_context()
+    plant.SetFreeBodyPose(plant.GetMyMutableContextFromRoot(root), ball, RigidTransform(world.p_WS))
+    simulator.AdvanceTo(seconds)
+    found = log.FindLog(root)
+    p_WB = found.data()[4:7].T  # after the quaternion
+    clearance = world.esdf.conservative().distance(p_WB) - RADIUS
+    table = np.column_stack([found.sample_times(), p_WB, clearance])
+    np.savetxt(out, table, "%.4f", ",", header="time,x,y,z,clearance", comments="")
+    fell = p_WB[0, 2] - p_WB[:, 2].min()
+    print(f"Wrote {out}: it fell {fell:.2f} m, and sank in by {-clearance.min():.3f} m at most.")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--place", type=Path, help="scene folder or OctoMap")
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--out", type=Path, default=Path("ball.csv"))
+    main(**vars(parser.parse_args()))

@@ -1,0 +1,64 @@
+"""`splatpilot mesh`: places as meshes."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatpilot.analysis.cli import main
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.systems.configuration import load_config
+
+SMALL = ["world.length=9", "world.width=6"]
+
+
+@pytest.fixture(scope="module")
+def world():
+    scenario = load_config(Scenario(), overrides=SMALL)
+    return make_world(scenario.world, 0)
+
+
+@pytest.mark.parametrize("kind", ["scene", "scenario"])
+def test_a_place_becomes_a_mesh(kind, world, tmp_path, capsys):
+    """A scene folder and the scenario that it came from give the trunks of the world, closed and in
+    world coordinates, and the command says how many triangles they take."""
+    out = tmp_path / "out" / "place.obj"
+    if kind == "scene":
+        write_scene_folder(tmp_path / "scene", world, provenance="")
+        words = [str(tmp_path / "scene")]
+    else:
+        (tmp_path / "small.yaml").write_text("world: {length: 9, width: 6}\n")
+        words = [str(tmp_path / "small.yaml"), "--seed", "0"]
+    assert main(["mesh", *words, "--out", str(out)]) == 0
+    mesh = trimesh.load(out, force="mesh")
+    assert mesh.is_watertight
+    assert f"{len(mesh.faces)} triangles" in capsys.readouterr().out
+    inside = np.all(
+        (mesh.vertices > world.esdf.lower_W + 0.2) & (mesh.vertices < world.esdf.upper_W - 0.2),
+        axis=1,
+    )
+    off = world.distance_field.distance(mesh.vertices[inside])
+    assert inside.sum() > 100
+    assert np.abs(off).max() < 0.5 * world.esdf.voxel_size
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["P02", "--out", "a.stl"], r"a.stl: a mesh is written as .gltf or .obj"),
+        (["nowhere", "--out", "a.obj"], "nowhere: there is no such"),
+        (["capture", "--out", "a.obj"], "capture: what is no scene folder"),
+        (["scene", "--seed", "1", "--out", "a.obj"], "neither a seed nor settings"),
+        (["P02", "--out", "there.obj"], "there.obj"),
+    ],
+)
+def test_what_cannot_be_a_mesh_is_said(words, message, world, tmp_path, capsys, monkeypatch):
+    """One line, and nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "there.obj").write_text("mine")
+    write_scene_folder(tmp_path / "scene", world, provenance="")
+    assert main(["mesh", *words]) == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.obj").exists() and (tmp_path / "there.obj").read_text() == "mine"

@@ -1,0 +1,118 @@
+"""Surfaces of distance fields as meshes, against shapes and against Drake's distances to meshes."""
+
+import numpy as np
+import pytest
+import trimesh
+from pydrake.geometry import GeometryInstance, Mesh, ProximityProperties, SceneGraph
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.field_mesh import field_mesh, write_mesh
+
+LOWER, VOXEL, SHAPE = np.array([-1.0, -2.0, 0.5]), 0.1, (30, 36, 24)
+CENTER, RADIUS = np.array([0.4, -0.3, 1.95]), 0.7
+
+
+def field(distance, unknown=None) -> Esdf:
+    axes = [LOWER[i] + VOXEL * (np.arange(SHAPE[i]) + 0.5) for i in range(3)]
+    p_WQ = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    distances = distance(p_WQ).astype(np.float32)
+    states = np.where(distances > 0, FieldState.FREE, FieldState.OCCUPIED).astype(np.uint8)
+    if unknown is not None:
+        states[unknown(p_WQ)] = FieldState.UNKNOWN
+    return Esdf(distances, states, LOWER, VOXEL)
+
+
+def ball(p_WQ):
+    return np.linalg.norm(p_WQ - CENTER, axis=-1) - RADIUS
+
+
+def floor(p_WQ):
+    """A floor that is 1 m high and slightly tilted."""
+    return (p_WQ @ [0.05, 0.1, 1.0] - 1.0) / np.linalg.norm([0.05, 0.1, 1.0])
+
+
+def drakes_distances(path, p_WQ) -> np.ndarray:
+    """Signed distances to a mesh in a file, as SceneGraph knows them."""
+    scene_graph = SceneGraph()
+    source = scene_graph.RegisterSource("test")
+    instance = GeometryInstance(RigidTransform(), Mesh(path), "mesh")
+    geometry = scene_graph.RegisterAnchoredGeometry(source, instance)
+    scene_graph.AssignRole(source, geometry, ProximityProperties())
+    query = scene_graph.get_query_output_port().Eval(scene_graph.CreateDefaultContext())
+    return np.array([query.ComputeSignedDistanceToPoint(p)[0].distance for p in p_WQ])
+
+
+def test_a_ball_is_a_ball():
+    """Closed, turned outwards, of the ball's volume, in fewer triangles than voxels on it have, and
+    the same every time."""
+    mesh = field_mesh(field(ball))
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
+    assert np.abs(ball(mesh.vertices)).max() < 0.3 * VOXEL
+    assert len(mesh.faces) < 2 * 4 * np.pi * RADIUS**2 / VOXEL**2
+    again = field_mesh(field(ball))
+    np.testing.assert_array_equal(mesh.vertices, again.vertices)
+    np.testing.assert_array_equal(mesh.faces, again.faces)
+
+
+@pytest.mark.parametrize(("conservative", "within"), [(False, 0.5), (True, 0.85)])
+def test_drakes_distances_are_the_fields(tmp_path, conservative, within):
+    """SceneGraph measures within half a voxel what the field says, near its surfaces, on either
+    side of them; a little more where unknown space and the box have edges, which the conservative
+    field says are farther than they are."""
+    esdf = field(
+        lambda p: np.minimum(ball(p), floor(p)),
+        unknown=lambda p: (p[..., 0] > 1.5) & (p[..., 2] > 1.3),
+    )
+    path = tmp_path / "place.obj"
+    write_mesh(path, field_mesh(esdf, conservative))
+    p_WQ = np.random.default_rng(0).uniform(LOWER + 0.1, esdf.upper_W - 0.1, (4000, 3))
+    expected = (esdf.conservative() if conservative else esdf).distance(p_WQ)
+    near = np.abs(expected) < VOXEL
+    assert near.sum() > 200
+    measured = drakes_distances(path, p_WQ[near])
+    error = np.abs(measured - expected[near]) / VOXEL
+    assert error.max() < within
+    assert np.quantile(error, 0.95) < 0.5
+
+
+def test_what_is_solid_ends_at_the_box():
+    """A floor is closed at the faces of the box and does not go on; conservatively it is part of a
+    shell around what is free, a voxel thick."""
+    esdf = field(floor)
+    mesh = field_mesh(esdf)
+    assert mesh.is_watertight
+    np.testing.assert_allclose(mesh.bounds[0], LOWER, atol=0.1 * VOXEL)
+    np.testing.assert_allclose(mesh.bounds[1][:2], esdf.upper_W[:2], atol=0.1 * VOXEL)
+    free = np.prod(esdf.upper_W - LOWER) - mesh.volume
+    shell = field_mesh(esdf, conservative=True)
+    assert shell.is_watertight
+    np.testing.assert_allclose(shell.bounds, [LOWER - VOXEL, esdf.upper_W + VOXEL], atol=1e-6)
+    solid = np.prod(np.ptp(shell.bounds, axis=0)) - shell.volume
+    assert solid == pytest.approx(free, rel=0.02)
+
+
+def test_files_are_read_by_others(tmp_path):
+    """OBJ has world coordinates, glTF is y up, and both have all of the mesh; a name of another
+    kind is refused."""
+    mesh = field_mesh(field(ball))
+    for name in ("ball.obj", "ball.gltf"):
+        write_mesh(tmp_path / name, mesh)
+        read = trimesh.load(tmp_path / name, force="mesh")
+        x, y, z = CENTER
+        np.testing.assert_allclose(
+            read.bounds.mean(axis=0), [x, y, z] if name == "ball.obj" else [x, z, -y], atol=0.02
+        )
+        assert len(read.faces) == len(mesh.faces)
+        assert read.volume == pytest.approx(mesh.volume, rel=1e-3)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["ball.gltf", "ball.obj"]
+    with pytest.raises(ValueError, match=r"ball\.stl: a mesh is written as \.gltf or \.obj"):
+        write_mesh(tmp_path / "ball.stl", mesh)
+
+
+def test_without_anything_solid_there_is_no_mesh():
+    """Nothing to touch is said so."""
+    with pytest.raises(ValueError, match="no surface in this field"):
+        field_mesh(field(lambda p: ball(p) + 10.0))
