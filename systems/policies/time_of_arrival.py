@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import skfmm
 from scipy.ndimage import distance_transform_edt
 
 from splatpilot.systems.collision.esdf import Esdf
@@ -217,6 +216,8 @@ def time_of_arrival(
     speed = np.where(ball, 1.0 / goal_slowness, 1.0 / slowness(field.distances))
     blocked = (field.distances < VEHICLE_RADIUS + margin) & ~ball
     front = np.ma.MaskedArray(to_goal - start, mask=blocked)
+    import skfmm  # Has no wheels for ARM, where all but planning works without it.
+
     marched = skfmm.travel_time(front, speed, dx=field.voxel_size, order=2)
     reachable = ~np.ma.getmaskarray(marched)
     times = np.where(ball, to_goal, start) * goal_slowness
