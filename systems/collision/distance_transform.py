@@ -4,9 +4,11 @@ import itertools
 
 import edt
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from splatpilot.systems.collision.distance_field import FieldState
+
+_SLAB = 32  # [voxels] along x that are looked at at a time, for the sake of memory.
 
 
 def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
@@ -26,11 +28,13 @@ def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Signed distance to occupied voxels whose surface is the faces of the voxels.
+    """Signed distance to occupied voxels whose surface is the faces of the voxels, never farther
+    than it is, where it is interpolated trilinearly.
 
-    The two-sided transform between voxel centres less half a voxel. Outside smooth solids sampled
-    at voxel centres it is biased near, the safe side, by up to 0.35 voxel (rms 0.2 to 0.4), because
-    a face is met obliquely; the transform without that half voxel is biased far by 0.2 to 0.5.
+    At voxel centres the exact distance, less what the interpolant is too large by in the half
+    voxels around: distances to an edge or corner are convex, and a chord is above them. Beside
+    flat walls that is nothing. Against the faces of random voxels the interpolant is 0.1 to 0.4
+    voxel near on average, up to 1 at worst, and never far; in occupied voxels it is not positive.
 
     Args:
         occupied: (nx, ny, nz) bool.
@@ -39,9 +43,44 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     Returns:
         (nx, ny, nz) float32 [m], negative in occupied voxels.
     """
-    outside = distance_to_voxels(occupied, voxel_size) - 0.5 * voxel_size
-    inside = distance_to_voxels(~occupied, voxel_size) - 0.5 * voxel_size
-    return np.where(occupied, -inside, outside)
+    if not occupied.any() or occupied.all():
+        far = np.float32(_diagonal(occupied.shape, voxel_size))
+        return np.full(occupied.shape, -far if occupied.any() else far)
+    # In half voxels: sample 2i + 1 is the centre of voxel i, 2i and 2i + 2 are its faces.
+    distances = edt.edt(~_with_faces(occupied), parallel=1)
+    distances -= edt.edt(~_with_faces(~occupied), parallel=1)
+    near = np.empty(occupied.shape, np.float32)
+    length = occupied.shape[0]
+    for start in range(0, length, _SLAB):
+        first, last = max(start - 1, 0), min(start + _SLAB + 1, length)
+        part = distances[2 * first + 1 : 2 * last]
+        part = part[:, 1:-1, 1:-1]  # from centre to centre along the other axes too
+        excess = np.maximum(_between(part[::2, ::2, ::2]) - part, 0.0)
+        excess = maximum_filter(excess, 3, mode="nearest")[::2, ::2, ::2]
+        safe = part[::2, ::2, ::2] - excess
+        end = min(start + _SLAB, length)
+        near[start:end] = safe[start - first : end - first]
+    return near * np.float32(0.5 * voxel_size)
+
+
+def _with_faces(voxels: np.ndarray) -> np.ndarray:
+    """Which samples, half a voxel apart, lie in or on marked voxels: (2nx + 1, ...) bool."""
+    marked = np.zeros([2 * n + 1 for n in voxels.shape], bool)
+    for corner in itertools.product(range(3), repeat=3):
+        part = tuple(slice(i, i + 2 * n, 2) for i, n in zip(corner, voxels.shape, strict=True))
+        marked[part] |= voxels
+    return marked
+
+
+def _between(values: np.ndarray) -> np.ndarray:
+    """Values (n, ...) and what lies halfway between neighbours: (2n - 1, ...)."""
+    for axis in range(values.ndim):
+        values = np.moveaxis(values, axis, 0)
+        finer = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)
+        finer[::2] = values
+        finer[1::2] = 0.5 * (values[:-1] + values[1:])
+        values = np.moveaxis(finer, 0, axis)
+    return values
 
 
 def distances_from_band(

@@ -50,10 +50,10 @@ def esdf_from_occupancy(
 ) -> Esdf:
     """The signed distance field of an occupancy grid.
 
-    Without `surface_offset` the surface is the faces of the occupied voxels: biased near, the safe
-    side, see `occupancy_distances`. With it the surface is known to a fraction of a voxel and the
-    field follows it: against analytic solids the error outside them is 0.03 to 0.13 voxel on
-    average (far) and 0.07 to 0.2 rms, and near zero within a voxel of the surface.
+    Without `surface_offset` the surface is the faces of the occupied voxels, and distances are
+    never farther than those, see `occupancy_distances`. With it the surface is known to a fraction
+    of a voxel and the field follows it: against analytic solids the error outside them is 0.03 to
+    0.13 voxel on average (far) and 0.07 to 0.2 rms, and near zero within a voxel of the surface.
 
     Args:
         occupied: (nx, ny, nz) bool.
