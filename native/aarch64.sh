@@ -44,7 +44,7 @@ fi
 if [ ! -e "$work/site/torch" ]; then
   "$python" -m uv pip install --quiet --target "$work/site" --only-binary :all: \
     --python-platform aarch64-manylinux_2_40 --python-version 3.13 \
-    drake edt hypothesis joblib lazy-loader lcm matplotlib numpy opencv-python-headless pillow \
+    av drake edt hypothesis joblib lazy-loader lcm matplotlib numpy opencv-python-headless pillow \
     plyfile pytest pyyaml scipy torch==2.8.0 tqdm trimesh
 fi
 
