@@ -94,9 +94,13 @@ def test_images_are_shrunk_as_for_the_making(place):
 
 
 def test_capture_without_depth(place):
-    """Without depth only colours are measured."""
+    """Without depth only colours are measured, and the sheet has no columns for what is unknown."""
     blind = replace(place.capture, load_depth=lambda i: None)
-    measures = measure_scene(place.scene("blind"), blind)
+    scene, seeing = place.scene("blind"), place.scene("seeing")
+    measures = measure_scene(scene, blind)
+    measure_scene(seeing)
+    width, wider = (np.shape(cv2.imread(str(s / "views.png")))[1] for s in (scene, seeing))
+    assert 0.5 * wider < width < 0.75 * wider
     assert measures.mean("depth_mae_m") is None and measures.mean("floater_fraction") is None
     assert measures.as_json()["psnr_db"] > 55
     assert "depth MAE [m]          -" in str(measures)
