@@ -10,6 +10,7 @@ from lcm import LCM
 
 from splatpilot.analysis.faults.fault import DELAY, Fault
 from splatpilot.systems.messaging.codecs import Codec
+from splatpilot.systems.weakly import weakly
 
 
 class Relay:
@@ -36,12 +37,9 @@ class Relay:
         self._ends, self._count, self._now = (vehicle, bridge), 0, 0.0
         self._waiting: list[tuple[float, int, LCM, str, bytes]] = []
         self._state: Any = None
-        for sender, receiver, codecs in (
-            (vehicle, bridge, from_vehicle),
-            (bridge, vehicle, from_bridge),
-        ):
+        for sender, codecs in ((vehicle, from_vehicle), (bridge, from_bridge)):
             for codec in codecs:
-                sender.subscribe(codec.channel, self._taker(receiver, codec, sender is vehicle))
+                sender.subscribe(codec.channel, self._taker(codec, sender is vehicle))
 
     def step(self, now: float) -> None:
         """Takes what was sent, and delivers what is due at a time [s]."""
@@ -53,15 +51,18 @@ class Relay:
             _, _, receiver, channel, data = heapq.heappop(self._waiting)
             receiver.publish(channel, data)
 
-    def _taker(self, receiver: LCM, codec: Codec, of_vehicle: bool):
-        def take(channel: str, data: bytes) -> None:
-            delays, data = self._treat(codec, data, of_vehicle)
-            for delay in delays:
-                self._count += 1
-                due = self._now + delay
-                heapq.heappush(self._waiting, (due, self._count, receiver, channel, data))
+    def _taker(self, codec: Codec, of_vehicle: bool):
+        # LCM owns what it calls, and is owned by the relay.
+        take = weakly(self._take)
+        return lambda channel, data: take(codec, of_vehicle, channel, data)
 
-        return take
+    def _take(self, codec: Codec, of_vehicle: bool, channel: str, data: bytes) -> None:
+        receiver = self._ends[1 if of_vehicle else 0]
+        delays, data = self._treat(codec, data, of_vehicle)
+        for delay in delays:
+            self._count += 1
+            due = self._now + delay
+            heapq.heappush(self._waiting, (due, self._count, receiver, channel, data))
 
     def _treat(self, codec: Codec, data: bytes, of_vehicle: bool) -> tuple[list[float], bytes]:
         """The delays [s] with which a message arrives, once or more or never, and what it is."""

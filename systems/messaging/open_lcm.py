@@ -1,5 +1,6 @@
 """Where messages travel."""
 
+import os
 import time
 
 from lcm import LCM
@@ -8,6 +9,9 @@ DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=4000000"
 """LCM's own group and port, seen on this host only (ttl=0); a buffer for images."""
 
 _PROBE = "SPLATPILOT_PROBE"
+
+# LCM waits by select(), which overwrites its stack for files numbered from 1024; it opens several.
+_MOST_FILES = 1000
 
 
 def open_lcm(url: str = DEFAULT_URL) -> LCM:
@@ -23,6 +27,12 @@ def open_lcm(url: str = DEFAULT_URL) -> LCM:
     """
     if not url.startswith(("udpm://", "memq://")):
         raise OSError(f"the LCM URL is {url!r}; it must begin with udpm:// or memq://")
+    with open(os.devnull) as file:
+        if file.fileno() >= _MOST_FILES:
+            raise OSError(
+                f"LCM cannot use {url}: {file.fileno()} files are open in this process, at most "
+                f"{_MOST_FILES} may be; close what is no longer needed"
+            )
     heard = []
     try:
         lcm = LCM(url)

@@ -12,6 +12,8 @@ INITIALIZATIONS = ("auto", "depth", "points", "random")
 STRATEGIES = ("auto", "none", "default", "mcmc")
 DISTANCE_FIELDS = ("rendered", "captured")
 DEVICES = ("cpu", "cuda")
+# [m]
+_FINEST = 0.005
 
 
 @dataclass(kw_only=True)
@@ -114,10 +116,12 @@ class ReconstructConfig:
     distance_field: str = "rendered"
     """Which depth becomes the distance field: "rendered" from the Gaussians, or "captured".
     Captures without depth have only the former; without iterations there is only the latter."""
-    voxel_size: float = 0.05
-    """[m], of the distance field. Where the scale is unknown, the median depth counts as 2 m."""
-    max_range: float = 8.0
-    """[m], depth beyond which the distance field does not believe the camera; the same applies."""
+    voxel_size: float = 0.0
+    """[m], of the distance field. Where the scale is unknown, the median depth counts as 2 m. 0 for
+    0.05, or as coarse as makes 20 million voxels of a large place."""
+    max_range: float = 0.0
+    """[m], depth beyond which the distance field does not believe the camera; the same applies. 0
+    for 8, or half as much again as the median depth where that is more."""
 
     seed: int = 0
     """Seed of everything random."""
@@ -177,7 +181,8 @@ class ReconstructConfig:
             "colors_rate": 0,
             "contrast": 0.001,
             "max_extent": 0.001,
-            "voxel_size": 0.005,
+            "voxel_size": 0,
+            "max_range": 0,
             "seed": 0,
             "threads": 0,
             "checkpoint_every": 1,
@@ -200,7 +205,12 @@ class ReconstructConfig:
             raise ValueError(f"sh_degree is {self.sh_degree}, 0 to 3 is needed")
         if self.hold_out == 1:
             raise ValueError("hold_out is 1, which withholds every frame; use 0 or at least 2")
-        if not self.max_range > self.voxel_size:
+        if 0 < self.voxel_size < _FINEST:
+            raise ValueError(
+                f"voxel_size is {self.voxel_size} m; at least {_FINEST}, or 0 for what suits the "
+                "place, is needed"
+            )
+        if 0 < self.max_range <= self.voxel_size:
             raise ValueError(
                 f"max_range is {self.max_range} m, more than the voxel size {self.voxel_size} m is "
                 "needed"

@@ -53,6 +53,7 @@ class ReconstructSummary:
     metric: bool  # lengths are in units of their own where it is false
     lower_W: NDArray[np.float64]  # (3,) [m]
     upper_W: NDArray[np.float64]  # (3,) [m]
+    voxel_size: float  # [m], of the distance field
     observed_free_volume: float  # [m^3]
     p_WS: NDArray[np.float64]  # (3,) [m]
     p_WG: NDArray[np.float64]  # (3,) [m]
@@ -72,6 +73,7 @@ class ReconstructSummary:
             "frames": self.frames,
             "Gaussians": self.gaussians,
             "size": f"{size} {unit}, from {vector(self.lower_W)} to {vector(self.upper_W)}",
+            "distance field": f"voxels of {self.voxel_size:.2g} {unit}",
             "image gains": f"{self.gain_range[0]:.3f} to {self.gain_range[1]:.3f}",
             "corner brightness": f"{np.exp(self.vignetting):.3f}",
         }
@@ -186,6 +188,7 @@ def reconstruct(
         metric=capture.metric,
         lower_W=field.lower_W,
         upper_W=field.upper_W,
+        voxel_size=field.voxel_size,
         observed_free_volume=field.volume(FieldState.FREE),
         p_WS=p_WS,
         p_WG=p_WG,

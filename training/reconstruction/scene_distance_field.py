@@ -23,6 +23,13 @@ from splatpilot.training.reconstruction.views import ShrunkFrames
 _NEAR = 0.5
 # The median depth of a scene of unknown scale is taken to be this [m].
 _MEDIAN_DEPTH = 2.0
+# What is not given: rooms have this range and these voxels [m], larger places multiples of their
+# median depth, and as many voxels as a flight loads in seconds.
+_RANGE, _VOXEL_SIZE = 8.0, 0.05
+_RANGE_OF_MEDIAN = 1.5
+_VOXELS = 20e6
+# So many images are enough for the median of their depths.
+_MEDIAN_IMAGES = 100
 
 
 @dataclass(frozen=True)
@@ -36,10 +43,11 @@ class DepthSource:
     def images(self) -> Iterator[NDArray[np.float32]]:
         return (self.load(i) for i in range(len(self.X_WCs)))
 
-    def median(self) -> float:
-        """[m], over all images; 0 where there is none."""
-        depths = [image[::4, ::4] for image in self.images()]
-        depth = np.concatenate([d[(d > 0) & np.isfinite(d)] for d in depths])
+    def median(self, far: float) -> float:
+        """[m], of what is nearer than `far` [m] in images all along the path; 0 if nothing is."""
+        step = -(-len(self.X_WCs) // _MEDIAN_IMAGES)
+        depths = [self.load(i)[::4, ::4] for i in range(0, len(self.X_WCs), step)]
+        depth = np.concatenate([d[(d > 0) & (d < far)] for d in depths])
         return float(np.median(depth)) if len(depth) else 0.0
 
 
@@ -102,24 +110,40 @@ def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
     return DepthSource(load, rendered.K, rendered.X_WCs)
 
 
-def fuse(
-    source: DepthSource,
-    voxel_size: float,
-    max_range: float,
-    bounds: tuple[NDArray, NDArray] | None = None,
-) -> Esdf:
+@dataclass(frozen=True)
+class FieldGrid:
+    """The grid of a distance field, and how far depth is believed."""
+
+    lower_W: NDArray[np.float64]  # (3,) [m]
+    upper_W: NDArray[np.float64]  # (3,) [m]
+    voxel_size: float  # [m]
+    max_range: float  # [m]
+
+
+def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) -> FieldGrid:
+    """Returns the grid that holds what depth images show, as fine and as far as the config says or,
+    where it says nothing, as suits the place. Lengths of the config are metres, or those of a place
+    whose median depth is `_MEDIAN_DEPTH` where the scale is unknown."""
+    median = source.median(FAR if metric else np.inf)
+    unit = 1.0 if metric else max(median, 1e-6) / _MEDIAN_DEPTH
+    max_range = config.max_range * unit or max(_RANGE * unit, _RANGE_OF_MEDIAN * median)
+    lower_W, upper_W = bounds_of_depth_images(source.images(), source.K, source.X_WCs, max_range)
+    coarse = float(np.cbrt(np.prod(upper_W - lower_W) / _VOXELS))
+    voxel_size = config.voxel_size * unit or max(_VOXEL_SIZE * unit, coarse)
+    return FieldGrid(lower_W, upper_W, voxel_size, max_range)
+
+
+def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
     """Fuses depth images into a distance field; space that no image saw is marked unknown."""
-    lower_W, upper_W = bounds or bounds_of_depth_images(
-        source.images(), source.K, source.X_WCs, max_range
-    )
     return esdf_from_depth_images(
-        source.images(), source.K, source.X_WCs, lower_W, upper_W, voxel_size, max_range
+        source.images(),
+        source.K,
+        source.X_WCs,
+        grid.lower_W,
+        grid.upper_W,
+        grid.voxel_size,
+        grid.max_range,
     )
-
-
-def unit_of(source: DepthSource, metric: bool) -> float:
-    """Returns the length that counts as a metre: 1, unless the scale is unknown."""
-    return 1.0 if metric else max(source.median(), 1e-6) / _MEDIAN_DEPTH
 
 
 @dataclass(frozen=True)
@@ -174,16 +198,15 @@ def make_distance_field(
     """
     every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
     if config.iterations == 0:
-        return fuse(every, config.voxel_size, config.max_range), None, every
+        return fuse(every, choose_grid(every, capture.metric, config)), None, every
     rendered = render_depth_of(
         capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
-    unit = unit_of(rendered, capture.metric)
-    voxel_size, max_range = config.voxel_size * unit, config.max_range * unit
     if not capture.has_depth:
-        return fuse(rendered, voxel_size, max_range), None, rendered
-    truth = fuse(every, voxel_size, max_range)
-    field = fuse(add_sky(rendered, frames), voxel_size, max_range, (truth.lower_W, truth.upper_W))
+        return fuse(rendered, choose_grid(rendered, capture.metric, config)), None, rendered
+    grid = choose_grid(every, capture.metric, config)
+    truth = fuse(every, grid)
+    field = fuse(add_sky(rendered, frames), grid)
     difference = compare_fields(field, truth)
     if config.distance_field == "rendered":
         return field, difference, every
@@ -192,4 +215,4 @@ def make_distance_field(
         capture.K,
         [capture.X_WCs[i] for i in frames.numbers],
     )
-    return fuse(seen, voxel_size, max_range), difference, every
+    return fuse(seen, choose_grid(seen, capture.metric, config)), difference, every

@@ -1,6 +1,7 @@
 """Flights in which something goes wrong, and that nothing worse comes of it."""
 
 import json
+import os
 import shutil
 
 import lcm
@@ -48,6 +49,15 @@ def test_without_a_fault_everything_arrives_at_once():
     line = Line("policy_killed")
     assert [data for _, data in line.heard] == line.sent
     np.testing.assert_allclose([now for now, _ in line.heard], 0.02 * np.arange(150))
+
+
+def test_a_relay_ends_with_what_it_connects():
+    """Hundreds of trials in one process open no more files than one."""
+    Line("dropped")
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        Line("dropped")
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_each_fault_of_messages_is_what_it_is_called():

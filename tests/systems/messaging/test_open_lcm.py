@@ -1,5 +1,7 @@
 """Opening LCM."""
 
+import os
+import resource
 import socket
 
 import pytest
@@ -36,3 +38,21 @@ def test_port_in_use_is_refused(udp_url):
         url = f"udpm://239.255.76.67:{other.getsockname()[1]}?ttl=0"
         with pytest.raises(OSError, match="does not deliver its own messages; use a multicast"):
             open_lcm(url)
+
+
+def test_too_many_open_files_are_an_error_and_no_crash():
+    """Beyond a thousand files LCM would overwrite its own stack."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limits[1] != resource.RLIM_INFINITY and limits[1] < 1100:
+        pytest.skip(f"this process may open {limits[1]} files only")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limits[0], 1100), limits[1]))
+    files = []
+    try:
+        while not files or files[-1] < 1000:
+            files.append(os.open(os.devnull, os.O_RDONLY))
+        with pytest.raises(OSError, match="files are open in this process, at most 1000"):
+            open_lcm("memq://")
+    finally:
+        for file in files:
+            os.close(file)
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)

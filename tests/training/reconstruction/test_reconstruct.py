@@ -107,9 +107,9 @@ def test_images_are_read_once(tmp_path, write_room, iterations):
         ({"max_gaussians": 0}, "max_gaussians is 0, at least 1"),
         ({"max_cell": 3}, "max_cell is 3, a power of two"),
         ({"opacity": 0.0}, r"opacity is 0\.0, it must be in \(0, 1\]"),
-        ({"voxel_size": 0.0}, r"voxel_size is 0\.0, at least 0\.005"),
+        ({"voxel_size": 0.001}, r"voxel_size is 0\.001 m; at least 0\.005, or 0"),
         ({"voxel_size": float("nan")}, "voxel_size is nan"),
-        ({"max_range": 0.0}, r"max_range is 0\.0 m, more than the voxel size"),
+        ({"max_range": 0.2, "voxel_size": 0.2}, r"max_range is 0\.2 m, more than the voxel size"),
         ({"contrast": -1.0}, r"contrast is -1\.0, at least 0\.001"),
     ],
 )

@@ -5,7 +5,14 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.reconstruction.scene_distance_field import DepthSource, add_sky, fuse
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.scene_distance_field import (
+    DepthSource,
+    FieldGrid,
+    add_sky,
+    choose_grid,
+    fuse,
+)
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
 K = np.array([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
@@ -35,6 +42,41 @@ def test_space_before_the_sky_is_free_only_where_a_fitted_frame_measured_it():
     expected = rendered.copy()
     expected[15:, :20] = np.inf
     np.testing.assert_array_equal(sky.load(1), expected)
-    box = np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5])
-    states = fuse(sky, 0.1, 8.0, box).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
+    grid = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
+    states = fuse(sky, grid).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
     np.testing.assert_array_equal(states, [FieldState.FREE, FieldState.UNKNOWN])
+
+
+def _wall(depth: float) -> DepthSource:
+    """Half of each image shows a wall, half the sky."""
+    image = np.full((60, 80), depth, dtype=np.float32)
+    image[:30] = np.inf
+    return DepthSource(lambda i: image, K, [RigidTransform()] * 3)
+
+
+def test_rooms_have_the_grid_of_rooms():
+    grid = choose_grid(_wall(3.0), True, ReconstructConfig())
+    assert (grid.voxel_size, grid.max_range) == (0.05, 8.0)
+
+
+def test_large_places_are_seen_as_a_whole_in_few_voxels():
+    grid = choose_grid(_wall(40.0), True, ReconstructConfig())
+    assert grid.max_range == 60.0
+    assert grid.upper_W[2] >= 40.0
+    voxels = np.prod((grid.upper_W - grid.lower_W) / grid.voxel_size)
+    assert grid.voxel_size > 0.05 and abs(voxels - 20e6) < 0.01 * 20e6
+
+
+def test_what_is_given_is_taken():
+    config = ReconstructConfig(voxel_size=0.1, max_range=8.0)
+    grid = choose_grid(_wall(40.0), True, config)
+    assert (grid.voxel_size, grid.max_range) == (0.1, 8.0)
+    assert grid.upper_W[2] < 9.0
+
+
+def test_the_grid_of_a_place_without_scale_does_not_change_with_its_unit():
+    small, large = (choose_grid(_wall(depth), False, ReconstructConfig()) for depth in (3.0, 300.0))
+    np.testing.assert_allclose(large.max_range, 100 * small.max_range)
+    np.testing.assert_allclose(small.max_range, 8.0 * 3.0 / 2.0)
+    np.testing.assert_allclose(small.voxel_size, 0.05 * 3.0 / 2.0)
+    np.testing.assert_allclose(large.voxel_size, 100 * small.voxel_size)
