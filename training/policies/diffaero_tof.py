@@ -40,7 +40,7 @@ def streaming_noise() -> ObservationNoise:
 class DiffAeroTofTraining(DiffAeroTraining):
     """A training run."""
 
-    schedule: Schedule = field(default_factory=lambda: Schedule(updates=12000, validate_every=500))
+    schedule: Schedule = field(default_factory=lambda: Schedule(updates=6000, validate_every=500))
     rollout: RolloutConfig = field(default_factory=lambda: RolloutConfig(noise=streaming_noise()))
 
 
