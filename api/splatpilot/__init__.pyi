@@ -16,7 +16,6 @@ from .systems.policies.privileged_planner import PrivilegedPlanner
 from .systems.sensing.observation_noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
 from .systems.splats.baked_scene import BakedScene
-from .systems.splats.distortion import Distortion
 from .systems.splats.gaussian_ply import read_ply, write_ply
 from .systems.splats.gaussian_scene import GaussianScene
 from .systems.splats.rasterization import rasterize
@@ -36,7 +35,6 @@ __all__ = [
     "BakedScene",
     "BuildFlightDiagram",
     "Capture",
-    "Distortion",
     "Esdf",
     "EsdfCollision",
     "FlatnessController",
