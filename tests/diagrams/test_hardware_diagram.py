@@ -70,7 +70,7 @@ class Halves:
 
 @pytest.mark.parametrize("name", ["planner", "reactive", "depthnav"])
 def test_the_two_halves_fly_as_the_whole(post_world, name):
-    """Cut in two, a flight is the same but for the 6 ms of messages: within 15 cm after 3 s, for
+    """Cut in two, a flight is the same but for the 6 ms of messages: within 20 cm after 3 s, for
     policies with plans, with accelerations and with headings, blind and seeing."""
     scenario = Scenario(
         timeout=3.0, policy=policy_named(name), start=[1.0, 1.0, 2.0], goal=[9.0, 1.0, 2.0]
@@ -78,7 +78,7 @@ def test_the_two_halves_fly_as_the_whole(post_world, name):
     whole = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
     halves = Halves(scenario, post_world)
     halves.advance_to(3.0)
-    np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.15)
+    np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.2)
     assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 2.0
     mode, _, state_age, _, gaps, rejected, overruns = halves.status()
     assert mode == lcmt_bridge_status.FLYING
