@@ -11,6 +11,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
+from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgb, DiffAeroRgbConfig
 from splatpilot.systems.policies.diffaero_tof import DiffAeroTof, DiffAeroTofConfig
 from splatpilot.systems.policies.policy_checkpoint import policy_of
 from splatpilot.systems.policies.privileged_planner import (
@@ -118,6 +119,10 @@ those that see by a sensor of their own."""
 
 register_policy(
     DiffAeroTofConfig, lambda config, world, vehicle: DiffAeroTof(config), name="diffaero_tof"
+)
+
+register_policy(
+    DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
 # Of these no weights ship.

@@ -24,6 +24,7 @@ POLICIES = (
     "depthnav",
     "agile_autonomy",
     "diffaero_tof",
+    "diffaero_rgb",
     "student_rgb",
     "student_depth",
 )
@@ -34,6 +35,7 @@ TRAINERS = (
     "depthnav",
     "diffaero_tof",
     "agile_autonomy",
+    "diffaero_rgb",
     "student_rgb",
     "student_depth",
 )

@@ -1,7 +1,7 @@
 """What the configurations of learned depth policies have in common."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 from splatpilot.systems.policies.agile_autonomy_inference import TrajectoryNetworkSpec
 from splatpilot.systems.policies.observation import require_poolable
@@ -27,15 +27,24 @@ class DepthPolicyConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.1 <= self.speed <= 10.0:
-            raise ValueError(
-                f"{type(self).__name__}.speed is {self.speed} m/s but must be 0.1 to 10; the "
-                f"default is {type(self).speed}"
-            )
+        require_speed(self)
         self.camera.validate()
         require_poolable(
             self.camera.height,
             self.camera.width,
             self.network.image_height,
             self.network.image_width,
+        )
+
+
+class _HasSpeed(Protocol):
+    speed: float
+
+
+def require_speed(config: _HasSpeed) -> None:
+    """Raises ValueError unless the speed that a policy is asked for can be."""
+    if not 0.1 <= config.speed <= 10.0:
+        raise ValueError(
+            f"{type(config).__name__}.speed is {config.speed} m/s but must be 0.1 to 10; the "
+            f"default is {type(config).speed}"
         )

@@ -50,9 +50,23 @@ def decide(
     Raises:
         ValueError: for a depth image of another size.
     """
-    R_WB = X_WB.rotation().matrix()
     nearest = pool_depth(depth, network.spec.image_height, network.spec.image_width)
-    image = inverse_depth(nearest, NEAREST, FARTHEST)
+    grid = inverse_depth(nearest, NEAREST, FARTHEST)
+    return decide_by_grid(network, grid, X_WB, v_WB, p_WG, speed, memory)
+
+
+def decide_by_grid(
+    network: RecurrentNetwork,
+    grid: np.ndarray,
+    X_WB: RigidTransform,
+    v_WB: np.ndarray,
+    p_WG: np.ndarray,
+    speed: float,
+    memory: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `decide`, of the inverse depths `grid` (9, 16), see `inverse_depth`, that are nearest in
+    each cell."""
+    R_WB = X_WB.rotation().matrix()
     state = heading_observation(R_WB, X_WB.translation(), v_WB, p_WG, speed)
-    output, memory = network.step(image, state, memory)
+    output, memory = network.step(grid, state, memory)
     return heading_frame(R_WB) @ limit_smoothly(output, ACCELERATION_LIMITS), memory

@@ -31,17 +31,24 @@ class OnnxModel:
         """The name of what the last operator gives."""
 
     def convolution(
-        self, weight: np.ndarray, bias: np.ndarray, *, stride: int, groups: int
+        self,
+        weight: np.ndarray,
+        bias: np.ndarray,
+        *,
+        stride: int = 1,
+        groups: int = 1,
+        dilation: int = 1,
     ) -> None:
-        """Convolves (N, C, H, W) by `weight` (outputs, C / groups, k, k), k odd, padded by k // 2,
-        and adds `bias` (outputs,)."""
+        """Convolves (N, C, H, W) by `weight` (outputs, C / groups, k, k), k odd, padded by k // 2
+        times the dilation, and adds `bias` (outputs,)."""
         name, kernel = f"convolution{len(self._nodes)}", weight.shape[2]
         for part, values in (("weight", weight), ("bias", bias)):
             self._tensors.append(_tensor(f"{name}.{part}", values))
         attributes = {
             "kernel_shape": [kernel] * 2,
             "strides": [stride] * 2,
-            "pads": [kernel // 2] * 4,
+            "pads": [dilation * (kernel // 2)] * 4,
+            "dilations": [dilation] * 2,
             "group": groups,
         }
         self._add("Conv", [self.output, f"{name}.weight", f"{name}.bias"], attributes)
@@ -49,6 +56,10 @@ class OnnxModel:
     def clip(self, least: float, most: float) -> None:
         """Limits all numbers."""
         self._add("Clip", [self.output], {"min": least, "max": most})
+
+    def leaky_relu(self, slope: float) -> None:
+        """Multiplies negative numbers by `slope`."""
+        self._add("LeakyRelu", [self.output], {"alpha": slope})
 
     def add(self, other: str) -> None:
         """Adds what an earlier operator gave, by its name."""

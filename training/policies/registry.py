@@ -8,6 +8,7 @@ from splatpilot.systems.registry import Registry
 from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
 from splatpilot.training.policies.depthnav import DepthNavLearner, DepthNavTraining
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
+from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
 from splatpilot.training.policies.diffaero_tof import DiffAeroTofLearner, DiffAeroTofTraining
 from splatpilot.training.policies.rollout_trainer import RolloutTrainer
 from splatpilot.training.policies.student import StudentTrainer
@@ -62,5 +63,6 @@ register_trainer(
     ),
 )
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
+register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
 register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
 register_trainer("student_depth", StudentDepthTraining, StudentTrainer)

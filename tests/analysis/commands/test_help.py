@@ -92,7 +92,7 @@ def test_names_that_are_checked_early_are_those_registered():
     [
         ("splatpilot rep", {"replay "}),
         ("splatpilot fly --ov", {"--overwrite "}),
-        ("splatpilot fly --policy diff", {"diffaero", "diffaero_tof"}),
+        ("splatpilot fly --policy diff", {"diffaero", "diffaero_tof", "diffaero_rgb"}),
         ("splatpilot fly --scenario P0", {f"P0{n}" for n in range(1, 10)}),
         ("splatpilot train dep", {"depthnav "}),
     ],

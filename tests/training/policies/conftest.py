@@ -31,12 +31,19 @@ CAMERA = OnboardCamera(width=32, height=24)
 @pytest.fixture(scope="session")
 def student_corpus(tmp_path_factory) -> Path:
     """The folder of a corpus of 3 worlds with 24 samples each."""
-    return write_corpus(tmp_path_factory.mktemp("corpus"), 3, 24)
+    return _write_corpus(tmp_path_factory.mktemp("corpus"), 3, 24, CAMERA)
 
 
-def write_corpus(folder: Path, worlds: int, states: int) -> Path:
+@pytest.fixture(scope="session")
+def wide_corpus(tmp_path_factory) -> Path:
+    """The folder of a corpus of 3 worlds with 16 samples each, of 160x120."""
+    camera = OnboardCamera(width=160, height=120)
+    return _write_corpus(tmp_path_factory.mktemp("wide_corpus"), 3, 16, camera)
+
+
+def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera) -> Path:
     """Random states on the way past pillars; red is near, and what is far is blue."""
-    config = CorpusConfig(camera=CAMERA)
+    config = CorpusConfig(camera=camera)
     claim_folder(folder / CONFIG, config)
     for part in ("worlds", "shards"):
         (folder / part).mkdir()
@@ -74,8 +81,9 @@ def write_corpus(folder: Path, worlds: int, states: int) -> Path:
 
 def _seen(rows: list, shapes: list[Shape], config: CorpusConfig) -> Samples:
     samples = Samples.zeros(len(rows), config.size)
+    camera = config.camera
     rays, geometry = (
-        PixelRays.of(CAMERA.width, CAMERA.height, CAMERA.fov_x),
+        PixelRays.of(camera.width, camera.height, camera.fov_x),
         ShapeGeometry([shapes]),
     )
     for n, (q_WB, p_WB, v_WB, waypoints_B) in enumerate(rows):
@@ -84,7 +92,7 @@ def _seen(rows: list, shapes: list[Shape], config: CorpusConfig) -> Samples:
         p_WC = torch.tensor((p_WB + CAMERA_AHEAD * x)[None], dtype=torch.float32)
         R_WC = torch.tensor(np.stack([-y, -z, x], 1)[None], dtype=torch.float32)
         depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(1, dtype=torch.int64))
-        samples.depth[n] = depth.reshape(CAMERA.height, CAMERA.width).clamp(max=1e4)
+        samples.depth[n] = depth.reshape(camera.height, camera.width).clamp(max=1e4)
         near = np.clip(1.0 - samples.depth[n].astype(float) / 10.0, 0.0, 1.0)
         samples.color[n] = 255.0 * np.stack([near, 0.0 * near, 1.0 - near], 2)
         samples.X_WB[n] = *q_WB, *p_WB

@@ -1,0 +1,175 @@
+"""Training DiffAero in colours, from a corpus to weights that fly."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.systems.policies.diffaero_rgb_inference import load_network
+from splatpilot.systems.policies.monocular_depth import MonocularDepth, MonocularSpec, encode_view
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.training.policies.diffaero_rgb import (
+    DiffAeroRgbTrainer,
+    DiffAeroRgbTraining,
+    MonocularModule,
+    mirrored,
+)
+from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.policies.train import run
+
+
+def training(corpus: Path, *overrides: str) -> DiffAeroRgbTraining:
+    settings = [
+        f"corpora=[{corpus}]",
+        "held_out=0.34",
+        "batch=8",
+        "schedule.updates=40",
+        "schedule.validate_every=40",
+        "schedule.checkpoint_every=20",
+    ]
+    return load_config(DiffAeroRgbTraining(), overrides=[*settings, *overrides])
+
+
+@pytest.fixture(scope="module")
+def trained(wide_corpus, tmp_path_factory) -> Path:
+    """The folder of a run."""
+    out = tmp_path_factory.mktemp("trained")
+    run(config=training(wide_corpus), out=out, make=TRAINERS.find("diffaero_rgb").make)
+    return out
+
+
+def test_what_flies_is_what_was_trained():
+    """OpenCV's output is torch's, and what the trainer shows its network is what flight does."""
+    torch.manual_seed(0)
+    spec = MonocularSpec()
+    module = MonocularModule(spec)
+    for weights in module.parameters():
+        torch.nn.init.normal_(weights, std=0.05)
+    weights = {name: values.numpy() for name, values in module.state_dict().items()}
+    view = np.random.default_rng(0).uniform(-1, 1, (6, 90, 160)).astype(np.float32)
+    found = np.stack(MonocularDepth(spec, weights)(view))
+    with torch.no_grad():
+        expected = module(torch.from_numpy(view)[None])[0].numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_trainer_shows_what_flight_shows(wide_corpus):
+    """Colours, rays and nearest depths of a sample are those of `encode_view` and of its depth."""
+    trainer = DiffAeroRgbTrainer(training(wide_corpus))
+    numbers = np.array([3, 20])
+    color, rays, target = trainer._samples(numbers)
+    data = trainer._data
+    for n, number in enumerate(numbers):
+        label = data.labels(numbers).X_WB[n].numpy()
+        w, x, y, z = label[:4]
+        R_WB = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        image = data.pixels(np.array([number]), "color")[0]
+        view = encode_view(image, R_WB)
+        np.testing.assert_allclose(rays[n].numpy(), view[3:], atol=1e-5)
+        shown = color[n].movedim(2, 0).numpy() / 127.5 - 1.0
+        np.testing.assert_allclose(shown, view[:3], atol=1e-5)
+        depth = data.pixels(np.array([number]), "depth")[0][15:105].astype(float)
+        cell = depth[20:30, 50:60].min()
+        assert target[n, 2, 5] == pytest.approx(3.0 / np.clip(cell, 0.3, 12.0) - 0.6, rel=1e-5)
+
+
+def test_a_mirror_swaps_left_and_right_of_rays_too():
+    """The view of a vehicle that rolls and pitches is, mirrored, the view of the mirrored world by
+    the vehicle that rolls the other way."""
+    rng = np.random.default_rng(4)
+    color = rng.integers(0, 256, (90, 160, 3)).astype(np.uint8)
+    mirror = np.diag([1.0, -1.0, 1.0])
+    angle, axis = 0.3, np.array([0.6, 0.8, 0.0])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    R_WB = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    views = [encode_view(color, R_WB), encode_view(color[:, ::-1], mirror @ R_WB @ mirror)]
+    view = torch.from_numpy(np.stack([views[0], views[0]]))
+    found = mirrored(view, torch.tensor([True, False])).numpy()
+    np.testing.assert_allclose(found[0], views[1], atol=1e-5)
+    np.testing.assert_array_equal(found[1], views[0])
+
+
+def test_it_learns_what_it_is_shown_and_flies(trained):
+    """Depths, which the corpus paints, are judged better and better; what decides stays DiffAero;
+    and the weights fly through a generated world."""
+    rows = list(csv.DictReader((trained / "curves.csv").open()))
+    curve = [{name: float(value) for name, value in row.items() if value} for row in rows]
+    assert curve[-1]["likelihood"] < curve[0]["likelihood"] - 0.3
+    assert curve[-1]["error"] < 0.7 * curve[0]["error"]
+    file = str(trained / "diffaero_rgb.npz")
+    shipped = PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).weights
+    with np.load(file) as weights:
+        for name, values in shipped.items():
+            np.testing.assert_array_equal(weights[f"policy.{name}"], values)
+    assert load_network(file).policy.initial_hidden().shape == (128,)
+    world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
+    scenario = Scenario(seed=1_000_000, policy=policy_named(file, 3.0), timeout=1.0)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
+
+
+def test_interrupted_training_ends_as_whole(wide_corpus, tmp_path):
+    """A run that was interrupted between two checkpoints ends with the same weights and curves, bit
+    for bit."""
+    overrides = ["schedule.updates=4", "schedule.validate_every=4", "schedule.checkpoint_every=2"]
+    config, make = training(wide_corpus, *overrides), TRAINERS.find("diffaero_rgb").make
+
+    def make_interrupted(config):
+        trainer = make(config)
+
+        def interrupt(update: int) -> None:
+            if update == 3:
+                raise KeyboardInterrupt
+
+        trainer.begin_update = interrupt
+        return trainer
+
+    run(config=config, out=tmp_path / "whole", make=make)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "again", make=make_interrupted)
+    run(config=config, out=tmp_path / "again", make=make)
+    with (
+        np.load(tmp_path / "whole" / "diffaero_rgb.npz") as whole,
+        np.load(tmp_path / "again" / "diffaero_rgb.npz") as again,
+    ):
+        for name in whole.files:
+            np.testing.assert_array_equal(whole[name], again[name])
+    curves = [(tmp_path / name / "curves.csv").read_text() for name in ("whole", "again")]
+    assert curves[0] == curves[1]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["corpora=[]"], "corpora is empty"),
+        (["batch=0"], "batch is 0"),
+        (["held_out=0.95"], r"held_out is 0\.95"),
+        (["noise.color_noise=-1"], r"noise\.color_noise is -1"),
+    ],
+)
+def test_bad_configurations_are_named(wide_corpus, overrides, message):
+    """The message names the field and its value."""
+    with pytest.raises(ValueError, match=message):
+        training(wide_corpus, *overrides).validate()
+
+
+def test_a_corpus_seen_through_another_camera_is_refused(student_corpus):
+    """The message says which images the policy looks at."""
+    with pytest.raises(ValueError, match="has 32x24 pixels, but this policy looks at the middle"):
+        DiffAeroRgbTrainer(training(student_corpus))
