@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from splatpilot.systems.policies.convolutions import LEAK
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, FARTHEST, NEAREST
@@ -109,6 +110,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         self.network = DiffAeroRgbModule().to(config.device)
         self.network.load_policy(config.policy)
         self._rays_B = torch.from_numpy(rays_B()).flatten(0, 1).to(config.device)
+        self._targets = torch.from_numpy(self._nearest()).to(config.device)
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
         data, count = self._data.held_out, config.validation_samples
         self._validation = data[np.linspace(0, len(data) - 1, min(count, len(data))).astype(int)]
@@ -170,18 +172,29 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
     def _samples(self, numbers: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """Colours (N, 90, 160, 3), 0 to 255, rays in the heading frame (N, 3, 90, 160) and nearest
         inverse depths (N, 9, 16) of samples."""
-        device, spec = self._config.device, self.spec.policy
-        first = (self._data.camera.height - HEIGHT) // 2
-        rows = slice(first, first + HEIGHT)
-        color = torch.from_numpy(self._data.pixels(numbers, "color")[:, rows]).to(device).float()
-        depth = self._data.pixels(numbers, "depth")[:, rows].astype(np.float32)
-        h, w = spec.image_height, spec.image_width
-        nearest = depth.reshape(-1, h, HEIGHT // h, w, WIDTH // w).min((2, 4))
-        target = inverse_depth(torch.from_numpy(nearest).to(device), NEAREST, FARTHEST)
+        device = self._config.device
+        color = self._data.pixels(numbers, "color")[:, self._rows()]
         R_WB = rotation_matrix(self._data.labels(numbers).X_WB[:, :4])
         R_WH = heading_frame(torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0]))
-        rays = (R_WH.mT @ R_WB) @ self._rays_B.mT
-        return color, rays.unflatten(2, (HEIGHT, WIDTH)), target
+        rays = ((R_WH.mT @ R_WB) @ self._rays_B.mT).unflatten(2, (HEIGHT, WIDTH))
+        target = inverse_depth(self._targets[torch.from_numpy(numbers)], NEAREST, FARTHEST)
+        return torch.from_numpy(color).to(device).float(), rays, target
+
+    def _nearest(self) -> np.ndarray:
+        """The nearest depths (N, 9, 16) [m] in the cells of all samples."""
+        spec = self.spec.policy
+        h, w = spec.image_height, spec.image_width
+        blocks = (-1, h, HEIGHT // h, w, WIDTH // w)
+        kept = []
+        for shard in tqdm(self._data.shards, desc="depths", unit="shard", disable=None):
+            depth = shard.arrays["depth"][:, self._rows()]
+            kept.append(depth.reshape(blocks).min((2, 4)).astype(np.float32))
+        return np.concatenate(kept)
+
+    def _rows(self) -> slice:
+        """Those in the middle of the corpora's images."""
+        first = (self._data.camera.height - HEIGHT) // 2
+        return slice(first, first + HEIGHT)
 
 
 def mirrored(view: Tensor, which: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """What the student learns from: samples of several corpora, and the distances in their worlds."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from hashlib import blake2b
 from typing import NamedTuple
 
@@ -79,7 +80,7 @@ class StudentData:
             trajectories_B=joined("trajectories_B"),
             world=torch.from_numpy(world).to(device),
         )
-        self._fields = EsdfGeometry([_trusted(records[name].esdf()) for name in self.worlds])
+        self._records = records
 
     def labels(self, numbers: np.ndarray) -> "Labels":
         """What belongs to the images of the samples of `numbers` (N,)."""
@@ -106,6 +107,11 @@ class StudentData:
         p_WQ = waypoints_B.detach().flatten(1, 2) @ R_WB.mT + p_WB
         world = labels.world.repeat_interleave(M * T)
         return self._fields.interpolate(p_WQ.flatten(0, 1), world)[0].reshape(N, M, T)
+
+    @cached_property
+    def _fields(self) -> EsdfGeometry:
+        """The distances in all worlds, which not everybody asks for."""
+        return EsdfGeometry([_trusted(self._records[name].esdf()) for name in self.worlds])
 
 
 def held_out_names(names: Sequence[str], share: float) -> list[str]:
