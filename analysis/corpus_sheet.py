@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.sample import EXPERT
+from splatpilot.training.corpus.sample import EXPERT, SOURCES
 
 _SCALE = 3  # pixels of the sheet a pixel of an image
 _COLUMNS = 4
@@ -41,7 +41,8 @@ def draw_sheet(corpus: Corpus, out: Path, count: int, seed: int = 0) -> None:
             for image in (samples.color[i], shaded)
         ]
         world = corpus.worlds[samples.world[i]].name
-        source = "" if samples.source[i] == EXPERT else ", recovery"
+        kind = samples.source[i]
+        source = "" if kind == EXPERT else f", {SOURCES[kind]}"
         text = f"{index}: {world}{source}, {np.linalg.norm(samples.v_B[i]):.1f} m/s"
         panels[0][:22] //= 3  # for the text to be read
         cv2.putText(panels[0], text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)

@@ -21,6 +21,9 @@ class CorpusConfig:
     # [-] Flights of the expert in each world, all to its goal: the first from its start, the others
     # from anywhere at least half as far away.
     flights: int = 16
+    # [-] States in each world that lie on no flight: anywhere in free space, half of them before a
+    # surface; see `training/corpus/off_path.py`.
+    off_path: int = 0
     # What the student will see through.
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(width=160, height=120))
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
@@ -38,6 +41,8 @@ class CorpusConfig:
         self.expert.validate()
         if not 1 <= self.flights <= 1000:
             raise ValueError(f"flights is {self.flights}; it must be 1 to 1000")
+        if not 0 <= self.off_path <= 100_000:
+            raise ValueError(f"off_path is {self.off_path}; it must be 0 to 100000")
         self.camera.validate()
         self.perturbation.validate()
         if not 0.0 <= self.appearance <= 1.0:

@@ -13,7 +13,7 @@ import numpy as np
 
 from splatpilot.systems.configuration import load_config
 from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.sample import Samples
+from splatpilot.training.corpus.sample import OFF_PATH, Samples
 from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.corpus.world_record import WorldRecord
 
@@ -58,8 +58,9 @@ class Corpus:
         return int(self._first[-1])
 
     def __str__(self) -> str:
-        flights = [flight for shard in self.shards for flight in shard.flights]
-        states = sum(flight["states"] for flight in flights)
+        states = sum(flight["states"] for shard in self.shards for flight in shard.flights)
+        flown = [shard for shard in self.shards if shard.source != OFF_PATH]
+        flights = [flight for shard in flown for flight in shard.flights]
         shown = sum(flight["states"] > 0 for flight in flights)
         return (
             f"{len(self)} samples of {states} states, {shown} of {len(flights)} flights and "

@@ -1,6 +1,7 @@
 """Gathering in one world: the expert flies; its states are labelled, seen and written."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.demonstrations import keep_clear, see_states
 from splatpilot.training.corpus.library import world_source
-from splatpilot.training.corpus.sample import EXPERT, Samples
+from splatpilot.training.corpus.off_path import STATES_A_LOOK, draw_off_path
+from splatpilot.training.corpus.sample import EXPERT, OFF_PATH, SOURCES, Samples
 from splatpilot.training.corpus.shard import write_shard
-from splatpilot.training.corpus.world_record import record_world
+from splatpilot.training.corpus.world_record import WorldSource, record_world
 from splatpilot.training.policies.expert import PLANNER, ExpertFlight, Labeller, fly_policy
 from splatpilot.training.policies.planner_flights import fly_planner
 
@@ -40,6 +42,7 @@ def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) 
     world = make_world(source.world, source.seed)
     labeller = Labeller(world.esdf, world.p_WG, config.expert)
     record_world(folder / "worlds" / source.name, source, world.esdf)
+    _gather_off_path(folder, config, source, world, labeller, revision)
     rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
     starts = np.stack([world.p_WS, *(_draw_start(labeller, world.p_WS, rng) for rng in rngs[1:])])
     parts, entries = [], []
@@ -72,9 +75,40 @@ def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) 
     )
 
 
-def shard_folder(folder: Path, world: str) -> Path:
-    """Where what the expert showed in a world is kept."""
-    return folder / "shards" / f"expert-{world}"
+def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
+    """Where what is seen in a world is kept: on the expert's flights, or off its path."""
+    return folder / "shards" / f"{SOURCES[source]}-{world}"
+
+
+def _gather_off_path(
+    folder: Path,
+    config: CorpusConfig,
+    source: WorldSource,
+    world: World,
+    labeller: Labeller,
+    revision: str,
+) -> None:
+    """Writes the shard of states that lie on no flight, if any are asked for."""
+    if not config.off_path:
+        return
+    alone = replace(config, perturbation=replace(config.perturbation, copies=0))
+    parts = []
+    for first in range(0, config.off_path, STATES_A_LOOK):
+        # The expert's flights have the numbers from 0 on.
+        rng = np.random.default_rng([config.seed, source.seed, config.flights + first])
+        count = min(STATES_A_LOOK, config.off_path - first)
+        states = draw_off_path(labeller, count, config.expert.speed, rng)
+        demonstrations = keep_clear(labeller.labels(states), labeller.field)
+        bound = source.perturbation_bound
+        parts.append(see_states(demonstrations, world, labeller, alone, bound, rng))
+    write_shard(
+        shard_folder(folder, source.name, OFF_PATH),
+        Samples.concatenate(parts, config.size),
+        world=source.name,
+        source=OFF_PATH,
+        flights=[{"states": sum(map(len, parts))}],
+        revision=revision,
+    )
 
 
 def _fly(

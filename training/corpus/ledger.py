@@ -6,7 +6,7 @@ from typing import Any
 
 from splatpilot.systems.files import written_atomically
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.sample import EXPERT
+from splatpilot.training.corpus.sample import SOURCES
 
 LEDGER = "ledger.csv"
 
@@ -22,7 +22,7 @@ def write_ledger(folder: Path, corpus: Corpus) -> None:
         same = {
             "shard": shard.path.name,
             "world": shard.world,
-            "source": "expert" if shard.source == EXPERT else "recovery",
+            "source": SOURCES[shard.source],
             "revision": shard.revision,
         }
         rows += [same | flight for flight in shard.flights]

@@ -17,6 +17,7 @@ from splatpilot.training.corpus.corpus import CONFIG, Corpus
 from splatpilot.training.corpus.gather import gather_world, shard_folder
 from splatpilot.training.corpus.ledger import write_ledger
 from splatpilot.training.corpus.library import world_source
+from splatpilot.training.corpus.sample import OFF_PATH
 from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.corpus.world_record import WorldRecord
 
@@ -53,7 +54,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     claim_folder(out / CONFIG, config)
     for part in ("worlds", "shards"):
         require_writable_folder(out / part)
-    missing = [k for k in range(worlds) if not _is_there(out, names[k])]
+    missing = [k for k in range(worlds) if not _is_there(out, names[k], config)]
     gather = partial(_gather, out, config, revision())
     with tqdm(total=worlds, initial=worlds - len(missing), desc="worlds", unit="world") as bar:
         for reason in map_processes(gather, missing, jobs):
@@ -65,19 +66,23 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     return corpus
 
 
-def _is_there(out: Path, world: str) -> bool:
+def _is_there(out: Path, world: str, config: CorpusConfig) -> bool:
     """Whether a world and its shard are there and whole; what is left of them otherwise is
     removed."""
     record, shard = out / "worlds" / world, shard_folder(out, world)
+    off_path = shard_folder(out, world, OFF_PATH)
     if not shard.exists():
         return False
     try:
         WorldRecord(record)
         Shard(shard).verify()
+        if config.off_path:
+            Shard(off_path).verify()
     except (ValueError, OSError) as error:
         tqdm.write(f"{error}: {world} is gathered again")
         shutil.rmtree(record, ignore_errors=True)
         shutil.rmtree(shard)
+        shutil.rmtree(off_path, ignore_errors=True)
         return False
     return True
 

@@ -7,8 +7,12 @@ import numpy as np
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 
-EXPERT, RECOVERY = 0, 1
-"""Where a sample comes from: a flight of the expert, or the time before a student's near-miss."""
+EXPERT, RECOVERY, OFF_PATH = 0, 1, 2
+"""Where a sample comes from: a flight of the expert, the time before a student's near-miss, or
+anywhere in free space."""
+
+SOURCES = {EXPERT: "expert", RECOVERY: "recovery", OFF_PATH: "off_path"}
+"""Their names."""
 
 
 class SampleSize(NamedTuple):
@@ -50,7 +54,7 @@ class Samples:
     # fewer than K.
     trajectories_B: np.ndarray
     world: np.ndarray  # (N,) int32, index into `Corpus.worlds`
-    source: np.ndarray  # (N,) uint8, `EXPERT` or `RECOVERY`
+    source: np.ndarray  # (N,) uint8, of `SOURCES`
 
     @classmethod
     def zeros(cls, count: int, size: SampleSize) -> Self:

@@ -43,7 +43,7 @@ def write_shard(
     Args:
         samples: what to write, perhaps none; their `world` and `source` are stated once:
         world: name of the world that all are from.
-        source: `EXPERT` or `RECOVERY`, of all.
+        source: one of `SOURCES`, of all.
         flights: of each flight that they come from, what JSON can hold.
         revision: of the program.
 

@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from splatpilot.systems.configuration import load_config
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.seeds import TRAINING_SEEDS
 from splatpilot.training.corpus import make
+from splatpilot.training.corpus.sample import EXPERT, OFF_PATH
 
 
 def all_bytes(folder: Path) -> dict[str, bytes]:
@@ -54,6 +56,25 @@ def test_what_is_damaged_is_gathered_again(small, gathered, tmp_path, monkeypatc
     make.run(config=small, out=out, worlds=2, jobs=1)
     assert asked == [0, 1]
     assert all_bytes(out) == all_bytes(folder)
+
+
+def test_states_off_the_path_have_shards_of_their_own(small, gathered, tmp_path):
+    """What flights showed is what it is without them; a damaged shard of theirs is gathered again,
+    to the same bytes; and the ledger has a row of theirs for each world."""
+    config = replace(small, off_path=70)
+    corpus = make.run(config=config, out=tmp_path, worlds=1, jobs=1)
+    beside, shard = corpus.shards[1], corpus.shards[0]
+    assert (shard.source, beside.source) == (EXPERT, OFF_PATH)
+    np.testing.assert_array_equal(shard.arrays["depth"], gathered.shards[0].arrays["depth"])
+    assert 35 <= len(beside) <= 70 and not np.isnan(beside.arrays["trajectories_B"][:, 0]).any()
+    before = all_bytes(tmp_path)
+    with (beside.path / "color.npy").open("r+b") as file:
+        file.seek(5000)
+        file.write(b"damage")
+    make.run(config=config, out=tmp_path, worlds=1, jobs=1)
+    assert all_bytes(tmp_path) == before
+    rows = list(csv.DictReader((tmp_path / "ledger.csv").open()))
+    assert [(row["source"], row["states"]) for row in rows][-1] == ("off_path", str(len(beside)))
 
 
 def test_the_ledger_accounts_for_every_sample(gathered):
