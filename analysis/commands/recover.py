@@ -23,7 +23,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
             "recover student_depth --out out/depth --set 'corpora=[out/corpus]' --flights 3",
         ),
     )
-    recover.add_argument("policy", choices=["student_rgb", "student_depth"])
+    recover.add_argument("policy", choices=["student_rgb", "student_depth", "diffaero_rgb"])
     recover.add_argument(
         "--out",
         type=Path,
@@ -43,10 +43,14 @@ def _recover(options: argparse.Namespace) -> None:
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies import recovery
+    from splatpilot.training.policies.registry import TRAINERS
 
     config = load_config(trainer_defaults(options), options.config, options.overrides)
     jobs = available_cores() if options.jobs is None else options.jobs
-    ledger = recovery.run(config=config, out=options.out, flights=options.flights, jobs=jobs)
+    make = TRAINERS.find(options.policy).make
+    ledger = recovery.run(
+        config=config, make=make, out=options.out, flights=options.flights, jobs=jobs
+    )
     flown = ", ".join(f"{count} {outcome}" for outcome, count in ledger["flights"].items())
     print(
         f"{flown}; {ledger['near_misses']} near-misses; {ledger['recovery_samples']} samples of "

@@ -2,18 +2,19 @@
 have done where the student came too near to something.
 
 After the paper, Sec. III-B. The student of the first stage flies, without any guard, the ways that
-the expert flew in the worlds that it was trained in; the second is trained from nothing on all.
+the expert flew in the worlds that it was trained in; the second is trained from nothing on all. For
+`diffaero_rgb`, which learns from the same corpora what it sees, the images alone matter.
 """
 
 import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from tqdm import tqdm
@@ -32,9 +33,8 @@ from splatpilot.training.corpus.recovery import StudentFlight, add_recovery
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
 from splatpilot.training.corpus.world_record import WorldRecord
 from splatpilot.training.policies import train
-from splatpilot.training.policies.student import StudentTrainer
-from splatpilot.training.policies.student_config import StudentTraining
 from splatpilot.training.policies.student_data import held_out_names
+from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 
 _PATIENCE = 2.0
 """How many times as long as the expert took a student may fly."""
@@ -42,6 +42,17 @@ _PATIENCE = 2.0
 
 _ARRAYS = "p_WG", "times", "states", "clearances"
 """Of each flight in a file of flights, see `StudentFlight`."""
+
+
+class CorpusTraining(TrainingConfig, Protocol):
+    """What the configuration of a trainer has that learns from corpora, a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    corpora: list[str]
+    """Their folders."""
+    held_out: float
+    """Part of their worlds, by name, that is not trained with."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +73,9 @@ class RecoveryFlights:
 
 
 @holds_folder("out")
-def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[str, Any]:
+def run[Config: CorpusTraining](
+    *, config: Config, make: Callable[[Config], Trainer], out: Path, flights: int, jobs: int
+) -> dict[str, Any]:
     """
     Trains a student, has it fly, gathers what it was to have done, and trains another on all.
 
@@ -75,6 +88,7 @@ def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[
 
     Args:
         config: of both stages.
+        make: the trainer of that configuration.
         flights: of the student, at most, in each world.
         jobs: processes that fly.
 
@@ -90,7 +104,7 @@ def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[
         if value < 1:
             raise ValueError(f"--{name} is {value}; it must be at least 1")
     claim_folder(out / "recovery.yaml", RecoveryFlights(flights))
-    first = train.run(config=config, out=out / "stage_1", make=StudentTrainer)
+    first = train.run(config=config, out=out / "stage_1", make=make)
     weights = out / "stage_1" / f"{first['policy']}.npz"
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
     for source, folder in zip(config.corpora, folders, strict=True):
@@ -106,7 +120,7 @@ def run(*, config: StudentTraining, out: Path, flights: int, jobs: int) -> dict[
         outcomes += ended
         add_recovery(folder, flown, jobs)
     both = replace(config, corpora=[str(folder) for folder in folders])
-    second = train.run(config=both, out=out / "stage_2", make=StudentTrainer)
+    second = train.run(config=both, out=out / "stage_2", make=make)
     ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
     ledger |= {"stage_1": first, "stage_2": second}
     with written_atomically(out / "recovery.json") as path:

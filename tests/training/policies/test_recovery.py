@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies.policy_checkpoint import policy_of
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus import make
 from splatpilot.training.corpus.config import CorpusConfig
@@ -14,7 +15,9 @@ from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.library import LibraryConfig
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
 from splatpilot.training.policies import recovery
+from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
 from splatpilot.training.policies.expert import ExpertConfig
+from splatpilot.training.policies.student import StudentTrainer
 from splatpilot.training.policies.student_config import StudentDepthTraining
 
 TINY = [
@@ -45,7 +48,7 @@ def expert(tmp_path_factory) -> Path:
 
 def both_stages(expert: Path, out: Path) -> dict:
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
-    return recovery.run(config=config, out=out, flights=1, jobs=1)
+    return recovery.run(config=config, make=StudentTrainer, out=out, flights=1, jobs=1)
 
 
 def weights(out: Path) -> dict[str, np.ndarray]:
@@ -77,11 +80,31 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
                 both_stages(expert, parts)
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
-        recovery.run(config=config, out=parts, flights=2, jobs=1)
+        recovery.run(config=config, make=StudentTrainer, out=parts, flights=2, jobs=1)
     monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
     assert both_stages(expert, parts)["flights"] == ledger["flights"]
     expected, found = weights(whole), weights(parts)
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
+
+
+def test_what_sees_in_colours_recovers_too(tmp_path):
+    """DiffAero in colours flies by what it judges, and both its stages see images of its corpus."""
+    grove = tmp_path / "grove.yaml"
+    grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
+    corpus = CorpusConfig(
+        worlds=LibraryConfig(kinds=[str(grove)]),
+        expert=ExpertConfig(period=0.5),
+        flights=1,
+        camera=OnboardCamera(width=160, height=90),
+    )
+    make.run(config=corpus, out=tmp_path / "expert", worlds=2, jobs=1)
+    tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
+    overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
+    config = load_config(DiffAeroRgbTraining(), overrides=overrides)
+    out = tmp_path / "out"
+    ledger = recovery.run(config=config, make=DiffAeroRgbTrainer, out=out, flights=1, jobs=1)
+    assert sum(ledger["flights"].values()) == 1 and ledger["recovery_samples"] > 0
+    assert policy_of(out / "stage_2" / "diffaero_rgb.npz") == "diffaero_rgb"
 
 
 def interrupt(*_args) -> None:
@@ -92,7 +115,7 @@ def test_counts_out_of_range_are_refused(expert, tmp_path):
     """The option is named, before anything is trained."""
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match="--flights is 0"):
-        recovery.run(config=config, out=tmp_path, flights=0, jobs=1)
+        recovery.run(config=config, make=StudentTrainer, out=tmp_path, flights=0, jobs=1)
     with pytest.raises(ValueError, match="--jobs is -1"):
-        recovery.run(config=config, out=tmp_path, flights=1, jobs=-1)
+        recovery.run(config=config, make=StudentTrainer, out=tmp_path, flights=1, jobs=-1)
     assert not list(tmp_path.iterdir())
