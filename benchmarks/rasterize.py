@@ -27,6 +27,7 @@ from scenes import cameras_of, intrinsics, load_scene, scene_name, tensors_of
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
+from splatpilot.systems.splats.distortion import Distortion
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 COUNTS = (100_000, 500_000)
@@ -157,6 +158,19 @@ def print_distorted(scene: GaussianScene, X_WC: RigidTransform) -> None:
         row(name, *(f"{milliseconds(call, 10)[0]:.1f}" for call in (forward_only, both)))
 
 
+def print_lenses(scene: GaussianScene, X_WC: RigidTransform) -> None:
+    header("lenses in flight, 320x240", "ms")
+    baked, K = BakedScene(scene), intrinsics(320, 240)
+    lenses = {
+        "pinhole": None,
+        "OpenCV, k1 k2 k3 and p1 p2": Distortion("opencv", [-0.28, 0.09, -0.012], [0.003, -0.002]),
+        "fisheye": Distortion("fisheye", [0.04, -0.01]),
+    }
+    for name, lens in lenses.items():
+        ms, _ = milliseconds(lambda lens=lens: baked.render(K, 320, 240, X_WC, distortion=lens))
+        row(name, f"{ms:.2f}")
+
+
 def print_torch(scene: GaussianScene, X_WC: RigidTransform, ours: dict[str, Callable]) -> None:
     """The vectorised torch reference, in float32 on one thread, once."""
     viewmats, Ks = cameras_of(X_WC, 320, 240)
@@ -191,6 +205,7 @@ def main() -> None:
         print_steps(*load_scene(count))
     print_scaling(scene, X_WC)
     print_baked(scene, X_WC)
+    print_lenses(scene, X_WC)
     print_distorted(scene, X_WC)
     print_torch(scene, X_WC, calls)
     print_raster_kernel(scene, X_WC, arguments.opensplat)

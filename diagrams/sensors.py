@@ -64,6 +64,7 @@ def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> Sp
         background=world.background,
         moving=world.moving.gaussians if world.moving else None,
         latency=latency,
+        distortion=config.distortion,
     )
 
 

@@ -87,13 +87,35 @@ inline void check_image_size(int width, int height) {
           "the image must have pixels, and at most 32768 a side");
 }
 
+// What Python knows of a lens.
+struct LensArguments {
+  DistortionModel model = DistortionModel::kNone;
+  double radial[6] = {}, tangential[2] = {}, most_squared_slope = 0.0;
+  double min_slope[2] = {}, max_slope[2] = {};
+};
+
 inline Camera camera_from(const Intrinsics& K, const Pose& X_CW, int width, int height,
                           double near_plane, double far_plane, double radius_clip, double eps2d,
-                          bool antialiased = false) {
+                          bool antialiased = false, const LensArguments& lens = {}) {
   check_image_size(width, height);
-  CameraParameters p{width, height, {}, {}, near_plane, far_plane, radius_clip, eps2d, antialiased};
+  CameraParameters p{};
+  p.width = width;
+  p.height = height;
+  p.near_plane = near_plane;
+  p.far_plane = far_plane;
+  p.radius_clip = radius_clip;
+  p.eps2d = eps2d;
+  p.antialiased = antialiased;
   std::copy_n(K.data(), 9, p.K);
   std::copy_n(X_CW.data(), 16, p.X_CW);
+  p.distortion.model = lens.model;
+  for (int k = 0; k < 6; ++k) p.distortion.radial[k] = static_cast<float>(lens.radial[k]);
+  for (int k = 0; k < 2; ++k) {
+    p.distortion.tangential[k] = static_cast<float>(lens.tangential[k]);
+    p.min_slope[k] = lens.min_slope[k];
+    p.max_slope[k] = lens.max_slope[k];
+  }
+  p.distortion.most_squared_slope = static_cast<float>(lens.most_squared_slope);
   return make_camera(p);
 }
 

@@ -12,6 +12,10 @@ struct CameraParameters {
   double near_plane, far_plane;  // [m]
   double radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;
+  Distortion distortion;
+  // Between which the slopes x/z, y/z of rays lie that meet the image or what is near it, where
+  // the lens distorts.
+  double min_slope[2], max_slope[2];
 };
 
 Camera make_camera(const CameraParameters& parameters);

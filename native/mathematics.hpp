@@ -1,4 +1,4 @@
-// exp2 and log2 of packs.
+// exp2, log2 and the arctangent of packs.
 #pragma once
 
 #include "simd.hpp"
@@ -37,6 +37,25 @@ SP_INLINE F16 log2(const F16& x) {
   p = p * s2 + F16(0.961796694f);  // 2 / (3 ln 2)
   p = p * s2 + F16(2.885390082f);  // 2 / ln 2
   return p * s + to_float(exponent);
+}
+
+// atan(x) for x >= 0, relative error below 3e-7: a polynomial fitted to [0, 1], and the complement
+// beyond.
+SP_INLINE F16 arctangent(const F16& x) {
+  const Mask16 beyond = x > F16(1.0f);
+  const F16 t = min(x, F16(1.0f) / max(x, F16(1.0f)));
+  const F16 s = t * t;
+  F16 p = F16(2.834064298e-3f);
+  p = p * s + F16(-1.600503050e-2f);
+  p = p * s + F16(4.258760746e-2f);
+  p = p * s + F16(-7.495445443e-2f);
+  p = p * s + F16(1.063675410e-1f);
+  p = p * s + F16(-1.420257051e-1f);
+  p = p * s + F16(1.999248358e-1f);
+  p = p * s + F16(-3.333306678e-1f);
+  p = p * s + F16(9.999999842e-1f);
+  const F16 angle = p * t;
+  return angle + zero_unless(beyond, F16(1.5707963268f) - F16(2.0f) * angle);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

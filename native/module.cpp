@@ -89,10 +89,22 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Means& mean
                   const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW, int width,
                   int height, double near_plane, double far_plane, double eps2d,
                   const Floats<nb::shape<3>>& background, const Output& color, const Output& depth,
-                  const Output& alpha) {
+                  const Output& alpha, int distortion, const Doubles<nb::shape<13>>& lens) {
   require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
   const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
-  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d);
+  require(distortion >= 0 && distortion <= 2, "there is no such distortion");
+  LensArguments bent{static_cast<DistortionModel>(distortion)};
+  const double* next = lens.data();
+  for (auto [to, count] : {std::pair{bent.radial, 6},
+                           {bent.tangential, 2},
+                           {&bent.most_squared_slope, 1},
+                           {bent.min_slope, 2},
+                           {bent.max_slope, 2}}) {
+    std::copy_n(next, count, to);
+    next += count;
+  }
+  const Camera camera =
+      camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d, false, bent);
   check_size(color, camera, 3);
   check_size(depth, camera, 1);
   check_size(alpha, camera, 1);
@@ -191,6 +203,7 @@ NB_MODULE(_native, m) {
   m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a,
         "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
         "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a, "depth"_a, "alpha"_a,
+        "distortion"_a, "lens"_a,
         "Writes colour, median depth and alpha of the scene and of Gaussians among it.");
 
   bind_losses(m);

@@ -113,8 +113,9 @@ SP_INLINE Vector16 plane_normal(const Camera& camera, const Vector16 columns[3],
   return to_camera(camera, n_W);
 }
 
-inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size_t begin,
-                             size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
+template <bool kDistorted>
+size_t project_arrays_through(const GaussianArrays& g, const Camera& camera, size_t begin,
+                              size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   uint32_t candidates[kChunkSize + kLanes];
   const size_t candidate_count = cull_arrays(g, camera, begin, end, candidates);
   // Lanes past the end repeat a Gaussian that exists and are masked out.
@@ -129,26 +130,34 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
     const F16 inverse_z = F16(1.0f) / p_C.z;
     Vector16 columns[3], m[2];
     covariance_factor(in.quat, in.scale, columns);
-    projection_rows(camera, p_C, inverse_z, m);
+    projection_rows<kDistorted>(camera, p_C, inverse_z, m);
     const Vector16 p0 = {dot(m[0], columns[0]), dot(m[0], columns[1]), dot(m[0], columns[2])};
     const Vector16 p1 = {dot(m[1], columns[0]), dot(m[1], columns[1]), dot(m[1], columns[2])};
     // An opacity of zero has no logarithm; any value below the cut serves.
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
 
     SplatPack pack;
-    uint32_t bits =
-        lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, log2_opacity, pack));
+    uint32_t bits = lane_bits(
+        finish_projection<kDistorted>(camera, p_C, inverse_z, p0, p1, log2_opacity, pack));
     if (candidate_count - first < kLanes) bits &= (1u << (candidate_count - first)) - 1;
     if (!bits) continue;
     if (planes) {
       const Vector16 n_C = plane_normal(camera, columns, in.scale, d_W);
-      append_planes(depth_plane(camera, p_C, inverse_z, p0, p1, n_C), bits, planes + count);
+      append_planes(depth_plane<kDistorted>(camera, p_C, inverse_z, p0, p1, n_C), bits,
+                    planes + count);
     }
     F16 color[3];
     gather_colors(g, indices, bits, d_W, color);
     count += append_splats(pack, color, bits, indices, splats + count, depth_bits + count);
   }
   return count;
+}
+
+inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size_t begin,
+                             size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
+  const bool distorted = camera.distortion.model != DistortionModel::kNone;
+  const auto project = distorted ? project_arrays_through<true> : project_arrays_through<false>;
+  return project(g, camera, begin, end, splats, planes, depth_bits);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

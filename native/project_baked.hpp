@@ -50,6 +50,7 @@ SP_INLINE Vector16 plane_normal(const Camera& camera, const F16 L[6], const Vect
   return to_camera(camera, {n0, n1, n2});
 }
 
+template <bool kDistorted>
 SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
                                      Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   const float* geometry = scene.geometry + group * 10 * kLanes;
@@ -59,7 +60,7 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
   if (!any(in_depth_range(camera, p_C.z))) return 0;
   const F16 inverse_z = F16(1.0f) / p_C.z;
   Vector16 m[2];
-  projection_rows(camera, p_C, inverse_z, m);
+  projection_rows<kDistorted>(camera, p_C, inverse_z, m);
   F16 L[6];
   for (int k = 0; k < 6; ++k) L[k] = field(3 + k);
   const auto times_L = [&](const Vector16& row) -> Vector16 {
@@ -68,11 +69,11 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
   const Vector16 p0 = times_L(m[0]), p1 = times_L(m[1]);
   SplatPack pack;
   const uint32_t bits =
-      lane_bits(finish_projection(camera, p_C, inverse_z, p0, p1, field(9), pack));
+      lane_bits(finish_projection<kDistorted>(camera, p_C, inverse_z, p0, p1, field(9), pack));
   if (!bits) return 0;
   if (planes) {
     const Vector16 n_C = plane_normal(camera, L, d_W);
-    append_planes(depth_plane(camera, p_C, inverse_z, p0, p1, n_C), bits, planes);
+    append_planes(depth_plane<kDistorted>(camera, p_C, inverse_z, p0, p1, n_C), bits, planes);
   }
 
   F16 color[3];
@@ -89,8 +90,9 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
 }
 
 // begin and end count Gaussians and are multiples of the chunk size, or the scene's end.
-inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size_t begin,
-                            size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
+template <bool kDistorted>
+size_t project_baked_through(const BakedArrays& scene, const Camera& camera, size_t begin,
+                             size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   constexpr size_t kGroupsPerBox = kBoundSize / kLanes;
   const size_t last_group = end / kLanes;
   size_t count = 0;
@@ -99,12 +101,20 @@ inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size
     for (; boxes; boxes &= boxes - 1) {
       const size_t first = (box + __builtin_ctz(boxes)) * kGroupsPerBox;
       for (size_t group = first; group < first + kGroupsPerBox && group < last_group; ++group) {
-        count += project_baked_group(scene, camera, group, splats + count,
-                                     planes ? planes + count : nullptr, depth_bits + count);
+        count +=
+            project_baked_group<kDistorted>(scene, camera, group, splats + count,
+                                            planes ? planes + count : nullptr, depth_bits + count);
       }
     }
   }
   return count;
+}
+
+inline size_t project_baked(const BakedArrays& scene, const Camera& camera, size_t begin,
+                            size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
+  const bool distorted = camera.distortion.model != DistortionModel::kNone;
+  const auto project = distorted ? project_baked_through<true> : project_baked_through<false>;
+  return project(scene, camera, begin, end, splats, planes, depth_bits);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

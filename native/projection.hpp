@@ -2,6 +2,7 @@
 // Kerbl et al. 2023), 16 at a time.
 #pragma once
 
+#include "distortion.hpp"
 #include "mathematics.hpp"
 #include "spherical_harmonics.hpp"
 #include "types.hpp"
@@ -59,6 +60,7 @@ SP_INLINE Mask16 may_be_visible(const Camera& camera, const Vector16& p_C,
 
 // The image of the world axes under the projection's Jacobian at p_C: m[i] = J_i R_CW, with the
 // slopes x/z and y/z held within 1.3 times the field of view as in the original method.
+template <bool kDistorted = false>
 SP_INLINE void projection_rows(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                Vector16 m[2]) {
   const F16 slope_x = clamp(p_C.x * inverse_z, F16(camera.min_slope_x), F16(camera.max_slope_x));
@@ -66,6 +68,16 @@ SP_INLINE void projection_rows(const Camera& camera, const Vector16& p_C, const 
   const F16 scale_x = F16(camera.fx) * inverse_z;
   const F16 scale_y = F16(camera.fy) * inverse_z;
   const float* R = camera.R_CW;
+  if constexpr (kDistorted) {
+    const DistortedPoint p = distort(camera.distortion, slope_x, slope_y);
+    const Vector16 by_x = {F16(R[0]) - slope_x * F16(R[6]), F16(R[1]) - slope_x * F16(R[7]),
+                           F16(R[2]) - slope_x * F16(R[8])};
+    const Vector16 by_y = {F16(R[3]) - slope_y * F16(R[6]), F16(R[4]) - slope_y * F16(R[7]),
+                           F16(R[5]) - slope_y * F16(R[8])};
+    m[0] = scale_x * (p.xx * by_x + p.xy * by_y);
+    m[1] = scale_y * (p.xy * by_x + p.yy * by_y);
+    return;
+  }
   m[0] = {scale_x * (F16(R[0]) - slope_x * F16(R[6])), scale_x * (F16(R[1]) - slope_x * F16(R[7])),
           scale_x * (F16(R[2]) - slope_x * F16(R[8]))};
   m[1] = {scale_y * (F16(R[3]) - slope_y * F16(R[6])), scale_y * (F16(R[4]) - slope_y * F16(R[7])),
@@ -89,6 +101,7 @@ SP_INLINE F16 largest_component(const Vector16& a) {
 // Finishes the projection from P (2x3), where P P^T is the 2D covariance before blurring. Working
 // from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
 // of large entries. Returns the lanes that are visible.
+template <bool kDistorted = false>
 SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                    Vector16 p0, Vector16 p1, F16 log2_opacity, SplatPack& out) {
   // Scaling by g keeps the squares of huge Gaussians within range; it is exactly 1 for all others.
@@ -118,6 +131,14 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
   out.uy = -(out.ux * out.slope_x);
   out.mean_x = F16(camera.fx) * p_C.x * inverse_z + F16(camera.cx);
   out.mean_y = F16(camera.fy) * p_C.y * inverse_z + F16(camera.cy);
+  Mask16 visible = in_depth_range(camera, p_C.z);
+  if constexpr (kDistorted) {
+    const F16 slope_x = p_C.x * inverse_z, slope_y = p_C.y * inverse_z;
+    const DistortedPoint p = distort(camera.distortion, slope_x, slope_y);
+    out.mean_x = F16(camera.fx) * p.x + F16(camera.cx);
+    out.mean_y = F16(camera.fy) * p.y + F16(camera.cy);
+    visible = visible & has_place(camera.distortion, slope_x, slope_y, p);
+  }
   out.log2_opacity = log2_opacity;
   out.depth = p_C.z;
 
@@ -129,7 +150,7 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
   const F16 clip = F16(camera.radius_clip);
   const F16 width = F16(static_cast<float>(camera.width));
   const F16 height = F16(static_cast<float>(camera.height));
-  Mask16 visible = in_depth_range(camera, p_C.z) & (budget >= F16(0.0f));
+  visible = visible & (budget >= F16(0.0f));
   visible = visible & (max(out.extent_x, out.extent_y) > clip);
   visible = visible & (out.mean_x + out.extent_x > F16(0.0f)) &
             (out.mean_x - out.extent_x < width) & (out.mean_y + out.extent_y > F16(0.0f)) &
@@ -140,6 +161,7 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
 }
 
 // From P as above and n_C, the inverse covariance times p_C up to scale.
+template <bool kDistorted = false>
 SP_INLINE PlanePack depth_plane(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                 const Vector16& p0, const Vector16& p1, const Vector16& n_C) {
   // What keeps a Gaussian seen edge-on invertible [px^2].
@@ -161,6 +183,13 @@ SP_INLINE PlanePack depth_plane(const Camera& camera, const Vector16& p_C, const
   const F16 inverse_facing = zero_unless(known, one / facing);
   out.w_x = n_C.x * inverse_facing * F16(1.0f / camera.fx);
   out.w_y = n_C.y * inverse_facing * F16(1.0f / camera.fy);
+  if constexpr (kDistorted) {
+    // By the pixel instead of the slope: the inverse of the lens's Jacobian.
+    const DistortedPoint p = distort(camera.distortion, p_C.x * inverse_z, p_C.y * inverse_z);
+    const F16 share = inverse_facing / (p.xx * p.yy - p.xy * p.xy);
+    out.w_x = (n_C.x * p.yy - n_C.y * p.xy) * share * F16(1.0f / camera.fx);
+    out.w_y = (n_C.y * p.xx - n_C.x * p.xy) * share * F16(1.0f / camera.fy);
+  }
   out.w = inverse_z;
   // A Gaussian that reaches to the camera's plane is turned, so that it has depth everywhere.
   const F16 fall =

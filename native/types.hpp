@@ -28,7 +28,16 @@ constexpr float kMaxExtent = 3.33f;
 // u^2 + v^2 = kExponentScale^2 * (squared Mahalanobis distance); this is sqrt(log2(e) / 2).
 constexpr float kExponentScale = 0.849321800288f;
 
-// A pinhole camera, prepared for projection.
+enum class DistortionModel : int { kNone, kOpenCv, kFisheye };
+
+// How a lens bends rays, see systems/splats/distortion.py.
+struct Distortion {
+  DistortionModel model;
+  float radial[6], tangential[2];
+  float most_squared_slope;  // x^2 + y^2 of x/z, y/z beyond which rays have no place
+};
+
+// A camera, prepared for projection.
 struct Camera {
   int width, height;            // [px]
   float fx, fy, cx, cy;         // [px]
@@ -43,6 +52,7 @@ struct Camera {
   // side_normal . p_C + side_reach s > 0 (left, right, top, bottom).
   float side_normal[4][3];
   float side_reach[4];
+  Distortion distortion;
 };
 
 // A visible Gaussian on the image plane.

@@ -16,6 +16,7 @@ from .systems.policies.privileged_planner import PrivilegedPlanner
 from .systems.sensing.observation_noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
 from .systems.splats.baked_scene import BakedScene
+from .systems.splats.distortion import Distortion
 from .systems.splats.gaussian_ply import read_ply, write_ply
 from .systems.splats.gaussian_scene import GaussianScene
 from .systems.splats.rasterization import rasterize
@@ -35,6 +36,7 @@ __all__ = [
     "BakedScene",
     "BuildFlightDiagram",
     "Capture",
+    "Distortion",
     "Esdf",
     "EsdfCollision",
     "FlatnessController",

@@ -7,6 +7,8 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.systems.splats.distortion import Distortion
+
 _LARGEST = 4096  # [px]
 
 _R_BC_LEVEL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
@@ -15,16 +17,18 @@ _R_BC_LEVEL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 
 
 @dataclass
 class OnboardCamera:
-    """A pinhole camera and its mount; it takes images when its policy looks."""
+    """A camera and its mount; it takes images when its policy looks."""
 
     # [px] Width of its images.
     width: int = 64
     # [px] Height of its images.
     height: int = 36
-    # [deg] Horizontal field of view.
+    # [deg] Horizontal field of view, from edge to edge through the middle.
     fov_x: float = 90.0
     # [deg] Vertical field of view; that of square pixels where left out.
     fov_y: float | None = None
+    # Of the lens; a pinhole where left out.
+    distortion: Distortion | None = None
     # [m] Least depth that its depth images show.
     min_depth: float = 0.1
     # [m] Greatest depth that its depth images show.
@@ -42,6 +46,13 @@ class OnboardCamera:
         for name in ("fov_x", "fov_y"):
             value = getattr(self, name)
             _check(name, value, value is None or 1.0 <= value <= 170.0, "1 to 170 deg")
+        if self.distortion is not None:
+            self.distortion.validate()
+            widest = 2.0 * math.degrees(math.atan(self.distortion.limit))
+            for name in ("fov_x", "fov_y"):
+                value = getattr(self, name)
+                shown = value is None or value < widest
+                _check(name, value, shown, f"less than the {widest:.1f} deg that the lens shows")
         _check("min_depth", self.min_depth, self.min_depth >= 0.0, "at least 0 m")
         farther = self.min_depth < self.max_depth < math.inf
         _check("max_depth", self.max_depth, farther, "more than min_depth, and finite")
@@ -52,12 +63,20 @@ class OnboardCamera:
     @property
     def focal_x(self) -> float:
         """[px]"""
-        return focal_length(self.width, self.fov_x)
+        return self._focal(self.width, self.fov_x, axis=0)
 
     @property
     def focal_y(self) -> float:
         """[px]"""
-        return self.focal_x if self.fov_y is None else focal_length(self.height, self.fov_y)
+        return self.focal_x if self.fov_y is None else self._focal(self.height, self.fov_y, axis=1)
+
+    def _focal(self, pixels: int, fov: float, axis: int) -> float:
+        if self.distortion is None:
+            return focal_length(pixels, fov)
+        edges = np.zeros((2, 2))
+        edges[:, axis] = math.tan(math.radians(0.5 * fov)) * np.array([-1.0, 1.0])
+        bent = self.distortion.project(edges)[:, axis]
+        return pixels / float(bent[1] - bent[0])
 
     def camera_info(self) -> CameraInfo:
         """The intrinsics, the principal point in the middle."""

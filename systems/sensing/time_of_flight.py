@@ -78,7 +78,16 @@ class TimeOfFlight:
 
 
 def sensor_of(camera: OnboardCamera) -> TimeOfFlight:
-    """The sensor that a policy's camera is: all of its image is left."""
+    """The sensor that a policy's camera is: all of its image is left.
+
+    Raises:
+        ValueError: for a camera whose lens distorts; frames of such sensors come rectified.
+    """
+    if camera.distortion is not None:
+        raise ValueError(
+            f"OnboardCamera.distortion is {camera.distortion}; a time-of-flight sensor has none: "
+            "leave it out"
+        )
     fov_y = math.degrees(2.0 * math.atan(0.5 * camera.height / camera.focal_y))
     return TimeOfFlight(
         width=camera.width,

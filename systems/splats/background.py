@@ -11,6 +11,7 @@ from splatpilot.systems.files import written_atomically
 from splatpilot.systems.png_chunks import require_whole_chunks
 from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.distortion import Distortion, pixel_slopes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -106,13 +107,27 @@ def pixel_rays(
 
 
 def put_behind(
-    view: RenderedView, background: Background, K: "NDArray", X_WC: "RigidTransform"
+    view: RenderedView,
+    background: Background,
+    K: "NDArray",
+    X_WC: "RigidTransform",
+    distortion: Distortion | None = None,
 ) -> RenderedView:
-    """Returns a view that was rendered on black with `background` behind it; K (3, 3) [px]."""
+    """Returns a view that was rendered on black with `background` behind it; K (3, 3) [px]. What a
+    lens does not show stays black."""
     color = view.color.copy()
     rows, columns = np.nonzero(view.alpha < 1 - _FAINT)
+    if distortion is not None:
+        height, width = view.alpha.shape
+        slopes = pixel_slopes(distortion, K, width, height)
+        shown = np.isfinite(slopes[rows, columns, 0])
+        rows, columns = rows[shown], columns[shown]
+        v_C = np.column_stack([slopes[rows, columns], np.ones(len(rows))])
+        v_W = v_C @ X_WC.rotation().matrix().T
+    else:
+        v_W = pixel_rays(K, rows, columns, X_WC)
     if isinstance(background, EnvironmentMap):
-        behind = background.color(pixel_rays(K, rows, columns, X_WC))
+        behind = background.color(v_W)
     else:
         behind = np.asarray(background, dtype=np.float32)
     color[rows, columns] += (1 - view.alpha[rows, columns])[:, None] * behind

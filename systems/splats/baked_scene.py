@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from splatpilot import _native
+from splatpilot.systems.splats.distortion import Distortion, hidden_pixels, native_lens
 from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, PlacedGaussians
 from splatpilot.systems.splats.spherical_harmonics import degree_of
 
@@ -19,7 +20,7 @@ EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gs
 
 
 class RenderedView(NamedTuple):
-    """What a pinhole camera sees of a scene, float32."""
+    """What a camera sees of a scene, float32."""
 
     color: "NDArray[np.float32]"  # (H, W, 3), over the background
     depth: "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0: no surface
@@ -99,6 +100,7 @@ class BakedScene:
         far: float = 1e10,
         background: "ArrayLike" = (0.0, 0.0, 0.0),
         moving: PlacedGaussians = NO_GAUSSIANS,
+        distortion: Distortion | None = None,
     ) -> RenderedView:
         """Renders colour, median depth and alpha.
 
@@ -112,6 +114,8 @@ class BakedScene:
             far: The same for those farther away [m].
             background: (3,) colour behind everything.
             moving: Gaussians among those of the scene, in this image alone; trusted to be valid.
+            distortion: of the lens; None for a pinhole. What it does not show is black,
+                of alpha and depth 0.
 
         Raises:
             ValueError: intrinsics, image size, depth range or background make no sense.
@@ -140,5 +144,10 @@ class BakedScene:
             color=color,
             depth=depth,
             alpha=alpha,
+            **native_lens(distortion, K, width, height)._asdict(),
         )
+        if distortion is not None:
+            hidden = hidden_pixels(distortion, K, width, height)
+            for image in (color, depth, alpha) if len(hidden) else ():
+                image.reshape(-1, image.shape[2])[hidden] = 0.0
         return RenderedView(color, depth[..., 0], alpha[..., 0])

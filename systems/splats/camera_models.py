@@ -14,10 +14,10 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.polynomial import Polynomial
 from torch import Tensor
+
+from splatpilot.systems.splats.distortion import fisheye_limit, opencv_limit
 
 SPREAD = 0.1
 """The sigma points lie SPREAD sqrt(3) standard deviations from the centre (gsplat's alpha)."""
@@ -57,7 +57,7 @@ def project_opencv(
     """
     valid = p_C[..., 2] > 0
     xy = _slopes(p_C, valid)
-    limit = opencv_limit(radial)
+    limit = opencv_limit(radial.detach().double().tolist())
     valid = valid & (xy.detach().square().sum(-1) < limit**2)
     xy = torch.where(valid[..., None], xy, 0.0)
     x, y = xy.unbind(-1)
@@ -103,7 +103,7 @@ def project_fisheye(
     Returns:
         (..., 2) pixels and (...,) validity.
     """
-    limit = min(max_angle, fisheye_limit(radial))
+    limit = min(max_angle, fisheye_limit(radial.detach().double().tolist()))
     # The axis itself, of which the derivative of the square root knows nothing, is left to the
     # limit a / r -> 1 / z.
     square = p_C[..., :2].square().sum(-1)
@@ -118,28 +118,6 @@ def project_fisheye(
     scale = angle_per_r * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
     distorted = torch.where(valid[..., None], scale[..., None] * p_C[..., :2], 0.0)
     return _to_pixels(distorted, K), valid
-
-
-def opencv_limit(radial: Tensor) -> float:
-    """Least r = sqrt(x^2 + y^2) at which ``r g(r)`` stops growing or g has a pole; may be inf."""
-    k1, k2, k3, k4, k5, k6 = radial.detach().double().tolist()
-    top, bottom = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])  # of r^2
-    s = Polynomial([0, 1])
-    growth = top * bottom + 2 * s * (top.deriv() * bottom - top * bottom.deriv())
-    return math.sqrt(min(_first_root(growth), _first_root(bottom)))
-
-
-def fisheye_limit(radial: Tensor) -> float:
-    """Least angle [rad] at which the image radius stops growing; inf if it never does."""
-    factors = zip((3, 5, 7, 9), radial.detach().double().tolist(), strict=True)
-    return math.sqrt(_first_root(Polynomial([1, *(n * k for n, k in factors)])))
-
-
-def _first_root(polynomial: Polynomial) -> float:
-    """Least positive real root; inf without one."""
-    roots = polynomial.trim().roots()
-    positive = roots.real[(roots.imag == 0) & (roots.real > 0)]
-    return float(np.min(positive, initial=math.inf))
 
 
 def _slopes(p_C: Tensor, valid: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from splatpilot.systems.splats.background import (
     put_behind,
 )
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.distortion import Distortion
 from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, PlacedGaussians
 
 
@@ -24,8 +25,9 @@ def render_view(
     far: float,
     background: Background = BLACK,
     moving: PlacedGaussians = NO_GAUSSIANS,
+    distortion: Distortion | None = None,
 ) -> RenderedView:
-    """What the pinhole camera of `camera_info` at X_WC sees; see `BakedScene.render`.
+    """What the camera of `camera_info` at X_WC sees, through a lens; see `BakedScene.render`.
 
     Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so the
     intrinsics are taken as they are.
@@ -33,9 +35,9 @@ def render_view(
     width, height = camera_info.width(), camera_info.height()
     K = camera_info.intrinsic_matrix()
     if not isinstance(background, EnvironmentMap):
-        return scene.render(K, width, height, X_WC, near, far, background, moving)
-    view = scene.render(K, width, height, X_WC, near, far, moving=moving)
-    return put_behind(view, background, K, X_WC)
+        return scene.render(K, width, height, X_WC, near, far, background, moving, distortion)
+    view = scene.render(K, width, height, X_WC, near, far, moving=moving, distortion=distortion)
+    return put_behind(view, background, K, X_WC, distortion)
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:

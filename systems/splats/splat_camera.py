@@ -17,6 +17,7 @@ from pydrake.systems.sensors import (
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.splats.background import BLACK, Background
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.distortion import Distortion
 from splatpilot.systems.splats.drake_images import (
     color_pixels,
     ranged_depth,
@@ -82,12 +83,13 @@ class SplatCamera(LeafSystem):
         background: Background = BLACK,
         moving: MovingGaussians | None = None,
         latency: float = 0.0,
+        distortion: Distortion | None = None,
     ):
         """
         Args:
             scene: what there is to see. A `BakedScene` is held by reference, so that many cameras
                 share one; a `GaussianScene` is baked for this camera alone.
-            camera_info: pinhole intrinsics, width and height.
+            camera_info: intrinsics, width and height.
             X_BC: pose of the camera in the body that carries it; identity when None.
             min_depth, max_depth: range of the depth image [m].
             near, far: Gaussians whose centre is not between these planes are not drawn [m].
@@ -96,9 +98,11 @@ class SplatCamera(LeafSystem):
             moving: what moves among the scene's Gaussians.
             latency: age of the images [s]: what moves is where it was so long ago. The pose that
                 the camera is given must be as old.
+            distortion: of the lens; None for a pinhole. What it does not show is no surface.
 
         Raises:
-            ValueError: if the depth range is empty or a focal length is not positive.
+            ValueError: if the depth range is empty or a focal length is not positive; for a
+                distortion that makes no sense.
         """
         super().__init__()
         if not 0 <= min_depth < max_depth < np.inf:
@@ -118,6 +122,9 @@ class SplatCamera(LeafSystem):
         self._clipping = (near, far)
         self._background = background
         self._moving, self._latency = moving, latency
+        if distortion is not None:
+            distortion.validate()
+        self._distortion = distortion
 
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
@@ -176,6 +183,7 @@ class SplatCamera(LeafSystem):
             *self._clipping,
             background=self._background,
             moving=moving,
+            distortion=self._distortion,
         )
 
     def _calc_view(self, context, value) -> None:
