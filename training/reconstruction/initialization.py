@@ -22,6 +22,8 @@ _STEPS_OF_IMAGE, _LEAST_STEPS, MOST_STEPS = 32, 2000, 7000
 _SOME = 4
 # Opacity and size, in distances to the third neighbour, of Gaussians about points.
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5
+# What part of the surfaces must be covered at first for optimisation to close what is open.
+_ENOUGH = 0.8
 # Opacity with which Gaussians on surfaces start into the optimisation.
 _FIRST_OPACITY = 0.9
 # Depth of random Gaussians, in extents of the cameras.
@@ -167,6 +169,14 @@ def gaussians_from_depth(
     p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*in_order, strict=True))
     if len(p_WQ) > detail.max_gaussians:
         kept = _mostly_large(covariances, detail.max_gaussians)
+        areas = np.trace(covariances, axis1=1, axis2=2)
+        covered = areas[kept].sum() / areas.sum()
+        if covered < _ENOUGH:
+            tqdm.write(
+                f"{len(kept)} Gaussians cover {covered:.0%} of the surfaces that the frames show, "
+                f"and leave holes in the rest; {len(p_WQ)} would cover them: set initial_gaussians "
+                "nearer to that, or use frames of a smaller part of the place"
+            )
         p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
     quats, scales = principal_axes(covariances)
     opacities = np.full(len(p_WQ), detail.opacity)

@@ -68,16 +68,20 @@ def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):
     assert np.abs(below.means).max() <= np.abs(whole.means).max() + 0.1
 
 
-def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path):
+def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path, capsys):
     """Where even the coarsest cells are too many, exactly as many as allowed are drawn, mostly
-    large ones, each of them one of all; without optimisation it is an error."""
+    large ones, each of them one of all, and what stays open is said; without optimisation it is an
+    error."""
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     frames = list(capture.frames())
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
     detail = Detail(max_gaussians=100_000, optimized=True, **COARSE)
     every = gaussians_from_depth(frames, photometry, detail)
+    assert not capsys.readouterr().out
     some = gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20))
     assert len(some) == 20 < len(every)
+    message = capsys.readouterr().out
+    assert message.startswith("20 Gaussians cover ") and f"; {len(every)} would cover" in message
     assert set(map(tuple, some.means)) <= set(map(tuple, every.means))
     assert np.linalg.norm(some.scales, axis=1).mean() > np.linalg.norm(every.scales, axis=1).mean()
     with pytest.raises(ValueError, match="20 Gaussians are too few"):
