@@ -1,6 +1,7 @@
 """How fast and how surely messages travel: vehicle and bridge in processes of their own, over UDP.
 
     python benchmarks/messaging.py [--scenario P02] [--policy agile_autonomy] [--seeds 20]
+        [--set FIELD=VALUE]...
 
 Flies one scenario seed by seed, while this process listens as `lcm-logger` does, and prints
 
@@ -103,6 +104,7 @@ def main() -> None:
     parser.add_argument("--scenario", default="P02")
     parser.add_argument("--policy", default="agile_autonomy")
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--set", action="append", default=[], help="FIELD=VALUE of the scenario")
     options = parser.parse_args()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("", 0))
@@ -115,6 +117,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as root:
         for seed in range(options.seeds):
             words = ["--scenario", options.scenario, "--policy", options.policy]
+            words += [word for setting in options.set for word in ("--set", setting)]
             with Listener(url) as listener:
                 outcome, _, gaps = fly([*words, "--seed", str(seed)], url, Path(root) / str(seed))
             outcomes.append(outcome)

@@ -24,6 +24,8 @@ class DiffAeroRgbSpec:
 
 
 DIFFAERO_RGB_NETWORK = DiffAeroRgbSpec()
+CAUTION = 1.0
+"""Expected errors by which surfaces are taken for nearer than they are judged to be."""
 
 
 class DiffAeroRgbNetwork:
@@ -72,5 +74,6 @@ def decide(
     Raises:
         ValueError: for an image of another size.
     """
-    grid, _ = network.monocular(encode_view(color, X_WB.rotation().matrix()))
+    inverse, log_error = network.monocular(encode_view(color, X_WB.rotation().matrix()))
+    grid = inverse + CAUTION * np.exp(log_error)
     return decide_by_grid(network.policy, grid, X_WB, v_WB, p_WG, speed, memory)
