@@ -8,8 +8,8 @@ Flies one scenario seed by seed, while this process listens as `lcm-logger` does
 - what was lost: sequence numbers that never came, here and at the bridge;
 - latency: from a message's `utime`, when its sender's tick was due, to its arrival here;
 - jitter: of what is sent 50 times a second, by how much intervals differ from 20 ms;
-- the loop: from the arrival of an image to that of the hypotheses decided on it, and to that of the
-  first command after them;
+- the loop: from the arrival of an image to that of the velocity setpoint decided on it, the first
+  that the bridge sent when a decision was due, as its sequence numbers and utimes tell;
 - how many flights reached the goal, for comparison with `splatpilot benchmark`.
 
 Load counts: run it on an idle machine, or say what else ran.
@@ -31,9 +31,11 @@ import numpy as np
 from drake import lcmt_header, lcmt_image_array
 from harness import header, machine, row
 
+from splatpilot.diagrams.policies import policy_named
 from splatpilot.systems.messaging.generated import (
     lcmt_body_rate_command,
     lcmt_bridge_status,
+    lcmt_depth_grid,
     lcmt_quadrotor_state,
     lcmt_trajectory_hypotheses,
     lcmt_velocity_setpoint,
@@ -42,6 +44,7 @@ from splatpilot.systems.messaging.generated import (
 TYPES = {
     "QUADROTOR_STATE": lcmt_quadrotor_state,
     "DEPTH_IMAGE": lcmt_image_array,
+    "DEPTH_GRID": lcmt_depth_grid,
     "TRAJECTORY_HYPOTHESES": lcmt_trajectory_hypotheses,
     "BODY_RATE_COMMAND": lcmt_body_rate_command,
     "VELOCITY_SETPOINT": lcmt_velocity_setpoint,
@@ -95,6 +98,18 @@ def fly(words: list[str], url: str, folder: Path) -> tuple[str, str, float]:
     return summary["outcome"], said["outcome"], float(said["gaps"]) + float(said["rejected"])
 
 
+def loops(images: np.ndarray, setpoints: np.ndarray, decision: float) -> np.ndarray:
+    """[ms] from images to the setpoints decided on them, of messages (n, 3) as they were heard;
+    decisions are due every `decision` [s] of the bridge's time."""
+    seq, utime, arrival = setpoints.T
+    period = np.median(np.diff(utime) / np.diff(seq))
+    decided = np.floor(seq * period / decision + 1e-6)
+    due = utime - seq * period + decided * decision
+    last = np.searchsorted(images[:, 2], due) - 1
+    fresh = np.append(False, np.diff(decided) > 0) & (last >= 0)
+    return 1e3 * (arrival - images[last, 2])[fresh]
+
+
 def quantiles(values: np.ndarray) -> tuple[str, ...]:
     return tuple(f"{np.quantile(values, q):.2f}" for q in (0.5, 0.99, 1.0))
 
@@ -113,7 +128,7 @@ def main() -> None:
     outcomes: list[str] = []
     seconds, lost, at_bridge = 0.0, collections.Counter[str](), 0.0
     latency, jitter = collections.defaultdict(list), collections.defaultdict(list)
-    decided, commanded = [], []
+    looped, decision = [], 1.0 / policy_named(options.policy).rate
     with tempfile.TemporaryDirectory() as root:
         for seed in range(options.seeds):
             words = ["--scenario", options.scenario, "--policy", options.policy]
@@ -132,14 +147,8 @@ def main() -> None:
                 latency[name].append(1e3 * (values[:, 2] - values[:, 1]))
                 if name in ("QUADROTOR_STATE", "BODY_RATE_COMMAND", "VELOCITY_SETPOINT"):
                     jitter[name].append(np.abs(1e3 * np.diff(values[:, 2]) - COMMAND_PERIOD))
-            if "TRAJECTORY_HYPOTHESES" in heard:
-                images, commands = heard["DEPTH_IMAGE"][:, 2], heard["BODY_RATE_COMMAND"][:, 2]
-                for plan in heard["TRAJECTORY_HYPOTHESES"][1:, 2]:
-                    image = images[images < plan].max()
-                    after = commands[commands > plan]
-                    decided.append(1e3 * (plan - image))
-                    if len(after):
-                        commanded.append(1e3 * (after[0] - image))
+            for name in {"DEPTH_IMAGE", "DEPTH_GRID"} & set(heard):
+                looped.append(loops(heard[name], heard["VELOCITY_SETPOINT"], decision))
     print(
         f"\n{options.policy} in {options.scenario}: {outcomes.count('goal')} of {options.seeds} "
         f"reached the goal ({', '.join(outcomes)}); {seconds:.0f} s of messages; the bridge missed "
@@ -151,10 +160,9 @@ def main() -> None:
         delays = np.concatenate(values)
         off = quantiles(np.concatenate(jitter[name])) if jitter[name] else ("", "", "")
         row(name, len(delays), lost[name], *quantiles(delays), *off)
-    if decided:
+    if looped:
         header("loop [ms]", "median", "p99", "most")
-        row("image to hypotheses", *quantiles(np.array(decided)))
-        row("image to the first command after them", *quantiles(np.array(commanded)))
+        row("image to velocity setpoint", *quantiles(np.concatenate(looped)))
 
 
 if __name__ == "__main__":
