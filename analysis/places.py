@@ -40,7 +40,12 @@ PLACES = {
     # and those that start from exact depth have hardly to move.
     "warehouse": Place(
         "worlds/warehouse.gltf",
-        ("render.up=z", "reconstruct.initial_gaussians=160000", "reconstruct.means_rate=4e-5"),
+        (
+            "render.up=z",
+            "reconstruct.initial_gaussians=430000",
+            "reconstruct.max_gaussians=430000",
+            "reconstruct.means_rate=4e-5",
+        ),
     ),
     "hospital_building": Place(
         "worlds/hospital_building.gltf",
