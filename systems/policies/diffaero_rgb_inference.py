@@ -24,8 +24,6 @@ class DiffAeroRgbSpec:
 
 
 DIFFAERO_RGB_NETWORK = DiffAeroRgbSpec()
-CAUTION = 1.0
-"""Expected errors by which surfaces are taken for nearer than they are judged to be."""
 
 
 class DiffAeroRgbNetwork:
@@ -74,6 +72,5 @@ def decide(
     Raises:
         ValueError: for an image of another size.
     """
-    inverse, log_error = network.monocular(encode_view(color, X_WB.rotation().matrix()))
-    grid = inverse + CAUTION * np.exp(log_error)
+    grid, _ = network.monocular(encode_view(color, X_WB.rotation().matrix()))
     return decide_by_grid(network.policy, grid, X_WB, v_WB, p_WG, speed, memory)
