@@ -168,7 +168,7 @@ def test_files_are_understood(page, tmp_path):
     ids=lambda page: page.stem,
 )
 def test_python_runs(page):
-    """Every Python block runs, those of a page one after the other, and flights that they fly end."""
+    """Every Python block runs, those of a page one after the other, and what they fly ends."""
     names: dict[str, Any] = {}
     for code in blocks(page, "python"):
         exec(code, names)
