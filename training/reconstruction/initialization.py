@@ -1,5 +1,6 @@
 """The Gaussians from which a reconstruction starts: from depth, from points, or at random."""
 
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -175,7 +176,8 @@ def gaussians_from_depth(
             tqdm.write(
                 f"{len(kept)} Gaussians cover {covered:.0%} of the surfaces that the frames show, "
                 f"and leave holes in the rest; {len(p_WQ)} would cover them: set initial_gaussians "
-                "nearer to that, or use frames of a smaller part of the place"
+                "nearer to that, or use frames of a smaller part of the place",
+                file=sys.stderr,
             )
         p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
     quats, scales = principal_axes(covariances)
