@@ -43,7 +43,6 @@ PLACES = {
         (
             "render.up=z",
             "reconstruct.initial_gaussians=430000",
-            "reconstruct.max_gaussians=430000",
             "reconstruct.means_rate=4e-5",
         ),
     ),
@@ -55,7 +54,6 @@ PLACES = {
             "render.apart=6",
             "render.spacing=1.4",
             "reconstruct.initial_gaussians=1000000",
-            "reconstruct.max_gaussians=1000000",
             "reconstruct.iterations=10000",
             "reconstruct.means_rate=4e-5",
         ),

@@ -30,19 +30,24 @@ TINY = [
 ]
 
 
-@pytest.fixture(scope="module")
-def expert(tmp_path_factory) -> Path:
-    """The folder of a corpus of one short flight in each of two small forests."""
-    folder = tmp_path_factory.mktemp("expert")
-    grove = tmp_path_factory.mktemp("worlds") / "grove.yaml"
+def gather(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
+    """A corpus of one short flight in each of two small forests."""
+    grove = worlds / "grove.yaml"
     grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
     config = CorpusConfig(
         worlds=LibraryConfig(kinds=[str(grove)]),
         expert=ExpertConfig(period=0.5),
         flights=1,
-        camera=OnboardCamera(width=32, height=24),
+        camera=camera,
     )
     make.run(config=config, out=folder, worlds=2, jobs=1)
+
+
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory) -> Path:
+    """The folder of a corpus in depth and colours for students."""
+    folder = tmp_path_factory.mktemp("expert")
+    gather(folder, tmp_path_factory.mktemp("worlds"), OnboardCamera(width=32, height=24))
     return folder
 
 
@@ -89,15 +94,7 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
 
 def test_what_sees_in_colours_recovers_too(tmp_path):
     """DiffAero in colours flies by what it judges, and both its stages see images of its corpus."""
-    grove = tmp_path / "grove.yaml"
-    grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
-    corpus = CorpusConfig(
-        worlds=LibraryConfig(kinds=[str(grove)]),
-        expert=ExpertConfig(period=0.5),
-        flights=1,
-        camera=OnboardCamera(width=160, height=90),
-    )
-    make.run(config=corpus, out=tmp_path / "expert", worlds=2, jobs=1)
+    gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
     overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
     config = load_config(DiffAeroRgbTraining(), overrides=overrides)
