@@ -7,9 +7,10 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.observation import camera_of, decision_period, images_of
-from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, Pilot
+from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, Pilot, make_policy
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
 from splatpilot.systems.messaging.bridge_status import BridgeStatus
 from splatpilot.systems.messaging.codecs import (
     Codec,
@@ -105,14 +106,20 @@ def BuildHardwareDiagram(
         return subscriber
 
     def add_publisher(
-        codec: Codec, source: OutputPort, period: float, enabled: OutputPort | None = None
+        codec: Codec,
+        source: OutputPort,
+        period: float,
+        enabled: OutputPort | None = None,
+        decided: OutputPort | None = None,
     ) -> None:
-        publisher = MessagePublisher(lcm, codec, period)
+        publisher = MessagePublisher(lcm, codec, period, config.tick if decided else None)
         builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
         builder.Connect(source, publisher.GetInputPort(codec.port))
         builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
         if enabled is not None:
             builder.Connect(enabled, publisher.enabled_input_port())
+        if decided is not None:
+            builder.Connect(decided, publisher.decided_input_port())
 
     received: dict[str, MessageSubscriber | TimeOfFlightReceiver] = {
         "state": add_subscriber(StateCodec())
@@ -122,8 +129,14 @@ def BuildHardwareDiagram(
     builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
     builder.Connect(received["state"].age_output_port(), predictor.age_input_port())
     state = predictor.state_output_port()
+    policy = policy or make_policy(scenario, world)
+    decided, decision = None, decision_period(scenario, policy)
+    codecs = image_codecs(scenario, policy)
+    if codecs and can_be_triggered(policy):
+        policy = ArrivalTriggered(policy, config.tick)
+        decided = policy.decided_output_port()
     pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
-    for codec in image_codecs(scenario, pilot.policy):
+    for codec in codecs:
         if codec.port == "depth_grid" and config.time_of_flight is not None:
             receiver = TimeOfFlightReceiver(config.time_of_flight, config.tick)
             builder.AddNamedSystem("depth_grid_receiver", receiver)
@@ -132,9 +145,11 @@ def BuildHardwareDiagram(
             received[codec.port] = add_subscriber(codec)
     observed = {"state": state}
     observed |= {name: received[name].GetOutputPort(name) for name in list(received)[1:]}
-    ConnectObservation(builder, observed, pilot.policy)
 
     status = BridgeStatus(list(received)[1:])
+    builder.AddNamedSystem("status", status)
+    age = {"observation_age": status.observation_age_output_port()}
+    ConnectObservation(builder, observed | age, pilot.policy)
     failsafe = Failsafe(
         config.failsafe,
         scenario.controller,
@@ -143,7 +158,6 @@ def BuildHardwareDiagram(
         world.distance_field.upper_W,
         world.distance_field,
     )
-    builder.AddNamedSystem("status", status)
     builder.AddNamedSystem("failsafe", failsafe)
     for signal, subscriber in received.items():
         for what in ("age", "gaps", "rejected"):
@@ -172,12 +186,13 @@ def BuildHardwareDiagram(
     command, setpoint = failsafe.command_output_port(), failsafe.velocity_setpoint_output_port()
     known, period = failsafe.state_is_known_output_port(), scenario.controller.period
     add_publisher(CommandCodec(), command, period, known)
-    add_publisher(VelocitySetpointCodec(), setpoint, period, failsafe.in_charge_output_port())
+    in_charge = failsafe.in_charge_output_port()
+    add_publisher(VelocitySetpointCodec(), setpoint, period, in_charge, decided)
     add_publisher(StatusCodec(), status.status_output_port(), 1 / config.status_rate)
     if pilot.policy.HasOutputPort("hypotheses"):
         plans = pilot.policy.GetOutputPort("hypotheses")
         codec = HypothesesCodec(num_hypotheses_in(plans.size()))
-        add_publisher(codec, plans, decision_period(scenario, pilot.policy))
+        add_publisher(codec, plans, decision, decided=decided)
 
     for name, port in observed.items():
         builder.ExportOutput(port, name)

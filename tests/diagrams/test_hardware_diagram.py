@@ -21,6 +21,7 @@ from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_trajectory_hypotheses
 from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET, MessagePublisher
 from splatpilot.systems.messaging.time_of_flight_receiver import (
@@ -32,6 +33,7 @@ from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.flight_limits import FlightLimits
 
 TICK = HardwareConfig().tick
 
@@ -68,17 +70,20 @@ class Halves:
         return self.hardware.GetOutputPort("status").Eval(self.root)
 
 
-@pytest.mark.parametrize("name", ["planner", "reactive", "depthnav"])
+@pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "diffaero", "diffaero_tof"])
 def test_the_two_halves_fly_as_the_whole(post_world, name):
-    """Cut in two, a flight is the same but for the 6 ms of messages: within 20 cm after 3 s, for
-    policies with plans, with accelerations and with headings, blind and seeing."""
+    """Cut in two, and with limits beyond what it does, a flight is the same but for the 6 ms of
+    messages: within 10 cm after 3 s, for policies with plans, with accelerations, with velocities
+    and with headings, blind and seeing."""
     scenario = Scenario(
         timeout=3.0, policy=policy_named(name), start=[1.0, 1.0, 2.0], goal=[9.0, 1.0, 2.0]
     )
     whole = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
-    halves = Halves(scenario, post_world)
+    limits = FlightLimits(max_speed=20.0, max_tilt=1.5, deceleration=100.0, min_clearance=0.0)
+    config = HardwareConfig(failsafe=FailsafeConfig(limits=limits))
+    halves = Halves(scenario, post_world, config=config)
     halves.advance_to(3.0)
-    np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.2)
+    np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.1)
     assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 2.0
     mode, _, state_age, _, gaps, rejected, overruns = halves.status()
     assert mode == lcmt_bridge_status.FLYING

@@ -16,17 +16,22 @@ EPOCH = 1_800_000_000.25  # [s]
 
 
 class Counter(LeafSystem):
-    """Its output is the number of its updates, every 0.02 s."""
+    """Its output is the number of its updates, and its output `decided` the time of the last."""
 
-    def __init__(self):
+    def __init__(self, period: float = 0.02):
         super().__init__()
         self.DeclareStateOutputPort("command", self.DeclareDiscreteState(4))
-        self.DeclarePeriodicDiscreteUpdateEvent(
-            0.02, 0.0, lambda context, x: x.set_value(context.get_discrete_state(0).value() + 1)
-        )
+        self.DeclareStateOutputPort("decided", self.DeclareDiscreteState(1))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context, discrete_state):
+        discrete_state.set_value(0, context.get_discrete_state(0).value() + 1)
+        discrete_state.set_value(1, [context.get_time()])
 
 
-def published(source: LeafSystem, until: float, enabled: float | None = None) -> list:
+def published(
+    source: LeafSystem, until: float, enabled: float | None = None, tick: float | None = None
+) -> list:
     """The messages that a publisher with a period of 0.02 s sends of a source of commands."""
     transport = lcm.LCM("memq://")
     heard = []
@@ -34,9 +39,11 @@ def published(source: LeafSystem, until: float, enabled: float | None = None) ->
     builder = DiagramBuilder()
     clock = builder.AddSystem(UnixClock())
     builder.AddSystem(source)
-    publisher = builder.AddSystem(MessagePublisher(transport, CommandCodec(), 0.02))
-    builder.Connect(source.get_output_port(), publisher.GetInputPort("command"))
+    publisher = builder.AddSystem(MessagePublisher(transport, CommandCodec(), 0.02, tick))
+    builder.Connect(source.get_output_port(0), publisher.GetInputPort("command"))
     builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+    if tick is not None:
+        builder.Connect(source.GetOutputPort("decided"), publisher.decided_input_port())
     if enabled is not None:
         switch = builder.AddSystem(ConstantVectorSource(np.array([enabled])))
         builder.Connect(switch.get_output_port(), publisher.enabled_input_port())
@@ -73,8 +80,21 @@ def test_nothing_is_sent_while_disabled():
     assert len(published(ConstantVectorSource(source), 0.1, enabled=1.0)) == 5
 
 
+def test_what_is_decided_between_is_sent_at_once():
+    """Between two of its times a publisher sends what is decided there, with the number of the
+    message before; what is decided at one of them is sent once."""
+    counter = Counter(0.03)
+    messages = published(counter, 0.1, tick=0.002)
+    at = [round(1e3 * (m.header.utime * 1e-6 - EPOCH)) for m in messages]
+    assert at == [0, 20, 30, 40, 60, 80, 90]
+    assert [m.header.seq for m in messages] == [0, 1, 1, 2, 3, 4, 4]
+    assert [m.thrust for m in messages] == [1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 4.0]
+
+
 @pytest.mark.parametrize("period", [0.0, -1.0, np.inf, np.nan])
 def test_period_must_be_positive(period):
-    """A period that is none is an error that names the channel."""
+    """A period or a tick that is none is an error that names the channel."""
     with pytest.raises(ValueError, match=r"BODY_RATE_COMMAND are .* apart"):
         MessagePublisher(lcm.LCM("memq://"), CommandCodec(), period)
+    with pytest.raises(ValueError, match=r"BODY_RATE_COMMAND are .* late at most"):
+        MessagePublisher(lcm.LCM("memq://"), CommandCodec(), 0.02, tick=period)
