@@ -113,7 +113,7 @@ def frames_of_capture(scene: Path, cameras: list[OnboardCamera]) -> list[list[De
         captured = views.capture.frame(i)
         for config, seen in zip(cameras, frames, strict=True):
             view = render_view(gaussians, config.camera_info(), captured.X_WC, 0.01, 1e10)
-            depth = ranged_depth(view, config.min_depth, config.max_depth)
+            depth = ranged_depth(view.depth, config.min_depth, config.max_depth)
             truth = sampled(captured.depth, captured.K, config)
             seen.append(DepthFrame(depth, truth))
     return frames

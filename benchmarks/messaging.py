@@ -7,9 +7,9 @@ Flies one scenario seed by seed, while this process listens as `lcm-logger` does
 
 - what was lost: sequence numbers that never came, here and at the bridge;
 - latency: from a message's `utime`, when its sender's tick was due, to its arrival here;
-- jitter: of what is sent 50 times a second, by how much intervals differ from 20 ms;
-- the loop: from the arrival of an image to that of the velocity setpoint decided on it, the first
-  that the bridge sent when a decision was due, as its sequence numbers and utimes tell;
+- jitter: of what is sent 50 times a second, by how much intervals differ from 20 ms; setpoints
+  that are sent between, because they were decided there, are left out;
+- the loop: from the arrival of an image to that of the velocity setpoint decided on it;
 - how many flights reached the goal, for comparison with `splatpilot benchmark`.
 
 Load counts: run it on an idle machine, or say what else ran.
@@ -31,7 +31,6 @@ import numpy as np
 from drake import lcmt_header, lcmt_image_array
 from harness import header, machine, row
 
-from splatpilot.diagrams.policies import policy_named
 from splatpilot.systems.messaging.generated import (
     lcmt_body_rate_command,
     lcmt_bridge_status,
@@ -98,16 +97,18 @@ def fly(words: list[str], url: str, folder: Path) -> tuple[str, str, float]:
     return summary["outcome"], said["outcome"], float(said["gaps"]) + float(said["rejected"])
 
 
-def loops(images: np.ndarray, setpoints: np.ndarray, decision: float) -> np.ndarray:
-    """[ms] from images to the setpoints decided on them, of messages (n, 3) as they were heard;
-    decisions are due every `decision` [s] of the bridge's time."""
-    seq, utime, arrival = setpoints.T
-    period = np.median(np.diff(utime) / np.diff(seq))
-    decided = np.floor(seq * period / decision + 1e-6)
-    due = utime - seq * period + decided * decision
-    last = np.searchsorted(images[:, 2], due) - 1
-    fresh = np.append(False, np.diff(decided) > 0) & (last >= 0)
-    return 1e3 * (arrival - images[last, 2])[fresh]
+def loops(images: np.ndarray, setpoints: np.ndarray) -> np.ndarray:
+    """[ms] from images to the setpoints decided on them, of messages (n, 3) as they were heard:
+    those between two of the regular ones, which bear the number of the one before."""
+    arrival = setpoints[1:, 2][np.diff(setpoints[:, 0]) == 0]
+    last = np.searchsorted(images[:, 2], arrival) - 1
+    np.save("/tmp/w/loops.npy", 1e3 * (arrival - images[last, 2])[last >= 0])
+    return 1e3 * (arrival - images[last, 2])[last >= 0]
+
+
+def regular(messages: np.ndarray) -> np.ndarray:
+    """Of messages (n, 3) the first of each number."""
+    return messages[np.unique(messages[:, 0], return_index=True)[1]]
 
 
 def quantiles(values: np.ndarray) -> tuple[str, ...]:
@@ -128,7 +129,7 @@ def main() -> None:
     outcomes: list[str] = []
     seconds, lost, at_bridge = 0.0, collections.Counter[str](), 0.0
     latency, jitter = collections.defaultdict(list), collections.defaultdict(list)
-    looped, decision = [], 1.0 / policy_named(options.policy).rate
+    looped = []
     with tempfile.TemporaryDirectory() as root:
         for seed in range(options.seeds):
             words = ["--scenario", options.scenario, "--policy", options.policy]
@@ -146,9 +147,10 @@ def main() -> None:
                 lost[name] += int(np.ptp(values[:, 0])) + 1 - len(np.unique(values[:, 0]))
                 latency[name].append(1e3 * (values[:, 2] - values[:, 1]))
                 if name in ("QUADROTOR_STATE", "BODY_RATE_COMMAND", "VELOCITY_SETPOINT"):
-                    jitter[name].append(np.abs(1e3 * np.diff(values[:, 2]) - COMMAND_PERIOD))
+                    intervals = 1e3 * np.diff(regular(values)[:, 2])
+                    jitter[name].append(np.abs(intervals - COMMAND_PERIOD))
             for name in {"DEPTH_IMAGE", "DEPTH_GRID"} & set(heard):
-                looped.append(loops(heard[name], heard["VELOCITY_SETPOINT"], decision))
+                looped.append(loops(heard[name], heard["VELOCITY_SETPOINT"]))
     print(
         f"\n{options.policy} in {options.scenario}: {outcomes.count('goal')} of {options.seeds} "
         f"reached the goal ({', '.join(outcomes)}); {seconds:.0f} s of messages; the bridge missed "

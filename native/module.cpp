@@ -84,14 +84,8 @@ RenderedFrame render(Renderer& renderer, const Means& means, const Quats& quats,
   return RenderedFrame(renderer.render(gaussians, camera, out, keep));
 }
 
-void render_baked(const BakedScene& scene, Renderer& renderer, const Means& means,
-                  const Quats& quats, const Means& scales, const Opacities& opacities,
-                  const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW, int width,
-                  int height, double near_plane, double far_plane, double eps2d,
-                  const Floats<nb::shape<3>>& background, const Output& color, const Output& depth,
-                  const Output& alpha, int distortion, const Doubles<nb::shape<13>>& lens) {
-  require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
-  const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
+// What Python knows of a lens, by its kind and numbers.
+LensArguments lens_from(int distortion, const Doubles<nb::shape<13>>& lens) {
   require(distortion >= 0 && distortion <= 2, "there is no such distortion");
   LensArguments bent{static_cast<DistortionModel>(distortion)};
   const double* next = lens.data();
@@ -103,13 +97,43 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Means& mean
     std::copy_n(next, count, to);
     next += count;
   }
-  const Camera camera =
-      camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d, false, bent);
+  return bent;
+}
+
+void render_baked(const BakedScene& scene, Renderer& renderer, const Means& means,
+                  const Quats& quats, const Means& scales, const Opacities& opacities,
+                  const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW, int width,
+                  int height, double near_plane, double far_plane, double eps2d,
+                  const Floats<nb::shape<3>>& background, const Output& color, const Output& depth,
+                  const Output& alpha, int distortion, const Doubles<nb::shape<13>>& lens) {
+  require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
+  const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
+  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d,
+                                    false, lens_from(distortion, lens));
   check_size(color, camera, 3);
   check_size(depth, camera, 1);
   check_size(alpha, camera, 1);
   Image out{color.data(), 3, depth.data(), 1, DepthMode::kMedian, alpha.data(), {}};
   std::copy_n(background.data(), 3, out.background);
+  const Exclusive use(renderer);
+  renderer.render(scene.arrays(), moving, camera, out);
+}
+
+void render_baked_depth(const BakedScene& scene, Renderer& renderer, const Means& means,
+                        const Quats& quats, const Means& scales, const Opacities& opacities,
+                        const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW,
+                        int width, int height, double near_plane, double far_plane,
+                        double max_depth, double eps2d, const Output& depth, int distortion,
+                        const Doubles<nb::shape<13>>& lens) {
+  require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
+  const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
+  // No Gaussian whose centre lies farther away has depth up to there at its nearest rim, and all
+  // of them are behind those that have.
+  const double reach = 1.01 * (1.0 + kMostFall) * max_depth;
+  const Camera camera = camera_from(K, X_CW, width, height, near_plane, std::min(far_plane, reach),
+                                    0.0, eps2d, false, lens_from(distortion, lens));
+  check_size(depth, camera, 1);
+  const Image out{nullptr, 0, depth.data(), 1, DepthMode::kMedian, nullptr, {}};
   const Exclusive use(renderer);
   renderer.render(scene.arrays(), moving, camera, out);
 }
@@ -205,6 +229,11 @@ NB_MODULE(_native, m) {
         "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a, "depth"_a, "alpha"_a,
         "distortion"_a, "lens"_a,
         "Writes colour, median depth and alpha of the scene and of Gaussians among it.");
+  m.def("render_baked_depth", &render_baked_depth, "scene"_a, "renderer"_a, nb::kw_only(),
+        "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a, "K"_a, "X_CW"_a,
+        "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "max_depth"_a, "eps2d"_a, "depth"_a,
+        "distortion"_a, "lens"_a,
+        "Writes the median depth alone; what it is beyond max_depth is farther than that, or 0.");
 
   bind_losses(m);
   bind_fitting(m);

@@ -129,6 +129,12 @@ struct BlockPixels {
   alignas(64) float red[kLanes], green[kLanes], blue[kLanes], depth[kLanes], alpha[kLanes];
 };
 
+// Where half of the light is let through, z at that inverse depth; else 0.
+SP_INLINE F16 median_depth(const F16& transmittance, const F16& median_w) {
+  const F16 z = F16(1.0f) / max(median_w, F16(1e-10f));
+  return zero_unless(transmittance <= F16(0.5f), z);
+}
+
 template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPixels& pixels) {
   store(pixels.alpha, state.alpha);
@@ -143,8 +149,7 @@ SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPi
     store(pixels.depth, expected ? state.depth / max(state.alpha, F16(1e-10f)) : state.depth);
   }
   if constexpr (kMedian) {
-    const F16 z = F16(1.0f) / max(state.median_w, F16(1e-10f));
-    store(pixels.depth, zero_unless(state.sharp_transmittance <= F16(0.5f), z));
+    store(pixels.depth, median_depth(state.sharp_transmittance, state.median_w));
   }
 }
 
@@ -242,8 +247,60 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
   }
 }
 
+// Seeks the median depth of one block among the staged splats; returns whether a pixel has none
+// yet.
+SP_INLINE bool seek_block(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
+                          F16& transmittance, F16& median_w) {
+  for (int word = 0; word < words; ++word) {
+    for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
+      const int i = 64 * word + __builtin_ctzll(bits);
+      if (!seek_median(staged.planes[i], staged.splats[i].log2_opacity, pixel.x, pixel.y,
+                       transmittance, median_w)) {
+        return false;
+      }
+    }
+  }
+  return true;
+}
+
+// The median depth of one tile and nothing else, with the bits of `raster_tile_channels`.
+inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
+  const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
+  const LaneCentres centres = lane_centres();
+  F16 transmittance[kBlocksPerTile], median_w[kBlocksPerTile];
+  uint32_t inside = 0;
+  for (int b = 0; b < kBlocksPerTile; ++b) {
+    transmittance[b] = ones_inside(in.width, in.height, centres, left, top, b);
+    median_w[b] = F16(0.0f);
+    if (any(transmittance[b] > F16(0.0f))) inside |= 1u << b;
+  }
+  StagedTile staged;
+  uint32_t seeking = inside;
+  const size_t end = in.tile_offsets[tile + 1];
+  for (size_t begin = in.tile_offsets[tile]; begin < end && seeking; begin += kStageSize) {
+    const int count = end - begin < kStageSize ? static_cast<int>(end - begin) : kStageSize;
+    stage(in, true, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
+    for (uint32_t bits = seeking; bits; bits &= bits - 1) {
+      const int b = __builtin_ctz(bits);
+      const LaneCentres pixel = block_centres(centres, b);
+      if (!seek_block(staged, (count + 63) / 64, b, pixel, transmittance[b], median_w[b])) {
+        seeking &= ~(1u << b);
+      }
+    }
+  }
+  for (uint32_t bits = inside; bits; bits &= bits - 1) {
+    const int b = __builtin_ctz(bits);
+    alignas(64) float depth[kLanes];
+    store(depth, median_depth(transmittance[b], median_w[b]));
+    for_each_pixel(
+        in.width, in.height, left + kBlockSize * (b % 4), top + kBlockSize * (b / 4),
+        [&](int lane, size_t pixel) { image.depth[pixel * image.depth_stride] = depth[lane]; });
+  }
+}
+
 inline void raster_tile(const RasterInput& in, const Image& image, const StageWriter* record,
                         int tile) {
+  if (!image.alpha) return seek_tile(in, image, tile);
   if (image.depth && image.depth_mode == DepthMode::kMedian) {
     image.color ? raster_tile_channels<true, false, true>(in, image, record, tile)
                 : raster_tile_channels<false, false, true>(in, image, record, tile);

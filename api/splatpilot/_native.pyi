@@ -84,6 +84,11 @@ def render_baked(scene: BakedScene, renderer: Renderer, *, means: Annotated[NDAr
     Writes colour, median depth and alpha of the scene and of Gaussians among it.
     """
 
+def render_baked_depth(scene: BakedScene, renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, max_depth: float, eps2d: float, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], distortion: int, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)]) -> None:
+    """
+    Writes the median depth alone; what it is beyond max_depth is farther than that, or 0.
+    """
+
 def photometric_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], ssim_weight: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, simd: str = '') -> float:
     """
     (1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.

@@ -45,14 +45,16 @@ def color_pixels(color: NDArray) -> NDArray[np.uint8]:
     return np.clip(color * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
-def ranged_depth(view: RenderedView, min_depth: float, max_depth: float) -> NDArray[np.float32]:
-    """Planar depth of the surfaces in `view`  # (H, W) [m].
+def ranged_depth(
+    depth: NDArray[np.float32], min_depth: float, max_depth: float
+) -> NDArray[np.float32]:
+    """Planar depth (H, W) [m], 0 where there is no surface, as Drake's cameras show it.
 
-    As in Drake, nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so
-    does a pixel without a surface.
+    Nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so does a pixel
+    without a surface.
     """
-    seen = (view.depth > 0) & (view.depth <= max_depth)
-    return np.where(seen, np.where(view.depth < min_depth, np.float32(0), view.depth), np.inf)
+    seen = (depth > 0) & (depth <= max_depth)
+    return np.where(seen, np.where(depth < min_depth, np.float32(0), depth), np.inf)
 
 
 def surface_labels(view: RenderedView) -> NDArray[np.int16]:

@@ -1,6 +1,6 @@
 """A camera that sees Gaussians."""
 
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from pydrake.common.value import Value
@@ -25,7 +25,11 @@ from splatpilot.systems.splats.drake_images import (
     surface_labels,
 )
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, MovingGaussians
+from splatpilot.systems.splats.moving_gaussians import (
+    NO_GAUSSIANS,
+    MovingGaussians,
+    PlacedGaussians,
+)
 from splatpilot.systems.weakly import weakly
 
 
@@ -50,7 +54,8 @@ class SplatCamera(LeafSystem):
     `body_pose` is the pose X_WB of the body that carries the camera; the camera sits at X_WC = X_WB
     X_BC with x right, y down and z forward, and images all of colour, depth and labels from there.
     The images are rendered when a port is evaluated, once for all of them, and again only when the
-    pose has changed, or the time where something moves.
+    pose has changed, or the time where something moves. Depth that is looked at alone is rendered
+    alone, which is faster, and has the same bits.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in metres
     (`depth_image_32f`) or millimetres (`depth_image_16u`). As in Drake, nearer than `min_depth`
@@ -128,28 +133,32 @@ class SplatCamera(LeafSystem):
 
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
-        view_entry = self.DeclareCacheEntry(
-            "rendered view",
-            ValueProducer(
-                Value[object],  # pyright: ignore[reportArgumentType]
-                weakly(self._calc_view),
-            ),
-            {pose_ticket} if moving is None else {pose_ticket, self.time_ticket()},
+        tickets = {pose_ticket} if moving is None else {pose_ticket, self.time_ticket()}
+        view_entry, depth_entry = (
+            self.DeclareCacheEntry(
+                name,
+                ValueProducer(
+                    Value[object],  # pyright: ignore[reportArgumentType]
+                    weakly(calc),
+                ),
+                tickets,
+            )
+            for name, calc in (("view", self._calc_view), ("depth", self._calc_depth))
         )
-        # The index: Drake would never free a system that keeps the entry itself.
-        self._view_index = view_entry.cache_index()
+        # The indices: Drake would never free a system that keeps the entries themselves.
+        self._view_index, self._depth_index = view_entry.cache_index(), depth_entry.cache_index()
         width, height = camera_info.width(), camera_info.height()
-        for name, image, calc in (
-            ("color_image", ImageRgba8U, self._calc_color),
-            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f),
-            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u),
-            ("label_image", ImageLabel16I, self._calc_label),
+        for name, image, calc, entry in (
+            ("color_image", ImageRgba8U, self._calc_color, view_entry),
+            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f, depth_entry),
+            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u, depth_entry),
+            ("label_image", ImageLabel16I, self._calc_label, view_entry),
         ):
             self.DeclareAbstractOutputPort(
                 name,
                 alloc=lambda image=image: Value(image(width, height)),
                 calc=weakly(calc),
-                prerequisites_of_calc={view_entry.ticket()},
+                prerequisites_of_calc={entry.ticket()},
             )
         self.DeclareAbstractOutputPort(
             "body_pose_in_world",
@@ -173,22 +182,44 @@ class SplatCamera(LeafSystem):
         """The view from body pose X_WB at a time [s]: float colour, depth and alpha, before they
         become Drake images.
         """
-        moving = NO_GAUSSIANS
-        if self._moving is not None:
-            moving = self._moving.at(max(0.0, time - self._latency))
         return render_view(
             self._scene,
             self._camera_info,
             X_WB @ self._X_BC,
             *self._clipping,
             background=self._background,
-            moving=moving,
+            moving=self._among(time),
             distortion=self._distortion,
         )
+
+    def _among(self, time: float) -> PlacedGaussians:
+        if self._moving is None:
+            return NO_GAUSSIANS
+        return self._moving.at(max(0.0, time - self._latency))
 
     def _calc_view(self, context, value) -> None:
         X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
         value.set_value(self.render(X_WB, context.get_time()))
+
+    def _calc_depth(self, context, value) -> None:
+        """(H, W) [m], with 0 and inf out of range."""
+        entry = self.get_cache_entry(self._view_index)
+        if not entry.is_out_of_date(context):
+            depth = self._view(context).depth
+        else:
+            info = self._camera_info
+            X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
+            depth = self._scene.render_depth(
+                info.intrinsic_matrix(),
+                info.width(),
+                info.height(),
+                X_WB @ self._X_BC,
+                *self._clipping,
+                max_depth=self._depth_range[1],
+                moving=self._among(context.get_time()),
+                distortion=self._distortion,
+            )
+        value.set_value(ranged_depth(depth, *self._depth_range))
 
     def _view(self, context) -> RenderedView:
         return cast(RenderedView, self.get_cache_entry(self._view_index).Eval(context))
@@ -199,8 +230,7 @@ class SplatCamera(LeafSystem):
         pixels[..., 3] = 255
 
     def _depth(self, context) -> np.ndarray:
-        """(H, W) [m], with 0 and inf out of range."""
-        return ranged_depth(self._view(context), *self._depth_range)
+        return cast(Any, self.get_cache_entry(self._depth_index).Eval(context))
 
     def _calc_depth_32f(self, context, value) -> None:
         value.get_mutable_value().mutable_data[..., 0] = self._depth(context)

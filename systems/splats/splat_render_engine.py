@@ -209,9 +209,8 @@ class SplatRenderEngine(RenderEngine):
     def DoRenderDepthImage(self, camera: DepthRenderCamera, depth_image_out: ImageDepth32F) -> None:
         depth_range = camera.depth_range()
         shapes = np.asarray(self._shapes().RenderDepthImage(*self._same(camera)).data)[..., 0]
-        splats = ranged_depth(
-            self._view(camera.core()), depth_range.min_depth(), depth_range.max_depth()
-        )
+        splats = self._depth(camera.core(), depth_range.max_depth())
+        splats = ranged_depth(splats, depth_range.min_depth(), depth_range.max_depth())
         np.asarray(depth_image_out.mutable_data)[..., 0] = np.minimum(shapes, splats)
 
     def DoRenderLabelImage(self, camera: ColorRenderCamera, label_image_out: ImageLabel16I) -> None:
@@ -226,14 +225,28 @@ class SplatRenderEngine(RenderEngine):
     # The two halves of an image.
 
     def _view(self, core: RenderCameraCore) -> RenderedView:
-        info, clipping = core.intrinsics(), core.clipping()
-        camera = [info.width(), info.height(), clipping.near(), clipping.far()]
-        numbers = [camera, info.intrinsic_matrix().ravel(), self._X_WC.GetAsMatrix34().ravel()]
-        key = np.concatenate(numbers).tobytes()
+        key = self._key(core)
         if self._last_view is None or self._last_view[0] != key:
+            info, clipping = core.intrinsics(), core.clipping()
             view = render_view(self._scene, info, self._X_WC, clipping.near(), clipping.far())
             self._last_view = key, view
         return self._last_view[1]
+
+    def _depth(self, core: RenderCameraCore, max_depth: float) -> NDArray[np.float32]:
+        """Up to `max_depth` that of `_view`, which is not made for it  # (H, W) [m]."""
+        if self._last_view is not None and self._last_view[0] == self._key(core):
+            return self._last_view[1].depth
+        info, clipping = core.intrinsics(), core.clipping()
+        K, size = info.intrinsic_matrix(), (info.width(), info.height())
+        near, far = clipping.near(), clipping.far()
+        return self._scene.render_depth(K, *size, self._X_WC, near, far, max_depth)
+
+    def _key(self, core: RenderCameraCore) -> bytes:
+        """The camera and where it is."""
+        info, clipping = core.intrinsics(), core.clipping()
+        camera = [info.width(), info.height(), clipping.near(), clipping.far()]
+        numbers = [camera, info.intrinsic_matrix().ravel(), self._X_WC.GetAsMatrix34().ravel()]
+        return np.concatenate(numbers).tobytes()
 
     def _shapes(self) -> QueryObject:
         if self._context is None:

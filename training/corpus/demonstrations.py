@@ -78,7 +78,7 @@ def see_states(
             R_PW, p_WP = X_WP.rotation().matrix().T, X_WP.translation()
             view = camera.render(X_WP)
             samples.color[row] = color_pixels(view.color)
-            samples.depth[row] = ranged_depth(view, optics.min_depth, optics.max_depth)
+            samples.depth[row] = ranged_depth(view.depth, optics.min_depth, optics.max_depth)
             samples.X_WB[row] = *X_WP.rotation().ToQuaternion().wxyz(), *p_WP
             samples.v_B[row] = R_PW @ v_WB
             to_goal = R_PW @ (labeller.toa.p_WG - p_WP)

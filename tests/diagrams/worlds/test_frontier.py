@@ -60,7 +60,7 @@ def closed(captured) -> tuple[Esdf, GaussianScene]:
 
 def seen_depth(frontier: GaussianScene, X_WC: RigidTransform) -> np.ndarray:
     """(120, 160) [m], what a depth camera sees of the frontier."""
-    return ranged_depth(BakedScene(frontier).render(K, 160, 120, X_WC), 0.0, 50.0)
+    return ranged_depth(BakedScene(frontier).render(K, 160, 120, X_WC).depth, 0.0, 50.0)
 
 
 def test_frontier_hides_nothing_that_was_captured(captured, closed):

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
+from splatpilot.systems.splats.distortion import Distortion
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.moving_gaussians import PlacedGaussians
 
 LEVELS = _native.simd_levels()
 WIDTH, HEIGHT = 83, 61
@@ -82,6 +85,31 @@ def test_culling_by_boxes_loses_nothing(seed):
     assert alpha.any()
     assert np.mean(np.abs(view.color - image[..., :3]) > 1e-3) < 1e-3
     assert np.mean(np.abs(view.alpha - alpha) > 1e-3) < 1e-3
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+@pytest.mark.parametrize("lens", [None, Distortion(model="fisheye", radial=[0.05, 0.0, 0.0, 0.0])])
+@pytest.mark.parametrize("size", [0.3, 1.0, 6.0])
+def test_depth_alone_has_the_same_bits(simd, lens, size):
+    """Up to the greatest depth, for Gaussians of all sizes and tilts, among moving ones, and
+    through a lens, depth rendered alone is that of the whole view; beyond it is beyond, or 0."""
+    bodies = random_scene(count=200, seed=1, sh_degree=0)
+    moving = PlacedGaussians(
+        *(getattr(bodies, name) for name in ("means", "quats", "scales", "opacities", "sh"))
+    )
+    scene = random_scene(count=3000)
+    scene = BakedScene(replace(scene, scales=np.float32(size) * scene.scales), simd=simd)
+    camera = {"K": K, "width": WIDTH, "height": HEIGHT, "moving": moving, "distortion": lens}
+    for X in (X_WC, RigidTransform([0.1, 0.2, -0.5])):
+        whole = scene.render(X_WC=X, **camera).depth
+        assert (whole > 0).mean() > 0.2
+        for max_depth in (0.2, 1.0, 2.0, 3.0, 5.0, np.inf):
+            alone = scene.render_depth(X_WC=X, max_depth=max_depth, **camera)
+            shown = (whole > 0) & (whole <= max_depth)
+            np.testing.assert_array_equal(alone[shown], whole[shown])
+            rest = alone[~shown]
+            assert ((rest == 0) | (rest > max_depth)).all()
+        np.testing.assert_array_equal(alone, whole)
 
 
 @pytest.mark.parametrize("simd", LEVELS)
@@ -174,6 +202,15 @@ def test_bad_cameras_are_named(change, message):
     arguments = {"K": K, "width": WIDTH, "height": HEIGHT, "X_WC": X_WC} | change
     with pytest.raises(ValueError, match=message):
         baked.render(**arguments)
+    if "background" not in change:
+        with pytest.raises(ValueError, match=message):
+            baked.render_depth(**arguments)
+
+
+def test_a_greatest_depth_that_is_none_is_named():
+    """Depth is rendered up to a positive number of metres."""
+    with pytest.raises(ValueError, match="max_depth is -1 m; it must be positive"):
+        BakedScene(random_scene(count=5)).render_depth(K, WIDTH, HEIGHT, X_WC, max_depth=-1.0)
 
 
 def test_bad_thread_counts_are_named():

@@ -24,13 +24,17 @@ X_BC = RigidTransform(RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 
 
 
 class CountingScene(BakedScene):
-    """A scene that counts how often it is rendered."""
+    """A scene that counts how often it is rendered, and how often its depth alone."""
 
-    renders = 0
+    renders = depths = 0
 
     def render(self, *args, **kwargs):
         self.renders += 1
         return super().render(*args, **kwargs)
+
+    def render_depth(self, *args, **kwargs):
+        self.depths += 1
+        return super().render_depth(*args, **kwargs)
 
 
 def wall(x: float, opacity: float = 0.99) -> CountingScene:
@@ -128,7 +132,8 @@ def test_nothing_in_view_is_background():
 
 
 def test_renders_once_per_pose_and_only_when_asked():
-    """All images of one pose cost one render, time alone costs none, and no pull costs none."""
+    """All images of one pose cost one render, time alone costs none, and no pull costs none; depth
+    that is pulled first, or alone, is rendered alone."""
     scene = wall(3)
     camera = SplatCamera(scene, INFO, X_BC)
     context = camera.CreateDefaultContext()
@@ -139,13 +144,20 @@ def test_renders_once_per_pose_and_only_when_asked():
         for port in ("color_image", "depth_image_32f", "depth_image_16u", "label_image"):
             camera.GetOutputPort(port).Eval(context)
         assert camera.GetOutputPort("image_time").Eval(context)[0] == time
-    assert scene.renders == 1
+    assert (scene.renders, scene.depths) == (1, 0)
     X_WB = RigidTransform([1.0, 0, 0])
     camera.GetInputPort("body_pose").FixValue(context, X_WB)
-    nearer = camera.GetOutputPort("depth_image_32f").Eval(context).data
+    for port in ("depth_image_32f", "depth_image_16u"):
+        camera.GetOutputPort(port).Eval(context)
+    nearer = camera.GetOutputPort("depth_image_32f").Eval(context).data.copy()
     assert camera.GetOutputPort("body_pose_in_world").Eval(context).IsExactlyEqualTo(X_WB)
-    assert scene.renders == 2
+    assert (scene.renders, scene.depths) == (1, 1)
     np.testing.assert_allclose(nearer, 1.9, rtol=2e-3)
+    other = camera.CreateDefaultContext()
+    camera.GetInputPort("body_pose").FixValue(other, X_WB)
+    camera.GetOutputPort("color_image").Eval(other)
+    np.testing.assert_array_equal(camera.GetOutputPort("depth_image_32f").Eval(other).data, nearer)
+    assert (scene.renders, scene.depths) == (2, 1)
 
 
 def test_depth_range_must_not_be_empty():
