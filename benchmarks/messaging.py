@@ -98,12 +98,12 @@ def fly(words: list[str], url: str, folder: Path) -> tuple[str, str, float]:
 
 
 def loops(images: np.ndarray, setpoints: np.ndarray) -> np.ndarray:
-    """[ms] from images to the setpoints decided on them, of messages (n, 3) as they were heard:
-    those between two of the regular ones, which bear the number of the one before."""
+    """[ms] from images to the first setpoints decided after them, of messages (n, 3) as they were
+    heard: those between two of the regular ones, which bear the number of the one before."""
     arrival = setpoints[1:, 2][np.diff(setpoints[:, 0]) == 0]
     last = np.searchsorted(images[:, 2], arrival) - 1
-    np.save("/tmp/w/loops.npy", 1e3 * (arrival - images[last, 2])[last >= 0])
-    return 1e3 * (arrival - images[last, 2])[last >= 0]
+    known, first = np.unique(last, return_index=True)
+    return 1e3 * (arrival[first] - images[known, 2])[known >= 0]
 
 
 def regular(messages: np.ndarray) -> np.ndarray:

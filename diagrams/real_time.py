@@ -25,8 +25,8 @@ def run_in_real_time(
     ready: Callable[[], object] = lambda: None,
 ) -> int:
     """
-    Advances a diagram, which has a `UnixClock` named `clock`, tick by tick: none begins before its
-    time on the wall clock.
+    Advances a diagram, which has a `UnixClock` named `clock`, tick by tick: the updates of none are
+    made before its time on the wall clock.
 
     A tick that ends after the next should have begun is an overrun; the input `overruns` of the
     diagram, where it has one, counts them, and the input `lag` is by how much [s]. The next tick is
@@ -57,7 +57,7 @@ def run_in_real_time(
     # The wall clock is not read again: when it is set, messages do not seem to be older.
     epoch, started, number, overruns, told = time.time(), time.monotonic(), 0, 0, 0.0
     clock.set_epoch(clock_context, epoch)
-    looked = -math.inf
+    looked = -0.5 * _WATCH_PERIOD  # Between what is sent at multiples of it.
     while True:
         # What happens at a tick is sent just after it.
         simulator.AdvanceTo(number * tick + 2 * PUBLISH_OFFSET)
@@ -66,6 +66,8 @@ def run_in_real_time(
             if over(looked):
                 return overruns
         number += 1
+        # No message that comes until then changes what happens before that tick's updates.
+        simulator.AdvanceTo(number * tick)
         late = time.monotonic() - (started + number * tick)
         overruns += late > 0.0
         lag = max(late, 0.0)
