@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from agreement import load_reference
 from harness import header, machine, milliseconds, peak_growth, row
@@ -25,6 +26,12 @@ from pydrake.math import RigidTransform
 from scenes import cameras_of, intrinsics, load_scene, scene_name, tensors_of
 
 from splatpilot import _native
+from splatpilot.diagrams.flight_start import sample_initial_state
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
 from splatpilot.systems.splats.distortion import Distortion
@@ -123,6 +130,25 @@ def print_baked(scene: GaussianScene, X_WC: RigidTransform) -> None:
         row(f"{width}x{height}", f"{plain:.2f}", f"{fast:.2f}", f"{plain / fast:.2f}")
 
 
+def print_depth_alone() -> None:
+    """In generated worlds, from where their first flights start."""
+    header("depth alone [ms]", "image", "colour and depth", "depth", "to 20 m", "to 6 m")
+    for name in ("P01", "P02", "P05", "P08"):
+        scenario = load_config(Scenario(), scenario_file(name))
+        world = make_world(scenario.world, scenario.seed)
+        X_WB = RigidTransform(sample_initial_state(scenario, world)[:3])
+        for width, height in ((64, 36), (320, 240)):
+            optics = OnboardCamera(width=width, height=height)
+            info, X_WC = optics.camera_info(), X_WB @ optics.X_BC()
+            camera = (info.intrinsic_matrix(), width, height, X_WC)
+            calls: list[Callable[[], object]] = [lambda c=camera, w=world: w.baked.render(*c)]
+            for most in (np.inf, 20.0, 6.0):
+                calls.append(
+                    lambda c=camera, w=world, m=most: w.baked.render_depth(*c, max_depth=m)
+                )
+            row(name, f"{width}x{height}", *(f"{milliseconds(call)[0]:.2f}" for call in calls))
+
+
 def print_distorted(scene: GaussianScene, X_WC: RigidTransform) -> None:
     header("distorted cameras, 320x240", "forward", "+ backward")
     viewmats, Ks = cameras_of(X_WC, 320, 240)
@@ -205,6 +231,7 @@ def main() -> None:
         print_steps(*load_scene(count))
     print_scaling(scene, X_WC)
     print_baked(scene, X_WC)
+    print_depth_alone()
     print_lenses(scene, X_WC)
     print_distorted(scene, X_WC)
     print_torch(scene, X_WC, calls)

@@ -58,7 +58,7 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
     mavlink, clock = Mavlink(config.system), UnixClock()
     telemetry = Px4Telemetry(inbox, mavlink, config.tick)
     address = config.vehicle_host, config.vehicle_port
-    commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY)
+    commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick)
     publisher = MessagePublisher(lcm, StateCodec(), 1 / config.state_rate)
     for name, system in (
         ("clock", clock),

@@ -27,6 +27,7 @@ class _Last(NamedTuple):
     """Of the last update, in the discrete state."""
 
     time: float = -math.inf  # [s]
+    sighted: float = -math.inf  # [s], of the last one by a new observation.
     observed: float = -math.inf  # [s], when the observation was sent that it saw,
     looked: float = -math.inf  # and that which was there at the last look.
 
@@ -36,9 +37,9 @@ class ArrivalTriggered(LeafSystem):
 
     A policy that decides fifteen times a second on images that come fifteen times a second would
     find each up to a fifteenth of a second old, as the two are started. This one decides as an
-    image comes, four fifths of a period after the last decision at the earliest; by one that came
-    before that when the period is over; and without a new one after a period and a quarter. So the
-    rate remains what the policy was made for, also where images are faster, slower, or missing.
+    image comes, four fifths of a period after the last decision on one at the earliest; by one that
+    came before that when the period is over; and without a new one after a period and a quarter. So
+    the rate remains what the policy was made for, also where images are faster, slower, or missing.
 
     .. pydrake_system::
 
@@ -131,17 +132,20 @@ class ArrivalTriggered(LeafSystem):
         last = _Last(*np.asarray(context.get_discrete_state(self._last).value()))
         now = context.get_time()
         observed = now - float(np.asarray(self.GetInputPort("observation_age").Eval(context))[0])
-        waited = (now - last.time) / self._period
         comes, is_new = (observed > seen + _NOISE for seen in (last.looked, last.observed))
-        due = LATEST if not is_new else EARLIEST if comes else 1.0
+        due = last.time + LATEST * self._period
+        if is_new:
+            due = last.sighted + (EARLIEST if comes else 1.0) * self._period
         discrete_state.set_value(self._last, np.array(last._replace(looked=observed)))
-        if math.isinf(observed) or waited < due - 1e-6:
+        if math.isinf(observed) or now < due - 1e-6:
             return
         inner = self._context(context, list(range(self._system.num_input_ports())))
         updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
         for group in range(inner.num_discrete_state_groups()):
             discrete_state.set_value(group, updated.value(group))
-        discrete_state.set_value(self._last, np.array(_Last(now, observed, observed)))
+        discrete_state.set_value(
+            self._last, np.array(_Last(now, now if is_new else last.sighted, observed, observed))
+        )
 
     def _calc_decided(self, context: Context, output: BasicVector) -> None:
         output[0] = context.get_discrete_state(self._last)[0]

@@ -65,6 +65,13 @@ class _Memory(NamedTuple):
     asked: float = -math.inf  # [s], when something was asked for last.
 
 
+class _Arrival(NamedTuple):
+    """Of setpoints, in the discrete state too."""
+
+    age: float = math.inf  # [s], at the last look; it falls where a setpoint has come.
+    time: float = -math.inf  # [s], when the last one came.
+
+
 class Px4Commander(LeafSystem):
     """Streams setpoints to PX4, enters offboard mode where that is asked for, and leaves it.
 
@@ -89,12 +96,12 @@ class Px4Commander(LeafSystem):
       the vehicle, sent on as ODOMETRY while it is no older than a setpoint may be.
     - ``unix_time`` (1): [s].
 
-    Every ``period`` from time 0 it sends the setpoint, if it is fresh, and the odometry; every
-    second a heartbeat. After ``streaming`` seconds of setpoints it asks for offboard mode, and in
-    it to arm, each where the configuration says so and the bridge flies, once a second until PX4
-    does. Where setpoints cease it asks for hold, and where the bridge lands for PX4's own landing,
-    and sends no more setpoints: offboard mode is not entered again. Nor is it where it was left by
-    someone else.
+    Every ``period`` from time 0 it sends the setpoint, if it is fresh, and the odometry, and the
+    setpoint also as it comes, for which it looks every ``tick``; every second a heartbeat. After
+    ``streaming`` seconds of setpoints it asks for offboard mode, and in it to arm, each where the
+    configuration says so and the bridge flies, once a second until PX4 does. Where setpoints cease
+    it asks for hold, and where the bridge lands for PX4's own landing, and sends no more setpoints:
+    offboard mode is not entered again. Nor is it where it was left by someone else.
     """
 
     setpoint_input_port = input_port("setpoint")
@@ -114,6 +121,7 @@ class Px4Commander(LeafSystem):
         address: tuple[str, int],
         gravity: float,
         period: float = 0.02,
+        tick: float = 0.002,
     ):
         """Constructs the system.
 
@@ -124,6 +132,7 @@ class Px4Commander(LeafSystem):
             address: host and port of PX4.
             gravity: [m/s^2].
             period: [s] between setpoints.
+            tick: [s] between looks at whether one has come; the period is whole ticks.
 
         Raises:
             ValueError: on a configuration out of range.
@@ -138,8 +147,11 @@ class Px4Commander(LeafSystem):
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
+        self._arrival = int(self.DeclareDiscreteState(np.array(_Arrival())))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
+        self.DeclarePeriodicPublishEvent(tick, PUBLISH_OFFSET, self._publish_at_once)
 
     def _is_fresh(self, context: Context, name: str) -> bool:
         age = optional_input(self, name, context)
@@ -191,7 +203,33 @@ class Px4Commander(LeafSystem):
             memory = memory._replace(left=float(left[1]), asked=-math.inf)
         if now - memory.asked >= _HEARTBEAT_PERIOD and self._request(context) is not None:
             memory = memory._replace(asked=now)
-        discrete_state.set_value(np.array(memory))
+        discrete_state.set_value(0, np.array(memory))
+
+    def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
+        age = optional_input(self, "setpoint_age", context)
+        assert age is not None
+        last = _Arrival(*np.asarray(context.get_discrete_state(self._arrival).value()))
+        time = context.get_time() if age[0] < last.age else last.time
+        discrete_state.set_value(self._arrival, np.array(_Arrival(age[0], time)))
+
+    def _publish_at_once(self, context: Context) -> None:
+        now = context.get_time() - PUBLISH_OFFSET
+        came = context.get_discrete_state(self._arrival)[1]
+        is_due = abs(math.remainder(now, self._period)) < PUBLISH_OFFSET  # And is sent anyway.
+        if now - came < PUBLISH_OFFSET and not is_due:
+            self._publish_setpoint(context)
+
+    def _publish_setpoint(self, context: Context) -> None:
+        now = context.get_time() - PUBLISH_OFFSET
+        if not self._is_fresh(context, "setpoint_age") or _memory(context).left:
+            return
+        setpoint = optional_input(self, "setpoint", context)
+        assert setpoint is not None
+        if self._config.setpoints == "velocity":
+            self._send(self._mavlink.velocity_setpoint(setpoint, now))
+        else:
+            thrust = self._config.hover_thrust
+            self._send(self._mavlink.body_rates(setpoint, thrust, self._gravity, now))
 
     def _publish(self, context: Context) -> EventStatus:
         memory, mavlink = _memory(context), self._mavlink
@@ -199,17 +237,8 @@ class Px4Commander(LeafSystem):
         tick = round(now / self._period)
         if tick % round(_HEARTBEAT_PERIOD / self._period) == 0:
             self._send(mavlink.heartbeat())
-        setpoint, pose = (
-            optional_input(self, name, context) for name in ("setpoint", "motion_capture_pose")
-        )
-        assert setpoint is not None
-        if self._is_fresh(context, "setpoint_age") and not memory.left:
-            if self._config.setpoints == "velocity":
-                self._send(mavlink.velocity_setpoint(setpoint, now))
-            else:
-                self._send(
-                    mavlink.body_rates(setpoint, self._config.hover_thrust, self._gravity, now)
-                )
+        self._publish_setpoint(context)
+        pose = optional_input(self, "motion_capture_pose", context)
         if pose is not None and self._is_fresh(context, "motion_capture_age"):
             unix_time, age = (
                 optional_input(self, name, context) for name in ("unix_time", "motion_capture_age")
@@ -227,4 +256,4 @@ class Px4Commander(LeafSystem):
 
 
 def _memory(context: Context) -> _Memory:
-    return _Memory(*np.asarray(context.get_discrete_state_vector().value()))
+    return _Memory(*np.asarray(context.get_discrete_state(0).value()))

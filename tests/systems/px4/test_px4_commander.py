@@ -79,6 +79,22 @@ def test_setpoints_are_sent_at_50_hz_while_they_are_fresh(told):
     assert vehicle.advance(1.0) == []
 
 
+def test_setpoints_are_sent_as_they_come(told):
+    """One that comes between two of the fifty is sent within a tick, once, and by its own value;
+    one that is old when it comes is not."""
+    vehicle = told(Px4CommanderConfig())
+    vehicle.advance(0.105)
+    vehicle.give(setpoint_age=[0.012])
+    assert vehicle.advance(0.002) == []
+    vehicle.give(setpoint=[0.0, 2.0, 0, np.nan], setpoint_age=[0.001])
+    sent = vehicle.advance(0.006)
+    assert [(m.vx, m.vy) for m in sent] == [(0.0, -2.0)]
+    vehicle.give(setpoint_age=[0.5])
+    vehicle.advance(0.02)
+    vehicle.give(setpoint_age=[0.4])
+    assert vehicle.advance(0.05) == []
+
+
 @pytest.mark.parametrize("mode", [status.WAITING, status.HOLDING, status.LANDING])
 def test_offboard_mode_is_not_asked_for_unless_the_bridge_flies(told, mode):
     """While the bridge waits, holds or lands, nothing is engaged or armed."""
