@@ -12,7 +12,8 @@ Flies one scenario seed by seed, while this process listens as `lcm-logger` does
 - the loop: from the arrival of an image to that of the velocity setpoint decided on it;
 - how many flights reached the goal, for comparison with `splatpilot benchmark`.
 
-Load counts: run it on an idle machine, or say what else ran.
+Load counts: run it on an idle machine, or say what else ran. Of virtual machines it prints what
+their host took from them meanwhile, where the system tells.
 """
 
 import argparse
@@ -111,6 +112,15 @@ def regular(messages: np.ndarray) -> np.ndarray:
     return messages[np.unique(messages[:, 0], return_index=True)[1]]
 
 
+def stolen() -> tuple[float, float]:
+    """Time of all cores that a virtual machine's host gave to others, and all time; any unit."""
+    stat = Path("/proc/stat")
+    if not stat.exists():
+        return 0.0, 0.0
+    numbers = [float(word) for word in stat.read_text().splitlines()[0].split()[1:9]]
+    return numbers[7], sum(numbers)
+
+
 def quantiles(values: np.ndarray) -> tuple[str, ...]:
     return tuple(f"{np.quantile(values, q):.2f}" for q in (0.5, 0.99, 1.0))
 
@@ -126,6 +136,7 @@ def main() -> None:
         free.bind(("", 0))
         url = f"udpm://239.255.76.67:{free.getsockname()[1]}?ttl=0&recv_buf_size=4000000"
     print(machine())
+    before = stolen()
     outcomes: list[str] = []
     seconds, lost, at_bridge = 0.0, collections.Counter[str](), 0.0
     latency, jitter = collections.defaultdict(list), collections.defaultdict(list)
@@ -156,6 +167,9 @@ def main() -> None:
         f"reached the goal ({', '.join(outcomes)}); {seconds:.0f} s of messages; the bridge missed "
         f"or rejected {at_bridge:.0f}"
     )
+    taken, passed = (after - then for after, then in zip(stolen(), before, strict=True))
+    if passed:
+        print(f"the host took {100.0 * taken / passed:.1f} % of the machine's time")
     header("channel", "messages", "lost", "latency [ms]: median", "p99", "most",
            "jitter [ms]: median", "p99", "most")  # fmt: skip
     for name, values in sorted(latency.items()):

@@ -16,19 +16,20 @@ from pydrake.systems.framework import (
 
 from splatpilot.systems.ports import input_port, output_port
 
-EARLIEST, LATEST = 0.8, 1.25
-"""Of the period, after the last update: when one that comes is not too early, and when none is
-waited for."""
+LATEST = 1.6
+"""Periods after the last update in which no observation is waited for."""
 
+_SAVED = 0.5  # Periods of rest that may be saved up, by which observations may come too early.
+_LEAST = 0.95  # Periods between updates on average, at least: clocks differ.
 _NOISE = 1e-4  # [s] In when the same observation was sent, as its age and the time tell it.
 
 
 class _Last(NamedTuple):
-    """Of the last update, in the discrete state."""
+    """What is kept in the discrete state."""
 
-    time: float = -math.inf  # [s]
-    sighted: float = -math.inf  # [s], of the last one by a new observation.
-    observed: float = -math.inf  # [s], when the observation was sent that it saw,
+    time: float = -math.inf  # [s], of the last update.
+    due: float = -math.inf  # [s], when an observation that comes is not too early.
+    observed: float = -math.inf  # [s], when the observation was sent that the last update saw,
     looked: float = -math.inf  # and that which was there at the last look.
 
 
@@ -37,9 +38,9 @@ class ArrivalTriggered(LeafSystem):
 
     A policy that decides fifteen times a second on images that come fifteen times a second would
     find each up to a fifteenth of a second old, as the two are started. This one decides as an
-    image comes, four fifths of a period after the last decision on one at the earliest; by one that
-    came before that when the period is over; and without a new one after a period and a quarter. So
-    the rate remains what the policy was made for, also where images are faster, slower, or missing.
+    image comes, as long as that is no more often than at its rate: of faster images some are left
+    out, by the rule of virtual scheduling (ITU-T I.371, the generic cell rate algorithm). Without
+    an image that comes in time it decides 1.6 periods after the last decision.
 
     .. pydrake_system::
 
@@ -57,8 +58,8 @@ class ArrivalTriggered(LeafSystem):
     - ``decided`` (1): [s], the time of the last update.
 
     Looks every ``tick`` seconds from time 0; the first update is by the first observation. The
-    discrete state is that of the system, and after it the times of the last update, of what it saw,
-    and of what came since.
+    discrete state is that of the system, and after it four times: of the last update, from which on
+    the next may be, of what the last one saw, and of what came since.
     """
 
     observation_age_input_port = input_port("observation_age")
@@ -133,19 +134,18 @@ class ArrivalTriggered(LeafSystem):
         now = context.get_time()
         observed = now - float(np.asarray(self.GetInputPort("observation_age").Eval(context))[0])
         comes, is_new = (observed > seen + _NOISE for seen in (last.looked, last.observed))
-        due = last.time + LATEST * self._period
-        if is_new:
-            due = last.sighted + (EARLIEST if comes else 1.0) * self._period
+        wanted = (comes and now >= last.due) or now >= last.time + LATEST * self._period - 1e-6
         discrete_state.set_value(self._last, np.array(last._replace(looked=observed)))
-        if math.isinf(observed) or now < due - 1e-6:
+        if math.isinf(observed) or not wanted:
             return
         inner = self._context(context, list(range(self._system.num_input_ports())))
         updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
         for group in range(inner.num_discrete_state_groups()):
             discrete_state.set_value(group, updated.value(group))
-        discrete_state.set_value(
-            self._last, np.array(_Last(now, now if is_new else last.sighted, observed, observed))
-        )
+        due = last.due
+        if is_new:
+            due = max(due, now - _SAVED * self._period) + _LEAST * self._period
+        discrete_state.set_value(self._last, np.array(_Last(now, due, observed, observed)))
 
     def _calc_decided(self, context: Context, output: BasicVector) -> None:
         output[0] = context.get_discrete_state(self._last)[0]
