@@ -19,7 +19,7 @@ class ScaleLimits(NamedTuple):
     """Of N Gaussians, by the depth from the closest of the views that see their centres."""
 
     smallest: Tensor  # (N,) [m], added, squared, to their standard deviations; 0 where none sees it
-    largest: Tensor  # (N,) [m], of their standard deviations; infinite where none sees it
+    largest: Tensor  # (N,) [m], of their standard deviations
 
     @classmethod
     def none(cls, like: Tensor) -> "ScaleLimits":
@@ -40,8 +40,10 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> Sc
     The smallest is the 3D smoothing filter of Mip-Splatting (Yu et al. 2024), a variance of 0.2
     square pixels in the closest view: smaller Gaussians are seen by the blur of colours alone;
     depth, which has none, would look through between them, and so would a camera that comes closer.
-    The largest is a twentieth of the depth: Gaussians are drawn as if perspective
-    were the same all over each, so that large ones stand as haze before cameras that come close.
+    The largest is a twentieth of the depth, or, where none sees the centre, of the distance from
+    the closest camera: Gaussians are drawn as if perspective were the same all over each, so that
+    large ones stand as haze before cameras that come close, and nothing says what those are that no
+    view sees whole; they grow through rooms, and stand as walls before cameras that come by.
 
     Args:
         means: (N, 3) [m].
@@ -50,8 +52,10 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> Sc
     """
     K, viewmats = views.K[0].to(means.device), views.viewmats.to(means.device)
     closest = torch.full_like(means[:, 0], torch.inf)  # [m]
+    nearest = torch.full_like(means[:, 0], torch.inf)  # [m], camera, whether or not it sees it
     for k, X_CW in enumerate(viewmats):
         p_CQ = means @ X_CW[:3, :3].T + X_CW[:3, 3]
+        nearest = torch.minimum(nearest, p_CQ.norm(dim=1))
         z = p_CQ[:, 2]
         u, v, _ = (p_CQ / z[:, None] @ K.T).unbind(dim=1)
         inside = (z > 0) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
@@ -60,6 +64,9 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> Sc
         shown = views.depths[k][row, column].to(means.device)
         number = number[(shown <= 0) | (z[number] < _HIDDEN * shown)]
         closest[number] = torch.minimum(closest[number], z[number])
-    smallest = torch.where(closest.isfinite(), _VARIANCE**0.5 / K[0, 0] * closest, 0)
-    largest = _LARGEST * closest if bounded else torch.full_like(closest, torch.inf)
+    seen = closest.isfinite()
+    smallest = torch.where(seen, _VARIANCE**0.5 / K[0, 0] * closest, 0)
+    largest = torch.full_like(closest, torch.inf)
+    if bounded:
+        largest = _LARGEST * torch.where(seen, closest, nearest)
     return ScaleLimits(smallest, largest)
