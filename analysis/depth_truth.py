@@ -1,5 +1,6 @@
 """The true depth of what is flown in: of generated worlds along flights, and of captures."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +19,8 @@ from splatpilot.diagrams.sensors import make_camera
 from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.surfaces import merge
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.drake_images import ranged_depth, render_view
@@ -28,6 +31,9 @@ from splatpilot.training.reconstruction.measures import has_true_depth
 
 _BEYOND = 0.1
 """[m], how far outside the volume scenery may begin."""
+
+_GHOST = 0.3
+"""[m] from surfaces, from where on none may be seen: voxels and their errors are less."""
 
 _VEIL = 0.01
 """Alpha from which scenery that has no solid may be what a pixel shows."""
@@ -79,21 +85,56 @@ def frames_along_flight(
     """
     truth = TrueDepth(make_blueprint(scenario.world, scenario.seed))
     world = make_world(scenario.world, scenario.seed)
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
-    rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
+    poses = _poses_along_flight(scenario, world, count)
     frames = []
     for config in cameras:
-        camera = make_camera(config, world)
-        context = camera.CreateDefaultContext()
-        frames.append([])
-        for row in rows:
-            X_WB = pose_from_state(flight.states[row])
-            camera.GetInputPort("body_pose").FixValue(context, X_WB)
-            image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
-            X_WC = X_WB @ config.X_BC()
-            depth = np.array(image.data)[..., 0]
-            frames[-1].append(DepthFrame(depth, truth.image(config, X_WC)))
+        seen = _depth_images(config, world, poses)
+        true = (truth.image(config, X_WB @ config.X_BC()) for X_WB in poses)
+        frames.append([DepthFrame(*pair) for pair in zip(seen, true, strict=True)])
     return frames
+
+
+def ghosts_along_flight(
+    scenario: Scenario, camera: OnboardCamera, count: int
+) -> NDArray[np.floating]:
+    """Flies a scenario, and returns of `count` frames (count,) evenly in time the share of pixels
+    with ghosts: depth that ends more than 0.3 m from all that the distance field knows, where it is
+    free. Captured places have no other truth where their cameras never were.
+
+    Raises:
+        ValueError: for worlds that cannot be made.
+        InfeasibleFlightError: for flights that cannot be flown.
+    """
+    world = make_world(scenario.world, scenario.seed)
+    poses = _poses_along_flight(scenario, world, count)
+    slopes_C, shares = camera.ray_slopes(), []
+    for X_WB, depth in zip(poses, _depth_images(camera, world, poses), strict=True):
+        X_WC = X_WB @ camera.X_BC()
+        shown = np.isfinite(depth)
+        p_CQ = depth[shown][:, None] * slopes_C[shown]
+        there = world.distance_field.query(p_CQ @ X_WC.rotation().matrix().T + X_WC.translation())
+        free = (there.state == FieldState.FREE) & (there.distance > _GHOST)
+        shares.append(free.sum() / depth.size)
+    return np.array(shares)
+
+
+def _poses_along_flight(scenario: Scenario, world: World, count: int) -> list[RigidTransform]:
+    """X_WB at `count` times of a flight."""
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
+    return [pose_from_state(state) for state in flight.states[rows]]
+
+
+def _depth_images(
+    config: OnboardCamera, world: World, poses: list[RigidTransform]
+) -> Iterator[NDArray[np.floating]]:
+    """What policies are handed: depth (H, W) [m]."""
+    camera = make_camera(config, world)
+    context = camera.CreateDefaultContext()
+    for X_WB in poses:
+        camera.GetInputPort("body_pose").FixValue(context, X_WB)
+        image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
+        yield np.array(image.data)[..., 0]
 
 
 def frames_of_capture(scene: Path, cameras: list[OnboardCamera]) -> list[list[DepthFrame]]:

@@ -2,11 +2,14 @@
 
     python benchmarks/depth_truth.py [--scenarios P01 P08] [--seeds 0 1] [--frames 24]
     python benchmarks/depth_truth.py --scenes FOLDER...
+    python benchmarks/depth_truth.py --ghosts [R13 R14]
 
 Of generated worlds the truth are rays cast at their solids along the flight of the privileged
 planner; of captured scenes, named by their folders, the depth of the frames that were withheld from
 them. Errors are wrong beyond 0.1 m or 5 %, the larger. Pixels whose truth nobody knows are left
-out: scenery beyond the volume has no solid. Relative errors are those of depths below 4 m.
+out: scenery beyond the volume has no solid. Relative errors are those of depths below 4 m. Ghosts
+are pixels along the planner's flights through captured places whose depth ends where the distance
+field is free, more than 0.3 m from all that it knows.
 """
 
 import argparse
@@ -15,7 +18,11 @@ from pathlib import Path
 from harness import header, row
 
 from splatpilot.analysis.depth_errors import DepthFrame, depth_errors
-from splatpilot.analysis.depth_truth import frames_along_flight, frames_of_capture
+from splatpilot.analysis.depth_truth import (
+    frames_along_flight,
+    frames_of_capture,
+    ghosts_along_flight,
+)
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.systems.configuration import load_config
@@ -44,6 +51,12 @@ def show(name: str, frames: list[list[DepthFrame]]) -> None:
             row(name, f"{camera.width}x{camera.height}", where, pixels, *cells)
 
 
+def scenario_of(name: str, seed: int) -> Scenario:
+    scenario = load_config(Scenario(), scenario_file(name))
+    scenario.seed = seed
+    return scenario
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Compare the depth of cameras with the truth.")
     generated = [name for name in benchmark_scenarios() if name.startswith("P")]
@@ -51,7 +64,18 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="*", type=int, default=[0])
     parser.add_argument("--frames", type=int, default=24, help="along each flight")
     parser.add_argument("--scenes", nargs="*", type=Path, help="captured ones instead: folders")
+    captured = [name for name in benchmark_scenarios() if name.startswith("R")]
+    parser.add_argument("--ghosts", nargs="*", help="in captured places, by name; all if none is")
     arguments = parser.parse_args()
+    if arguments.ghosts is not None:
+        header("", "ghosts", "worst frame")
+        for name in arguments.ghosts or captured:
+            for seed in arguments.seeds:
+                scenario = scenario_of(name, seed)
+                shares = ghosts_along_flight(scenario, CAMERAS[0], arguments.frames)
+                cells = (f"{100 * share:.2f} %" for share in (shares.mean(), shares.max()))
+                row(f"{name}, seed {seed}", *cells)
+        return
     header("", "size", "where", *COLUMNS)
     if arguments.scenes is not None:
         for folder in arguments.scenes:
@@ -59,9 +83,7 @@ def main() -> None:
         return
     for name in arguments.scenarios:
         for seed in arguments.seeds:
-            scenario = load_config(Scenario(), scenario_file(name))
-            scenario.seed = seed
-            frames = frames_along_flight(scenario, CAMERAS, arguments.frames)
+            frames = frames_along_flight(scenario_of(name, seed), CAMERAS, arguments.frames)
             show(f"{name}, seed {seed}", frames)
 
 

@@ -4,14 +4,21 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from splatpilot.analysis import depth_truth
 from splatpilot.analysis.depth_errors import depth_errors
-from splatpilot.analysis.depth_truth import TrueDepth, frames_along_flight, frames_of_capture
+from splatpilot.analysis.depth_truth import (
+    TrueDepth,
+    frames_along_flight,
+    frames_of_capture,
+    ghosts_along_flight,
+)
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.diagrams.worlds.make_world import make_blueprint
+from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 CAMERA = OnboardCamera(64, 36)
 
@@ -46,6 +53,26 @@ def test_scenery_has_no_truth():
     assert unknown.mean() > 0.1
     assert not unknown[bare < 5].any()
     np.testing.assert_array_equal(truth[~unknown], bare[~unknown])
+
+
+def test_what_cameras_see_in_free_space_is_a_ghost(monkeypatch):
+    """A Gaussian as large as a wall that the distance field does not know fills what stands behind
+    it; without it no pixel of the planner's flight ends in free space."""
+    config = load_config(Scenario(), scenario_file("P04"))
+    assert ghosts_along_flight(config, CAMERA, 4).max() == 0.0
+    world = make_world(config.world, config.seed)
+    wall = GaussianScene.from_colors(
+        means=[world.p_WS + np.array([6.0, 0.0, 0.0])],
+        quats=[[1.0, 0, 0, 0]],
+        scales=[[0.02, 40.0, 40.0]],
+        opacities=[0.99],
+        colors=[[0.5, 0.5, 0.5]],
+    )
+    haunted = replace(world, gaussians=world.gaussians.merged_with(wall))
+    monkeypatch.setattr(depth_truth, "make_world", lambda *_: haunted)
+    shares = ghosts_along_flight(config, CAMERA, 4)
+    assert shares[0] > 0.3
+    assert shares[-1] == 0.0  # It lies behind.
 
 
 def test_a_camera_in_a_furnished_room_sees_what_is_there():
