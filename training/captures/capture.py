@@ -60,6 +60,12 @@ class FileAxes:
     R_BC: RotationMatrix
 
 
+OPTICAL_AXES = FileAxes("optical: x right, y down, z forward", RotationMatrix(), RotationMatrix())
+OPENGL_AXES = FileAxes(
+    "OpenGL: x right, y up, z back", RotationMatrix(), RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+)
+
+
 def no_depth(i: int) -> None:
     """The `Capture.load_depth` of a capture without depth."""
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 import cv2  # noqa: F401  # Before pycolmap, whose libpng it would otherwise take for its own.
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.extras import import_extra
-from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints
+from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.colmap_records import check_records
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
@@ -145,7 +145,7 @@ def capture_of_model(
         path,
         kind,
         [frame(image) for image in sorted(registered, key=lambda image: image.name)],
-        axes=FileAxes("optical: x right, y down, z forward", RotationMatrix(), RotationMatrix()),
+        axes=OPTICAL_AXES,
         read_depth=lambda file: read_depth(file, config.depth_unit or 1000.0),
         dropped=dropped,
     )

@@ -8,6 +8,7 @@ is the capture that is read wrongly.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,10 @@ from splatpilot.training.captures.poses import stray_frames
 
 MAX_DROPPED = 0.2
 """The fraction of frames that may be left out."""
+_MAPS = 8
+"""Cameras whose resampling is kept at a time."""
+_SAME_SHAPE = 0.02
+"""Relative difference of the ratios of width to height, below which depth shows the same view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +63,7 @@ def open_frames(
     lens: Callable[[int, int], Lens] = lambda width, height: _no_lens(),
     read_depth: Callable[[Path], NDArray[np.float32]] | None = None,
     depth_camera: Callable[[int, int], DepthCamera] | None = None,
+    stretch_depth: bool = False,
     dropped: Sequence[str] = (),
 ) -> Capture:
     """Opens the frames; images and depths are read when asked for.
@@ -70,6 +76,8 @@ def open_frames(
         read_depth: reads the depth [m] in a file; None if there is none.
         depth_camera: gives the camera of depth images of a width and height [px]; None if depth has
             the pixels of the images before they are undistorted.
+        stretch_depth: whether depth, without a camera of its own, may show in fewer pixels or more
+            what the image shows.
         dropped: messages about frames that were left out already, which do not count further.
 
     Raises:
@@ -82,7 +90,9 @@ def open_frames(
             sound.append(_inspect(frame))
         except (ValueError, OSError) as error:
             messages.append(str(error))
-    sound = _keep_usual_size(sound, messages, registered=depth_camera is None)
+    sound = _keep_usual_size(sound, messages, registered=not (depth_camera or stretch_depth))
+    if stretch_depth:
+        sound = _keep_same_view(sound, messages)
     if sound:
         stray = set(stray_frames(np.array([frame.X_FB.translation() for frame in sound])).tolist())
         for i in sorted(stray):
@@ -103,7 +113,8 @@ def open_frames(
         camera = common_pinhole(distinct)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    maps = {each: resampling_maps(each, camera) for each in distinct}
+    # Some cameras focus anew with each frame: their maps would fill the memory.
+    map_of = lru_cache(_MAPS)(lambda lens: resampling_maps(lens, camera))
     has_depth = read_depth is not None and any(frame.depth for frame in sound)
 
     def load_image(i: int) -> NDArray[np.uint8]:
@@ -115,14 +126,19 @@ def open_frames(
         if file is None or size is None or read_depth is None:
             return None
         depth = _require_size(read_depth(file), file, size)
+        if depth_camera:
+            return depth
         # Between surfaces an average would be a place where nothing is.
-        return depth if depth_camera else _resample(depth, i, cv2.INTER_NEAREST)
+        if size != sound[i].size:
+            depth = cv2.resize(depth, sound[i].size, interpolation=cv2.INTER_NEAREST_EXACT)
+        return _resample(depth, i, cv2.INTER_NEAREST)
 
     def _resample(image: NDArray, i: int, interpolation: int) -> NDArray:
         lens = lenses[i]
-        if lens is None or (found := maps[lens]) is None:
+        if lens is None or (found := map_of(lens)) is None:
             return image
-        return cv2.remap(image, *found, interpolation)
+        # The pinhole sees up to half a pixel more than the lens, which is not black.
+        return cv2.remap(image, *found, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     R_WF, R_BC = RigidTransform(axes.R_WF), RigidTransform(axes.R_BC)
     depth_sizes = [frame.depth_size for frame in sound if frame.depth_size]
@@ -169,6 +185,21 @@ def _keep_usual_size(
             messages.append(_size_message(frame.image, frame.size, usual))
         elif frame.depth and frame.depth_size and wanted and frame.depth_size != wanted:
             messages.append(_size_message(frame.depth, frame.depth_size, wanted))
+        else:
+            kept.append(frame)
+    return kept
+
+
+def _keep_same_view(frames: Sequence[_Frame], messages: list[str]) -> list[_Frame]:
+    """Leaves out frames whose depth has another shape than their image."""
+    kept = []
+    for frame in frames:
+        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
+        if abs(w * height - h * width) > _SAME_SHAPE * w * height:
+            messages.append(
+                f"{frame.depth}: {w}x{h} pixels of depth do not show what {width}x{height} pixels "
+                "of an image do; width and height must have one ratio"
+            )
         else:
             kept.append(frame)
     return kept

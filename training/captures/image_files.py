@@ -11,6 +11,7 @@ from PIL import Image
 from splatpilot.systems.array_files import array_layout, read_array, reason_of
 from splatpilot.systems.png_chunks import require_whole_chunks
 from splatpilot.systems.read_limit import require_readable_size
+from splatpilot.training.captures.exr_files import exr_size, read_exr
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
@@ -61,6 +62,9 @@ def _depth_layout(file: Path) -> tuple[tuple[int, ...], np.dtype]:
 
 def depth_size(file: Path) -> tuple[int, int]:
     """Returns width and height [px] of a depth image or array; raises as the two above."""
+    if file.suffix == ".exr":
+        _require_content(file)
+        return exr_size(file)
     if file.suffix != ".npy":
         return image_size(file)
     shape = array_shape(file)
@@ -77,7 +81,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
 
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
-    """Returns depth (H, W) [m] from `.npy`, or from an image of integers or floats.
+    """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats.
 
     Args:
         unit: how many units of the file make a metre.
@@ -88,6 +92,8 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     if file.suffix == ".npy":
         _depth_layout(file)
         raw = read_array(file)
+    elif file.suffix == ".exr":
+        raw = read_exr(file)
     else:
         raw = _decode(file, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype == np.uint8:
@@ -119,8 +125,10 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
         pattern: regular expression of the whole name, whose group is the number.
 
     Raises:
-        FileNotFoundError: if no name is like that.
+        FileNotFoundError: if there is no such folder, or no name is like that.
     """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: the folder is missing")
     files = {}
     for file in folder.iterdir():
         if match := re.fullmatch(pattern, file.name):

@@ -8,21 +8,21 @@ Whether lengths are metres the file does not say: they are taken to be if there 
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from os.path import isfile  # false, too, of names that no file system takes
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.ply_files import read_ply_file
 from splatpilot.systems.read_limit import read_text
-from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, SfmPoints
+from splatpilot.training.captures.capture import OPENGL_AXES, Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
-from splatpilot.training.captures.image_files import depth_size, image_size, read_depth
+from splatpilot.training.captures.image_files import image_size, read_depth
 from splatpilot.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
 from splatpilot.training.captures.metric_scale import make_metric
 from splatpilot.training.captures.poses import pose_from_matrix
@@ -30,9 +30,6 @@ from splatpilot.training.captures.upright import turn_upright
 
 TRANSFORMS = "transforms.json"
 
-_AXES = FileAxes(
-    "OpenGL: x right, y up, z back", RotationMatrix(), RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-)
 _MAX_DISTORTION = 100.0
 _DISTORTION = {
     "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
@@ -86,9 +83,9 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
         path,
         "nerfstudio capture",
         frames,
-        axes=_AXES,
+        axes=OPENGL_AXES,
         read_depth=lambda file: read_depth(file, unit),
-        depth_camera=_smaller_depth_camera(frames),
+        stretch_depth=True,
     )
     if points:
         capture = dataclasses.replace(capture, points=_read_points(path / points))
@@ -173,27 +170,6 @@ def _lens(
             f"{file}: the camera of {image.name} is not described ({reason_of(error)}); w, h, "
             "fl_x, fl_y, cx and cy, or camera_angle_x, are needed"
         ) from None
-
-
-def _smaller_depth_camera(
-    frames: Sequence[FrameFiles],
-) -> Callable[[int, int], DepthCamera] | None:
-    """Returns the camera of depth of another resolution than the images; None if it is the same."""
-    for frame in frames:
-        lens = frame.lens
-        if frame.depth is None or lens is None or not isfile(frame.depth):
-            continue
-        if depth_size(frame.depth) == (lens.width, lens.height):
-            return None
-        if lens.project is not None:
-            raise ValueError(
-                f"{frame.depth}: depth of another resolution than images that are distorted; "
-                "resample it to the images' size, or undistort both"
-            )
-        return lambda width, height: DepthCamera(
-            lens.scale_to(width, height).K, width, height, RigidTransform()
-        )
-    return None
 
 
 def _read_points(file: Path) -> SfmPoints:

@@ -38,6 +38,19 @@ def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
     return rows
 
 
+def read_matrix(file: Path) -> NDArray[np.float64]:
+    """Returns the matrix (4, 4) in a text file; NaN and infinities are read as such.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it does not hold four rows of four numbers.
+    """
+    rows = read_rows(file, 4, "row of a 4x4 matrix; four numbers are needed")
+    if len(rows) != 4:
+        raise ValueError(f"{file}: {len(rows)} rows, 4 are needed")
+    return np.array(rows)
+
+
 def pose_from_quaternion(row: NDArray[np.float64], source: str) -> RigidTransform:
     """Returns the pose of a row tx ty tz qx qy qz qw.
 

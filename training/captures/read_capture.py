@@ -10,6 +10,9 @@ from splatpilot.training.captures.capture_config import CaptureConfig, complete_
 from splatpilot.training.captures.colmap import model_folder, read_colmap
 from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstudio
 from splatpilot.training.captures.photographs import photographs_in, read_photographs
+from splatpilot.training.captures.polycam import is_polycam, read_polycam
+from splatpilot.training.captures.record3d import is_record3d, read_record3d
+from splatpilot.training.captures.scannet import is_scannet, read_scannet
 from splatpilot.training.captures.seven_scenes import is_seven_scenes, read_seven_scenes
 from splatpilot.training.captures.tartanair import (
     is_tartanair_v1,
@@ -83,6 +86,16 @@ register_capture(
     is_seven_scenes,
     read_seven_scenes,
     description="7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
+)
+register_capture(
+    "scannet",
+    is_scannet,
+    read_scannet,
+    description="ScanNet (color/, depth/, pose/, intrinsic/)",
+)
+register_capture("polycam", is_polycam, read_polycam, description="Polycam's raw data (keyframes/)")
+register_capture(
+    "record3d", is_record3d, read_record3d, description="Record3D (metadata.json, rgb/, depth/)"
 )
 register_capture(
     "colmap",

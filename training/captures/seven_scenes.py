@@ -10,14 +10,14 @@ otherwise was measured on redkitchen by agreement of colours between frames.
 from pathlib import Path
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
-from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes
+from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, DepthCamera
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import numbered_files, read_depth
 from splatpilot.training.captures.lens import Lens, pinhole
-from splatpilot.training.captures.poses import pose_from_matrix, read_rows
+from splatpilot.training.captures.poses import pose_from_matrix, read_matrix
 from splatpilot.training.captures.upright import turn_upright
 
 # fx, fy, cx, cy [px] at 640x480, and the colour camera's position in the depth camera [m].
@@ -52,10 +52,7 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         pose = path / f"{stem}.pose.txt"
 
         def X_FC() -> RigidTransform:
-            rows = read_rows(pose, 4, "row of a 4x4 matrix; four numbers are needed")
-            if len(rows) != 4:
-                raise ValueError(f"{pose}: {len(rows)} rows, 4 are needed")
-            return pose_from_matrix(np.array(rows), str(pose)) @ X_DC
+            return pose_from_matrix(read_matrix(pose), str(pose)) @ X_DC
 
         return FrameFiles(color, X_FC, path / f"{stem}.depth.png")
 
@@ -75,7 +72,7 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         path,
         "RGB-D folder",
         [frame(number, color) for number, color in colors.items()],
-        axes=FileAxes("optical: x right, y down, z forward", RotationMatrix(), RotationMatrix()),
+        axes=OPTICAL_AXES,
         lens=lens,
         read_depth=lambda file: read_depth(file, unit),
         depth_camera=depth_camera,

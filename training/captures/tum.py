@@ -4,16 +4,18 @@ Layout, intrinsics and the 5000 units a metre as published with the data set (St
 Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012). Depth is registered to colour;
 poses `tx ty tz qx qy qz qw` are those of the optical axes in a world with z up. A colour image is
 paired with the depth nearest in time, and its pose is interpolated between two measured ones.
+Where poses are those of keyframes, too far apart to interpolate, images take the pose of their own
+time, and those between keyframes have none.
 """
 
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from splatpilot.systems.read_limit import read_text
-from splatpilot.training.captures.capture import Capture, FileAxes
+from splatpilot.training.captures.capture import OPTICAL_AXES, Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import read_depth
@@ -25,6 +27,8 @@ _MAX_APART = 0.02
 """[s] between a colour image and its depth, as the data set's own tools have it."""
 _MAX_GAP = 0.1
 """[s] between two poses that one is interpolated from."""
+_SAME_TIME = 0.005
+"""[s] between an image and the pose of a keyframe that is its own."""
 
 # fx, fy, cx, cy [px], counted from the first pixel's centre, and distortion k1 k2 p1 p2 k3, of the
 # three cameras that the sequences' names tell apart; of any other, the driver's default.
@@ -57,20 +61,20 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
         raise ValueError(f"{pose_file}: {len(rows)} finite poses, at least 2 are needed")
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
 
+    _require_overlap(path / "rgb.txt", color_times, pose_file, rows[:, 0])
+    _require_overlap(path / "rgb.txt", color_times, path / "depth.txt", depth_times)
+
     frames = []
     for time, color in zip(color_times, colors, strict=True):
         nearest = int(np.argmin(np.abs(depth_times - time)))
-        after = int(np.searchsorted(rows[:, 0], time))
-        if (
-            abs(depth_times[nearest] - time) <= _MAX_APART
-            and 0 < after < len(rows)
-            and rows[after, 0] - rows[after - 1, 0] <= _MAX_GAP
-        ):
-            frames.append(_frame(path, color, depths[nearest], rows[after - 1 : after + 1], time))
+        around = _poses_around(rows, time)
+        if abs(depth_times[nearest] - time) <= _MAX_APART and len(around):
+            frames.append(_frame(path, color, depths[nearest], around, time))
     alone = len(colors) - len(frames)
     dropped = [
         f"{path / 'rgb.txt'}: {alone} of {len(colors)} colour images have no depth within "
-        f"{_MAX_APART} s or no two poses within {_MAX_GAP} s around them"
+        f"{_MAX_APART} s, or neither two poses within {_MAX_GAP} s around them nor one within "
+        f"{_SAME_TIME} s"
     ]
     unit = config.depth_unit or 5000.0
 
@@ -86,7 +90,7 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
         path,
         "TUM RGB-D sequence",
         frames,
-        axes=FileAxes("optical: x right, y down, z forward", RotationMatrix(), RotationMatrix()),
+        axes=OPTICAL_AXES,
         lens=lens,
         read_depth=lambda file: read_depth(file, unit),
         dropped=dropped if alone else (),
@@ -94,11 +98,40 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
     return turn_upright(capture, config.up or "z")
 
 
+def _require_overlap(
+    images: Path, times: NDArray[np.float64], other: Path, others: NDArray[np.float64]
+) -> None:
+    """Raises ValueError if two lists have no time in common."""
+    margin = _MAX_APART
+    if times.max() < others.min() - margin or others.max() < times.min() - margin:
+        raise ValueError(
+            f"{other}: runs from {others.min():.3f} to {others.max():.3f} s, but {images} from "
+            f"{times.min():.3f} to {times.max():.3f} s; they have no time in common, write both by "
+            "one clock"
+        )
+
+
+def _poses_around(rows: NDArray[np.float64], time: float) -> NDArray[np.float64]:
+    """Returns the rows from which the pose at `time` is had: two around it, one, or none."""
+    after = int(np.searchsorted(rows[:, 0], time))
+    if 0 < after < len(rows) and rows[after, 0] - rows[after - 1, 0] <= _MAX_GAP:
+        return rows[after - 1 : after + 1]
+    nearest = int(np.argmin(np.abs(rows[:, 0] - time)))
+    return rows[nearest : nearest + int(abs(rows[nearest, 0] - time) <= _SAME_TIME)]
+
+
 def _frame(
     path: Path, color: str, depth: str, rows: NDArray[np.float64], time: float
 ) -> FrameFiles:
+    """`rows` are one pose or two."""
+
     def X_FC() -> RigidTransform:
-        a, b = (pose_from_quaternion(r[1:], f"{path / 'groundtruth.txt'}, {r[0]} s") for r in rows)
+        poses = [
+            pose_from_quaternion(row[1:], f"{path / 'groundtruth.txt'}, {row[0]} s") for row in rows
+        ]
+        if len(poses) == 1:
+            return poses[0]
+        a, b = poses
         s = (time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
         q = a.rotation().ToQuaternion().slerp(s, b.rotation().ToQuaternion())
         return RigidTransform(q, (1 - s) * a.translation() + s * b.translation())

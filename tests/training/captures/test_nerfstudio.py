@@ -66,6 +66,14 @@ def test_distortion_is_taken_out(write, K, shows_room):
         shows_room(read_capture(path), color=3.0, depth=0.02)
 
 
+def test_edges_of_undistorted_images_are_not_dark(write, K):
+    """At the edges of the pinhole's images is what the lens sees there, and nothing black."""
+    path = write(camera_model="OPENCV", k1=0.02)
+    for i in range(10):
+        cv2.imwrite(str(path / f"{i:02d}.png"), np.full((48, 64, 3), 200, np.uint8))
+    assert (read_capture(path).frame(0).image == 200).all()
+
+
 def test_fisheye(write, K, shows_room):
     """An equidistant fisheye becomes a pinhole."""
     v, u = np.mgrid[0:48, 0:64] + 0.5
@@ -98,8 +106,17 @@ def test_small_depth(write, shows_room, room_views, K):
     for i, view in enumerate(room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)):
         np.save(path / f"{i:02d}.npy", (1000 * view.depth).astype(np.float32))
     capture = read_capture(path)
-    assert capture.depth_camera is not None and capture.depth_camera.width == 32
+    assert capture.frame(0).depth.shape == (48, 64)
     shows_room(capture, color=0.5, depth=0.03)
+
+
+def test_depth_of_another_view_is_refused(write, room_views, K):
+    """Depth whose ratio of width to height is not the images' cannot show what they show."""
+    path = write()
+    for i in range(10):
+        np.save(path / f"{i:02d}.npy", np.ones((24, 24), np.float32))
+    with pytest.raises(ValueError, match="24x24 pixels of depth do not show what 64x48 pixels"):
+        read_capture(path)
 
 
 def test_scale(write, room_poses):

@@ -80,7 +80,7 @@ def test_a_kind_that_is_not_installed(folder):
     for kind, message in (
         ("pairs:NUMBER", "pairs:NUMBER is no kind of capture"),
         ("pairs:NOWHERE", "'pairs:NOWHERE' is not at"),
-        ("polycam", r"no kind of capture 'polycam'; there are tartanair_v1, .*photographs"),
+        ("kinect", r"no kind of capture 'kinect'; there are tartanair_v1, .*photographs"),
     ):
         with pytest.raises(ValueError, match=message):
             read_capture(folder, CaptureConfig(kind=kind))

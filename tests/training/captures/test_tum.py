@@ -74,3 +74,34 @@ def test_bad_lists(write, name, text, message):
     (write / name).write_text(text)
     with pytest.raises(ValueError, match=message):
         read_capture(write)
+
+
+def keep_keyframes(folder, every: int, offset: float = 0.0) -> None:
+    """Leaves of the poses those of every so manieth image, at its own time."""
+    rows = [line.split() for line in (folder / "groundtruth.txt").read_text().splitlines()[1:]]
+    kept = []
+    for i in range(0, 10, every):
+        row = np.array(rows[2 * i : 2 * i + 2], dtype=float).mean(axis=0)
+        row[0] += offset
+        kept.append(" ".join(f"{value:.6f}" for value in row))
+    (folder / "groundtruth.txt").write_text("\n".join(kept) + "\n")
+
+
+def test_keyframes(write, shows_room):
+    """Where only keyframes have poses, far apart, their images are the capture."""
+    keep_keyframes(write, every=4)
+    capture = read_capture(write)
+    assert len(capture) == 3
+    assert "7 of 10 colour images have no depth" in capture.dropped[0]
+    for frame, i in enumerate((0, 4, 8)):
+        assert capture.frame_names[frame] == f"{100 + i / 30:.6f}.png"
+    shows_room(capture, color=0.5, depth=0.001)
+
+
+def test_clocks_must_overlap(write):
+    """Poses by another clock are no missing poses: the message says both times."""
+    keep_keyframes(write, every=4, offset=1e6)
+    with pytest.raises(
+        ValueError, match=r"groundtruth\.txt: runs from 1000100\.000 to .*rgb\.txt from 100\.000"
+    ):
+        read_capture(write)
