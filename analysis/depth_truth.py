@@ -67,8 +67,8 @@ class TrueDepth:
             outside = ~((p_WQ >= self._lower_W) & (p_WQ <= self._upper_W)).all(axis=-1)
             unknown = np.isfinite(depth) & (p_WQ[..., 2] > self._upper_W[2])
         if self._scenery is not None:
-            info, reach = camera.camera_info(), camera.max_depth
-            view = render_view(self._scenery, info, X_WC, near=0.01, far=reach)
+            K, size = camera.camera_info().intrinsic_matrix(), (camera.width, camera.height)
+            view = render_view(self._scenery, K, *size, X_WC, near=0.01, far=camera.max_depth)
             unknown |= outside & (view.alpha > _VEIL)
         return np.where(unknown, np.nan, depth)
 
@@ -153,7 +153,8 @@ def frames_of_capture(scene: Path, cameras: list[OnboardCamera]) -> list[list[De
     for i in views.metadata.held_out:
         captured = views.capture.frame(i)
         for config, seen in zip(cameras, frames, strict=True):
-            view = render_view(gaussians, config.camera_info(), captured.X_WC, 0.01, 1e10)
+            K, size = config.camera_info().intrinsic_matrix(), (config.width, config.height)
+            view = render_view(gaussians, K, *size, captured.X_WC, 0.01, 1e10)
             depth = ranged_depth(view.depth, config.min_depth, config.max_depth)
             truth = sampled(captured.depth, captured.K, config)
             seen.append(DepthFrame(depth, truth))

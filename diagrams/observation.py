@@ -1,5 +1,7 @@
 """What a policy observes: its camera, what is between the camera and the policy, and sensors."""
 
+from dataclasses import replace
+
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
 from splatpilot.diagrams.scenario import Scenario
@@ -16,7 +18,8 @@ from splatpilot.systems.sensing.time_of_flight_grid import TimeOfFlightGrid
 _TAKEN = {
     *("plant", "pose", "collision", "goal", "policy", "controller", "camera", "video"),
     *("selector", "velocity_tracker"),
-    *("policy_camera", "delayed_pose", "depth_noise", "color_noise", "time_of_flight_grid"),
+    *("policy_camera", "policy_camera_start_pose", "delayed_pose"),
+    *("depth_noise", "color_noise", "time_of_flight_grid"),
     *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
     *("state_log", "command_log", "hypotheses_log"),
 }
@@ -61,7 +64,7 @@ def AddObservation(
 
     It renders when the policy looks. Where the scenario asks for them, `delayed_pose` makes its
     images late, and `depth_noise` or `color_noise` noisy; `time_of_flight_grid` makes grids of
-    them.
+    them. With a rolling shutter `policy_camera_start_pose` tells where its first row is read.
 
     Returns:
         The images that the policy has inputs for, by their names.
@@ -71,8 +74,9 @@ def AddObservation(
         return {}
     config, noise = camera_of(scenario, policy), scenario.observation
     camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, noise.latency))
+    frames = FrameTimes.draw(noise, scenario.seed)
+    _connect_start_pose(builder, "policy_camera", camera, config, state, frames)
     if noise.is_late:
-        frames = FrameTimes.draw(noise, scenario.seed)
         delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(frames))
         builder.Connect(state, delayed.GetInputPort("state"))
         pose = delayed.GetOutputPort("pose")
@@ -95,6 +99,24 @@ def AddObservation(
         builder.Connect(images["depth_image_32f"], grid.depth_image_32f_input_port())
         images["depth_grid"] = grid.depth_grid_output_port()
     return images
+
+
+def _connect_start_pose(
+    builder: DiagramBuilder,
+    name: str,
+    camera: System,
+    config: SensorConfig,
+    state: OutputPort,
+    frames: FrameTimes,
+) -> None:
+    """Tells a camera with a rolling shutter where the vehicle was when it read its first row."""
+    if not camera.HasInputPort("start_pose"):
+        return
+    readout = getattr(config, "readout", 0.0)
+    start = DelayedPose(replace(frames, before=readout), period=min(0.02, readout))
+    builder.AddNamedSystem(f"{name}_start_pose", start)
+    builder.Connect(state, start.state_input_port())
+    builder.Connect(start.pose_output_port(), camera.GetInputPort("start_pose"))
 
 
 def AddSensors(
@@ -121,6 +143,7 @@ def AddSensors(
         for port, source in (("state", state), ("body_pose", pose)):
             if sensor.HasInputPort(port):
                 builder.Connect(source, sensor.GetInputPort(port))
+        _connect_start_pose(builder, name, sensor, config, state, FrameTimes.late(0.0))
         for index in range(sensor.num_output_ports()):
             port = sensor.get_output_port(index)
             measured[f"{name}_{port.get_name()}"] = port

@@ -65,6 +65,7 @@ def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> Sp
         moving=world.moving.gaussians if world.moving else None,
         latency=latency,
         distortion=config.distortion,
+        readout=config.readout,
     )
 
 

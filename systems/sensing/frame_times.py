@@ -24,6 +24,7 @@ class FrameTimes:
     rate: float | None = None  # [Hz]
     phase: float = 0.0  # [-]
     lookback: int = 0  # [-] Frames that are looked through.
+    before: float = 0.0  # [s] By how much something else happened before a frame was taken.
 
     @classmethod
     def late(cls, latency: float) -> "FrameTimes":
@@ -42,21 +43,22 @@ class FrameTimes:
         return cls(delays, rate, phase, lookback(noise))
 
     def age(self, time: float) -> float:
-        """[s], at a time [s], of the last frame that has come."""
+        """[s], at a time [s], of the last frame that has come, or of what happened `before`."""
         if self.rate is None:
-            return float(self.delays[0])
+            return float(self.delays[0]) + self.before
         newest = math.floor(time * self.rate - self.phase)
         age = 0.0
         for number in range(newest, newest - self.lookback, -1):
             age = time - (number + self.phase) / self.rate
             if self.delays[number % CYCLE] <= age:
                 break
-        return age
+        return age + self.before
 
     @property
     def oldest(self) -> float:
         """[s], that no age exceeds."""
-        return float(self.delays[0]) if self.rate is None else self.lookback / self.rate
+        oldest = float(self.delays[0]) if self.rate is None else self.lookback / self.rate
+        return oldest + self.before
 
 
 def frame_delays(noise: ObservationNoise, late: np.ndarray, lost: np.ndarray) -> np.ndarray:

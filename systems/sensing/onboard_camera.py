@@ -37,6 +37,8 @@ class OnboardCamera:
     p_BC: list[float] = field(default_factory=lambda: [0.1, 0.0, 0.0])
     # [deg] How far it looks up.
     pitch: float = 0.0
+    # [s] Between reading the first row of an image and the last; 0 is a global shutter.
+    readout: float = 0.0
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
@@ -58,6 +60,7 @@ class OnboardCamera:
         _check("max_depth", self.max_depth, farther, "more than min_depth, and finite")
         mounted = len(self.p_BC) == 3 and bool(np.isfinite(self.p_BC).all())
         _check("p_BC", self.p_BC, mounted, "three finite numbers x, y, z in metres")
+        _check("readout", self.readout, 0.0 <= self.readout <= 0.2, "0 to 0.2 s")
         _check("pitch", self.pitch, -90.0 <= self.pitch <= 90.0, "-90 to 90 deg")
 
     @property

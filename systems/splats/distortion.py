@@ -184,7 +184,7 @@ def _restored(model: str, radial: tuple, tangential: tuple, max_angle: float) ->
     return Distortion(model, list(radial), list(tangential), max_angle)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=512)  # each band of a rolling shutter has one
 def _native_lens(model, radial, tangential, max_angle, focal, width, height) -> NativeLens:
     distortion = _restored(model, radial, tangential, max_angle)
     limit = distortion.limit

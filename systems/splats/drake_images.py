@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
-from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.splats.background import (
     BLACK,
@@ -19,7 +18,9 @@ from splatpilot.systems.splats.moving_gaussians import NO_GAUSSIANS, PlacedGauss
 
 def render_view(
     scene: BakedScene,
-    camera_info: CameraInfo,
+    K: NDArray[np.float64],
+    width: int,
+    height: int,
     X_WC: RigidTransform,
     near: float,
     far: float,
@@ -27,13 +28,11 @@ def render_view(
     moving: PlacedGaussians = NO_GAUSSIANS,
     distortion: Distortion | None = None,
 ) -> RenderedView:
-    """What the camera of `camera_info` at X_WC sees, through a lens; see `BakedScene.render`.
+    """What a camera of intrinsics K [px] at X_WC sees, through a lens; see `BakedScene.render`.
 
-    Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so the
+    Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so its
     intrinsics are taken as they are.
     """
-    width, height = camera_info.width(), camera_info.height()
-    K = camera_info.intrinsic_matrix()
     if not isinstance(background, EnvironmentMap):
         return scene.render(K, width, height, X_WC, near, far, background, moving, distortion)
     view = scene.render(K, width, height, X_WC, near, far, moving=moving, distortion=distortion)

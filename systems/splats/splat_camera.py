@@ -1,6 +1,7 @@
 """A camera that sees Gaussians."""
 
-from typing import Any, cast
+from collections.abc import Iterator
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from pydrake.common.value import Value
@@ -30,7 +31,19 @@ from splatpilot.systems.splats.moving_gaussians import (
     MovingGaussians,
     PlacedGaussians,
 )
+from splatpilot.systems.splats.rolling_shutter import band_intrinsics, pose_between, row_bands
 from splatpilot.systems.weakly import weakly
+
+
+_BANDS = 8
+"""Into which an image with a rolling shutter is cut at least where something moves."""
+
+
+class _Rows(NamedTuple):
+    """What is rendered from one pose."""
+
+    camera: tuple[np.ndarray, int, int, RigidTransform]  # K (3, 3) [px], width, height, X_WC
+    moving: PlacedGaussians
 
 
 class SplatCamera(LeafSystem):
@@ -43,6 +56,7 @@ class SplatCamera(LeafSystem):
         name: SplatCamera
         input_ports:
         - body_pose
+        - start_pose (with a readout)
         output_ports:
         - color_image
         - depth_image_32f
@@ -53,6 +67,8 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera sits at X_WC = X_WB
     X_BC with x right, y down and z forward, and images all of colour, depth and labels from there.
+    With a `readout`, a rolling shutter, that is where its last row is read, and `start_pose` the
+    pose X_WB where the first was; see `rolling_shutter`.
     The images are rendered when a port is evaluated, once for all of them, and again only when the
     pose has changed, or the time where something moves. Depth that is looked at alone is rendered
     alone, which is faster, and has the same bits.
@@ -89,6 +105,7 @@ class SplatCamera(LeafSystem):
         moving: MovingGaussians | None = None,
         latency: float = 0.0,
         distortion: Distortion | None = None,
+        readout: float = 0.0,
     ):
         """
         Args:
@@ -104,10 +121,11 @@ class SplatCamera(LeafSystem):
             latency: age of the images [s]: what moves is where it was so long ago. The pose that
                 the camera is given must be as old.
             distortion: of the lens; None for a pinhole. What it does not show is no surface.
+            readout: time between reading the first row and the last [s]; 0 reads all at once.
 
         Raises:
-            ValueError: if the depth range is empty or a focal length is not positive; for a
-                distortion that makes no sense.
+            ValueError: if the depth range is empty, a focal length is not positive or `readout` is
+                negative; for a distortion that makes no sense.
         """
         super().__init__()
         if not 0 <= min_depth < max_depth < np.inf:
@@ -120,13 +138,15 @@ class SplatCamera(LeafSystem):
                 f"camera focal lengths are {camera_info.focal_x()}, {camera_info.focal_y()} "
                 "pixels; both must be positive"
             )
+        if not 0.0 <= readout < np.inf:
+            raise ValueError(f"camera readout is {readout} s; it must be at least 0 and finite")
         self._scene = BakedScene(scene) if isinstance(scene, GaussianScene) else scene
         self._camera_info = camera_info
         self._X_BC = RigidTransform() if X_BC is None else X_BC
         self._depth_range = (min_depth, max_depth)
         self._clipping = (near, far)
         self._background = background
-        self._moving, self._latency = moving, latency
+        self._moving, self._latency, self._readout = moving, latency, readout
         if distortion is not None:
             distortion.validate()
         self._distortion = distortion
@@ -134,6 +154,9 @@ class SplatCamera(LeafSystem):
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
         tickets = {pose_ticket} if moving is None else {pose_ticket, self.time_ticket()}
+        if readout > 0.0:
+            start_port = self.DeclareAbstractInputPort("start_pose", Value(RigidTransform()))
+            tickets.add(self.input_port_ticket(start_port.get_index()))
         view_entry, depth_entry = (
             self.DeclareCacheEntry(
                 name,
@@ -178,28 +201,59 @@ class SplatCamera(LeafSystem):
         """The pose of the camera in the body that carries it."""
         return self._X_BC
 
-    def render(self, X_WB: RigidTransform, time: float = 0.0) -> RenderedView:
+    def render(
+        self, X_WB: RigidTransform, time: float = 0.0, X_WB_start: RigidTransform | None = None
+    ) -> RenderedView:
         """The view from body pose X_WB at a time [s]: float colour, depth and alpha, before they
-        become Drake images.
+        become Drake images. Where X_WB_start is given, the first row is read there, `readout`
+        before.
         """
-        return render_view(
-            self._scene,
-            self._camera_info,
-            X_WB @ self._X_BC,
-            *self._clipping,
-            background=self._background,
-            moving=self._among(time),
-            distortion=self._distortion,
-        )
+        views = [
+            render_view(
+                self._scene,
+                *rows.camera,
+                *self._clipping,
+                background=self._background,
+                moving=rows.moving,
+                distortion=self._distortion,
+            )
+            for rows in self._bands(X_WB, time, X_WB_start)
+        ]
+        if len(views) == 1:
+            return views[0]
+        return RenderedView(*map(np.concatenate, zip(*views, strict=True)))
+
+    def _bands(
+        self, X_WB: RigidTransform, time: float, X_WB_start: RigidTransform | None
+    ) -> Iterator[_Rows]:
+        """Rows that are rendered from one pose, from the first to the last."""
+        info, time = self._camera_info, time - self._latency
+        K, width, height = info.intrinsic_matrix(), info.width(), info.height()
+        X_WC1 = X_WB @ self._X_BC
+        if X_WB_start is None:
+            yield _Rows((K, width, height, X_WC1), self._among(time))
+            return
+        X_WC0 = X_WB_start @ self._X_BC
+        focal, fewest = float(max(K[0, 0], K[1, 1])), 1 if self._moving is None else _BANDS
+        for first, last in row_bands(X_WC0, X_WC1, focal, height, fewest):
+            s = 0.5 * (first + last) / height
+            X_WC = pose_between(X_WC0, X_WC1, s)
+            camera = (band_intrinsics(K, first), width, last - first, X_WC)
+            yield _Rows(camera, self._among(time - (1.0 - s) * self._readout))
 
     def _among(self, time: float) -> PlacedGaussians:
-        if self._moving is None:
-            return NO_GAUSSIANS
-        return self._moving.at(max(0.0, time - self._latency))
+        return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
+
+    def _poses(self, context) -> tuple[RigidTransform, float, RigidTransform | None]:
+        """Where the last row is read, when, and where the first is with a rolling shutter."""
+        X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
+        start = None
+        if self._readout > 0.0:
+            start = cast(RigidTransform, self.GetInputPort("start_pose").Eval(context))
+        return X_WB, context.get_time(), start
 
     def _calc_view(self, context, value) -> None:
-        X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
-        value.set_value(self.render(X_WB, context.get_time()))
+        value.set_value(self.render(*self._poses(context)))
 
     def _calc_depth(self, context, value) -> None:
         """(H, W) [m], with 0 and inf out of range."""
@@ -207,18 +261,17 @@ class SplatCamera(LeafSystem):
         if not entry.is_out_of_date(context):
             depth = self._view(context).depth
         else:
-            info = self._camera_info
-            X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
-            depth = self._scene.render_depth(
-                info.intrinsic_matrix(),
-                info.width(),
-                info.height(),
-                X_WB @ self._X_BC,
-                *self._clipping,
-                max_depth=self._depth_range[1],
-                moving=self._among(context.get_time()),
-                distortion=self._distortion,
-            )
+            depths = [
+                self._scene.render_depth(
+                    *rows.camera,
+                    *self._clipping,
+                    max_depth=self._depth_range[1],
+                    moving=rows.moving,
+                    distortion=self._distortion,
+                )
+                for rows in self._bands(*self._poses(context))
+            ]
+            depth = depths[0] if len(depths) == 1 else np.concatenate(depths)
         value.set_value(ranged_depth(depth, *self._depth_range))
 
     def _view(self, context) -> RenderedView:

@@ -228,7 +228,15 @@ class SplatRenderEngine(RenderEngine):
         key = self._key(core)
         if self._last_view is None or self._last_view[0] != key:
             info, clipping = core.intrinsics(), core.clipping()
-            view = render_view(self._scene, info, self._X_WC, clipping.near(), clipping.far())
+            view = render_view(
+                self._scene,
+                info.intrinsic_matrix(),
+                info.width(),
+                info.height(),
+                self._X_WC,
+                clipping.near(),
+                clipping.far(),
+            )
             self._last_view = key, view
         return self._last_view[1]
 

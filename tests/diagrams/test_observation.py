@@ -1,6 +1,9 @@
 """What lies between a policy and the world."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
@@ -96,3 +99,29 @@ def test_diagram_has_only_what_the_scenario_asks_for(post_world):
     scenario.observation = ObservationNoise(depth_dropout=0.1, color_noise=0.1, latency=0.05)
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     assert {n for n in names if diagram.HasSubsystemNamed(n)} == {"depth_noise", "delayed_pose"}
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.1])
+def test_rolling_shutter_starts_where_the_vehicle_was(post_world, latency):
+    """A camera with a readout is told the pose of its last row and, so long before, of its first,
+    both as late as its images."""
+    policy = policy_named("reactive")
+    policy.camera = replace(policy.camera, readout=0.03)
+    scenario = Scenario(policy=policy, observation=ObservationNoise(latency=latency), timeout=3.0)
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    simulator = Simulator(diagram)
+    root = simulator.get_mutable_context()
+    plant = diagram.GetSubsystemByName("plant")
+    start = sample_initial_state(scenario, post_world)
+    plant.GetMyMutableContextFromRoot(root).SetContinuousState(start)
+    camera, states = diagram.GetSubsystemByName("policy_camera"), {}
+    for step in range(300):
+        simulator.AdvanceTo(0.005 * (step + 1))
+        states[step + 1] = np.array(diagram.GetOutputPort("state").Eval(root))
+    context, now = camera.GetMyContextFromRoot(root), 300
+    for port, ago in (("body_pose", latency), ("start_pose", latency + 0.03)):
+        then = pose_from_state(states[now - round(ago / 0.005)])
+        seen = camera.GetInputPort(port).Eval(context)
+        assert np.abs(seen.translation() - then.translation()).max() < 2e-3
+        assert (seen.rotation().inverse() @ then.rotation()).ToAngleAxis().angle() < 5e-3
+    assert np.linalg.norm(states[now][3:6]) > 0.5

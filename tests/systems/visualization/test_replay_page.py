@@ -90,7 +90,16 @@ def open_page(open_in_browser):
 def seen(gaussians, background, X_WB: RigidTransform) -> np.ndarray:
     """What the onboard camera sees, as `Page.picture` has it."""
     info = CameraInfo(WIDTH, HEIGHT, FOV_Y)
-    view = render_view(BakedScene(gaussians), info, X_WB @ X_BC, 0.01, 1e3, background)
+    view = render_view(
+        BakedScene(gaussians),
+        info.intrinsic_matrix(),
+        info.width(),
+        info.height(),
+        X_WB @ X_BC,
+        0.01,
+        1e3,
+        background,
+    )
     return np.round(255 * np.clip(view.color[..., ::-1], 0, 1)).astype(np.uint8)
 
 

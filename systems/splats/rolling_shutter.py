@@ -1,0 +1,52 @@
+"""Rolling shutters: each row of an image is seen from where the camera was when it was read.
+
+Rows are read one after the other at even times, the first at the pose X_WC0 and the last at X_WC1;
+between them the position moves evenly, and the rotation about one axis. Rows between which an image
+hardly moves are rendered together, as a band, from the pose of their middle.
+"""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+_STEP = 0.5
+"""[px] that an image may move between two bands, so that no row is off by more than half of it."""
+_NEAREST = 1.0
+"""[m] Depth of what is told to move so far; what is nearer moves more."""
+
+
+def row_bands(
+    X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, fewest: int = 1
+) -> list[tuple[int, int]]:
+    """First row and row after the last of each band of an image.
+
+    Args:
+        X_WC0, X_WC1: poses of the camera at the first and the last row.
+        focal: [px]
+        height: [px]
+        fewest: bands at least, for what moves before a camera at rest.
+    """
+    turned = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
+    travelled = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
+    moved = focal * (abs(turned) + float(travelled) / _NEAREST)
+    count = min(height, max(fewest, math.ceil(moved / _STEP)))
+    edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
+    return list(pairwise(edges))
+
+
+def pose_between(X_WC0: RigidTransform, X_WC1: RigidTransform, s: float) -> RigidTransform:
+    """The pose at the fraction s of the way from X_WC0 to X_WC1."""
+    turn = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis()
+    turn.set_angle(s * turn.angle())
+    p_WC = (1.0 - s) * X_WC0.translation() + s * X_WC1.translation()
+    return RigidTransform(X_WC0.rotation() @ RotationMatrix(turn), p_WC)
+
+
+def band_intrinsics(K: NDArray[np.float64], first: int) -> NDArray[np.float64]:
+    """The intrinsics (3, 3) [px] of an image's rows from `first` on as an image of their own."""
+    cropped = K.copy()
+    cropped[1, 2] -= first
+    return cropped
