@@ -16,14 +16,19 @@ import cv2
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraConfig
 
 from splatpilot.diagrams.flight_diagram import MakeCamera
 from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.diagrams.sensors import make_camera
 from splatpilot.diagrams.worlds.make_world import is_procedural, make_world
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.sensing.observation_noise import ObservationNoise, expose, image_generator
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.drake_images import color_pixels
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 Picture = np.ndarray  # (H, W, 3) uint8, red first
@@ -70,6 +75,21 @@ def worlds(out: Path) -> None:
         views.append((255 * color.clip(0, 1)).astype(np.uint8))
     pairs = zip(views[::2], views[1::2], strict=True)
     save(np.vstack([np.hstack(pair) for pair in pairs]), out)
+
+
+def sensor(out: Path) -> None:
+    """A room as it is; while the vehicle turns, through a rolling shutter; and at night."""
+    scenario = load_config(Scenario(), benchmark_scenarios()["P10"])
+    world = make_world(scenario.world, scenario.seed)
+    X_WB = pose_from_state(sample_initial_state(scenario, world))
+    camera = make_camera(OnboardCamera(420, 280, readout=0.03), world)
+    turned = X_WB @ RigidTransform(RollPitchYaw(-0.12, 0.0, 0.12), [-0.1, 0.0, 0.0])
+    views = [camera.render(X_WB), camera.render(X_WB, 0.0, turned)]
+    still, rolled = (color_pixels(view.color) for view in views)
+    night = ObservationNoise(exposure_error=4.0, full_well=8000.0, read_noise=8.0)
+    grain = image_generator(0, 0).standard_normal(still.shape)
+    dim = expose(still.astype(float), night, -1.0, grain).astype(np.uint8)
+    save(np.hstack([still, rolled, dim]), out)
 
 
 def row(left: Path, right: Path, out: Path) -> None:
@@ -155,6 +175,7 @@ KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
     "moments": (moments, ["video"]),
     "moving": (moving, ["video"]),
     "worlds": (worlds, []),
+    "sensor": (sensor, []),
     "row": (row, ["left", "right"]),
     "column": (column, ["upper", "lower"]),
     "sheet": (sheet, ["picture"]),

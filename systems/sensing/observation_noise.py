@@ -2,15 +2,18 @@
 
 The noise of an image is a function of a seed and of the image's number alone. It can be drawn again
 for any image, in any order, and a flight with it repeats bit for bit. Policies train with the same
-noise; training repeats the formula for depth in torch (`training/policies/observation.py`).
+noise; training repeats the formulas in torch (`training/policies/observation.py`).
 """
 
 import math
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
 _LARGEST_LATENCY = 1.0  # [s]
+_LARGEST_EXPOSURE_ERROR = 6.0  # [EV]
+_GAMMA = 2.2  # of colours over light
 
 
 @dataclass
@@ -29,6 +32,14 @@ class ObservationNoise:
     color_noise: float = 0.0
     # [-] Largest change in brightness of a whole image; uniform up to it, up and down.
     brightness_jitter: float = 0.0
+    # [EV] Largest error of an image's exposure: light doubles with each; uniform up to it, up and
+    # down. What becomes brighter than white is lost.
+    exposure_error: float = 0.0
+    # [electrons] That fill a colour pixel at white, whose number varies as photons do: by its root.
+    # 0 counts without noise; phones and small machine vision have 5,000 to 10,000.
+    full_well: float = 0.0
+    # [electrons] Noise of reading a colour pixel out; 2 to 10 are usual.
+    read_noise: float = 0.0
     # [s] How old images are when they come; the policy's state is up to date.
     latency: float = 0.0
     # [Hz] Range that a flight's rate of images is drawn from; where left out, an image is taken
@@ -44,6 +55,9 @@ class ObservationNoise:
         the remedy."""
         limits = {
             "depth_additive": math.inf,
+            "exposure_error": _LARGEST_EXPOSURE_ERROR,
+            "full_well": math.inf,
+            "read_noise": math.inf,
             "latency": _LARGEST_LATENCY,
             "jitter": _LARGEST_LATENCY,
         }
@@ -54,6 +68,11 @@ class ObservationNoise:
             if not (0.0 <= value <= limit and value < math.inf):
                 most = f" and at most {limit:g}" if limit < math.inf else " and finite"
                 raise ValueError(f"{name}.{number.name} is {value}; it must be at least 0{most}")
+        if self.read_noise > 0.0 and self.full_well == 0.0:
+            raise ValueError(
+                f"{name}.read_noise is {self.read_noise} electrons, but how many make white is not "
+                f"said; give {name}.full_well too, as 8000"
+            )
         rates = self.frame_rate
         if rates and not (len(rates) == 2 and 0.1 <= rates[0] <= rates[1] <= 1000.0):
             raise ValueError(
@@ -80,7 +99,12 @@ class ObservationNoise:
     @property
     def changes_color(self) -> bool:
         """Whether colour images are touched."""
-        return max(self.color_noise, self.brightness_jitter) > 0.0
+        return max(self.color_noise, self.brightness_jitter) > 0.0 or self.changes_light
+
+    @property
+    def changes_light(self) -> bool:
+        """Whether colour images are exposed anew."""
+        return max(self.exposure_error, self.full_well) > 0.0
 
 
 def noisy_depth(
@@ -130,10 +154,32 @@ def noisy_color(
     color: np.ndarray, noise: ObservationNoise, generator: np.random.Generator
 ) -> np.ndarray:
     """The colour image (H, W, 3) uint8, brighter or darker as a whole, with noise at each pixel;
-    see `disturb_color`."""
+    see `expose` and `disturb_color`."""
     brighter = generator.uniform(-1.0, 1.0)
     grain = generator.standard_normal(color.shape, dtype=np.float32)
+    if noise.changes_light:
+        error = np.float32(generator.uniform(-1.0, 1.0))
+        photons = generator.standard_normal(color.shape, dtype=np.float32)
+        color = expose(color.astype(np.float32), noise, error, photons)
     return disturb_color(color, noise, brighter, grain)
+
+
+def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any:
+    """
+    Colours (..., 3), 0 to 255, as a sensor counts their light. Arrays or tensors, of floats.
+
+        light' = 2^(exposure_error u) (c / 255)^2.2
+        c' = 255 clip(light' + n sqrt(light' / full_well + (read_noise / full_well)^2))^(1 / 2.2)
+
+    Args:
+        error: u, drawn from U(-1, 1) for each image, of a shape that broadcasts.
+        photons: n, of the colours' shape, drawn from N(0, 1).
+    """
+    light = (color / 255.0) ** _GAMMA * 2.0 ** (noise.exposure_error * error)
+    if noise.full_well > 0.0:
+        variance = light / noise.full_well + (noise.read_noise / noise.full_well) ** 2
+        light = light + photons * variance**0.5
+    return 255.0 * light.clip(0.0, 1.0) ** (1.0 / _GAMMA)
 
 
 def disturb_color(

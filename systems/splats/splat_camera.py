@@ -34,7 +34,6 @@ from splatpilot.systems.splats.moving_gaussians import (
 from splatpilot.systems.splats.rolling_shutter import band_intrinsics, pose_between, row_bands
 from splatpilot.systems.weakly import weakly
 
-
 _BANDS = 8
 """Into which an image with a rolling shutter is cut at least where something moves."""
 

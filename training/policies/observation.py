@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.policies.velocity_tracking import MAX_ACCELERATION, RESPONSE_TIME
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.sensing.observation_noise import ObservationNoise, expose
 from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH
 from splatpilot.training.policies.vehicles import Vehicle
 
@@ -28,7 +28,7 @@ def training_noise() -> ObservationNoise:
 def validate_training_noise(noise: ObservationNoise, name: str) -> None:
     """Raises ValueError on noise out of range, or of colours, naming the field of `name`."""
     noise.validate(name)
-    for field in ("color_noise", "brightness_jitter"):
+    for field in ("color_noise", "brightness_jitter", "exposure_error", "full_well"):
         if getattr(noise, field) > 0.0:
             raise ValueError(
                 f"{name}.{field} is {getattr(noise, field)}, but training has images of depth "
@@ -58,6 +58,10 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
     """Colours (N, H, W, 3), 0 to 255, as a worse camera measures them, each image anew."""
     brighter = torch.empty_like(color[:, 0, 0, 0]).uniform_(-1.0, 1.0, generator=generator)
     grain = torch.empty_like(color).normal_(generator=generator)
+    if noise.changes_light:
+        error = torch.empty_like(brighter).uniform_(-1.0, 1.0, generator=generator)
+        photons = torch.empty_like(color).normal_(generator=generator)
+        color = expose(color, noise, error[:, None, None, None], photons)
     return disturb_color(color, noise, brighter, grain)
 
 

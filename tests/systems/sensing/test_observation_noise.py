@@ -5,6 +5,7 @@ import pytest
 
 from splatpilot.systems.sensing.observation_noise import (
     ObservationNoise,
+    expose,
     image_generator,
     noisy_color,
     noisy_depth,
@@ -59,6 +60,35 @@ def test_color_noise_and_brightness():
     )
 
 
+def test_exposure():
+    """An error of exposure is a factor of light for the whole image; what is brighter than white
+    stays white."""
+    noise = ObservationNoise(exposure_error=1.0)
+    grey, error = np.full((4, 4, 3), 100.0), 0.5
+    light = (expose(grey, noise, error, np.zeros(grey.shape)) / 255) ** 2.2
+    np.testing.assert_allclose(light, 2**0.5 * (100 / 255) ** 2.2, rtol=1e-9)
+    assert (expose(np.full(3, 250.0), noise, 1.0, np.zeros(3)) == 255.0).all()
+    factors = []
+    for number in range(200):
+        seen = noisy_color(grey.astype(np.uint8), noise, image_generator(1, number))
+        assert len(np.unique(seen)) == 1
+        factors.append((seen[0, 0, 0] / 100) ** 2.2)
+    assert 0.5 <= min(factors) < 0.55 and 1.85 < max(factors) < 2.03
+
+
+def test_photons_and_reading():
+    """Of N electrons, sqrt(N + read^2) is the noise: in the dark that of reading alone."""
+    noise = ObservationNoise(full_well=400.0, read_noise=6.0)
+    photons = np.random.default_rng(0).standard_normal((400, 400, 3))
+    for electrons in (100.0, 225.0, 300.0):
+        color = np.full(photons.shape, 255 * (electrons / 400) ** (1 / 2.2))
+        counted = 400 * (expose(color, noise, 0.0, photons) / 255) ** 2.2
+        assert counted.mean() == pytest.approx(electrons, rel=2e-3)
+        assert counted.std() == pytest.approx(np.sqrt(electrons + 36.0), rel=0.01)
+    dark = 400 * (expose(np.zeros(photons.shape), noise, 0.0, photons) / 255) ** 2.2
+    assert dark[dark > 0].std() == pytest.approx(6.0 * np.sqrt(1 - 2 / np.pi), rel=0.01)
+
+
 def test_noise_is_a_function_of_seed_and_number():
     """The same seed and image number give the same bits; another of either gives others."""
     noise = ObservationNoise(depth_additive=0.1)
@@ -81,7 +111,14 @@ def test_no_noise_changes_nothing():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("depth_dropout", 1.1), ("depth_additive", np.inf), ("latency", 1.5), ("color_noise", -0.1)],
+    [
+        ("depth_dropout", 1.1),
+        ("depth_additive", np.inf),
+        ("latency", 1.5),
+        ("color_noise", -0.1),
+        ("exposure_error", 6.5),
+        ("read_noise", 3.0),  # of how many electrons?
+    ],
 )
 def test_bad_noise_is_named(field, value):
     """A value out of range names the field."""

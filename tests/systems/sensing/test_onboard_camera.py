@@ -35,6 +35,7 @@ def test_mount_looks_ahead_and_up():
         ("max_depth", 0.05),
         ("p_BC", [1.0, 2.0]),
         ("pitch", 91.0),
+        ("readout", 0.3),
     ],
 )
 def test_bad_config_is_named(field, value):

@@ -51,7 +51,8 @@ def test_a_pole_leans_as_the_camera_turns():
 
 
 def test_each_row_is_that_of_its_pose():
-    """Fast enough that every row is a band, rows have the bits of what a camera there sees."""
+    """Fast enough that every row is a band, rows are what a camera there sees. They are not so to
+    the last bit: Gaussians are held to the field of view of what is rendered."""
     camera = SplatCamera(pole(), INFO, readout=0.02)
     X_0 = RigidTransform(RotationMatrix.MakeXRotation(0.3), [0.1, 0.0, -0.2])
     X_1 = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0.1, 0.4])
@@ -59,7 +60,7 @@ def test_each_row_is_that_of_its_pose():
     view = camera.render(X_1, 0.0, X_0)
     for row in range(0, HEIGHT, 7):
         own = camera.render(pose_between(X_0, X_1, (row + 0.5) / HEIGHT))
-        np.testing.assert_allclose(view.color[row], own.color[row], atol=1e-3)
+        np.testing.assert_allclose(view.color[row], own.color[row], atol=2e-2)
         seen = own.depth[row] > 0
         assert seen.any() and (view.depth[row] > 0)[seen].mean() > 0.9
         both = seen & (view.depth[row] > 0)

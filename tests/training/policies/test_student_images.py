@@ -7,7 +7,7 @@ import torch
 from splatpilot.systems.policies import student_inference
 from splatpilot.systems.sensing import observation_noise
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.training.policies.observation import disturb_color
+from splatpilot.training.policies.observation import disturb_color, noisy_color
 from splatpilot.training.policies.student_images import (
     Appearance,
     clean_images,
@@ -53,6 +53,23 @@ def test_colour_noise_of_training_is_that_of_flight():
     for n in range(2):
         expected = observation_noise.disturb_color(color[n], noise, brighter[n], grain[n])
         np.testing.assert_allclose(found[n], expected, atol=0.51)
+
+
+def test_exposure_of_training_is_that_of_flight():
+    """The same draws expose tensors as they expose arrays, each image by its own error."""
+    noise = ObservationNoise(exposure_error=2.0, full_well=500.0, read_noise=5.0)
+    rng = np.random.default_rng(0)
+    color = rng.integers(0, 256, (2, 5, 6, 3)).astype(np.float32)
+    error, photons = rng.uniform(-1, 1, 2), rng.normal(size=color.shape).astype(np.float32)
+    drawn = torch.tensor(error)[:, None, None, None], torch.tensor(photons)
+    found = observation_noise.expose(torch.tensor(color), noise, *drawn)
+    for n in range(2):
+        expected = observation_noise.expose(color[n], noise, error[n], photons[n])
+        np.testing.assert_allclose(found[n], expected, atol=1e-3)
+    generators = (torch.Generator().manual_seed(seed) for seed in (0, 0, 1))
+    first, same, other = (noisy_color(torch.tensor(color), noise, g) for g in generators)
+    assert torch.equal(first, same) and not torch.equal(first, other)
+    assert (first != torch.tensor(color)).any()
 
 
 def test_light_and_hue():
