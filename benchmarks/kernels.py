@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 import torch
 from harness import header, milliseconds, row
-from opensplat import build_opensplat, time_opensplat
+from opensplat import print_opensplat
 from pydrake.math import RigidTransform
 from scenes import cameras_of, tensors_of
 
 from splatpilot import _native
-from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 WIDTH, HEIGHT = 320, 240
@@ -78,15 +77,8 @@ def print_raster_kernel(scene: GaussianScene, X_WC: RigidTransform, opensplat: P
         row(f"splatpilot {simd}", f"{ms:.3f}")
     if opensplat is None:
         print("OpenSplat: not measured; name a checkout with --opensplat")
-        return
-    viewmats, Ks = cameras_of(X_WC, WIDTH, HEIGHT)
-    tensors = tensors_of(scene)
-    image, _, meta = rasterize(**tensors, viewmats=viewmats, Ks=Ks, width=WIDTH, height=HEIGHT)
-    colors = tensors["colors"][meta["gaussian_ids"]]
-    theirs, difference = time_opensplat(build_opensplat(opensplat), meta, colors, image[0])
-    row("OpenSplat's on the same projected Gaussians", f"{theirs:.1f}")
-    ratios = ", ".join(f"{simd} {theirs / ms:.0f}" for simd, ms in ours.items())
-    print(f"OpenSplat's over ours: {ratios}; median difference of the images {difference:.1e}")
+    else:
+        print_opensplat(scene, X_WC, opensplat)
 
 
 def copy_rate() -> float:
