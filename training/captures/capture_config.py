@@ -77,6 +77,8 @@ class CaptureConfig:
     images are level on average; `ground`: across the largest plane below the cameras."""
     scale: ScaleConfig = field(default_factory=ScaleConfig)
     """Where metres come from when images alone were registered."""
+    topics: list[str] = field(default_factory=list)
+    """Topics of a ROS bag that has several of a kind: of colour, depth and poses, in this order."""
     partners: int = 0
     """With how many others a photograph is compared: half of them next to it by name, half those
     that look most alike; 0: with all, of more than 60 photographs with 20."""
@@ -101,6 +103,11 @@ class CaptureConfig:
         if self.up and self.up not in UP_AXES | {"cameras", "ground"}:
             raise ValueError(
                 f"capture.up is {self.up!r}; known are x, y, z, -x, -y, -z, cameras and ground"
+            )
+        if self.topics and len(self.topics) != 3:
+            raise ValueError(
+                f"capture.topics is {self.topics}; three names are needed, of colour, depth and "
+                "poses, `/tf` being one of poses"
             )
         if self.partners < 0:
             raise ValueError(f"capture.partners is {self.partners}; it must be at least 0")

@@ -12,6 +12,7 @@ from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstud
 from splatpilot.training.captures.photographs import photographs_in, read_photographs
 from splatpilot.training.captures.polycam import is_polycam, read_polycam
 from splatpilot.training.captures.record3d import is_record3d, read_record3d
+from splatpilot.training.captures.rosbag import is_rosbag, read_rosbag
 from splatpilot.training.captures.scannet import is_scannet, read_scannet
 from splatpilot.training.captures.seven_scenes import is_seven_scenes, read_seven_scenes
 from splatpilot.training.captures.tartanair import (
@@ -110,6 +111,7 @@ register_capture(
     description="photographs alone",
 )
 
+register_capture("rosbag", is_rosbag, read_rosbag, description="a ROS bag")
 register_capture("video", is_video, read_video, description="a video (.mp4, .mov, ...)")
 
 _OURS = CAPTURES.registered()

@@ -8,6 +8,7 @@ Where poses are those of keyframes, too far apart to interpolate, images take th
 time, and those between keyframes have none.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from splatpilot.training.captures.upright import turn_upright
 
 _MAX_APART = 0.02
 """[s] between a colour image and its depth, as the data set's own tools have it."""
-_MAX_GAP = 0.1
+_MAX_GAP = 0.12
 """[s] between two poses that one is interpolated from."""
 _SAME_TIME = 0.005
 """[s] between an image and the pose of a keyframe that is its own."""
@@ -52,6 +53,32 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
         FileNotFoundError: if a list is missing.
         ValueError: if a list is not as it should be, or too many frames cannot be used.
     """
+
+    def lens(width: int, height: int) -> Lens:
+        if config.intrinsics:
+            return Lens(pinhole(*config.intrinsics), width, height)
+        name = next((name for name in _CAMERAS if name in path.resolve().name), "")
+        (fx, fy, cx, cy), distortion = _CAMERAS.get(name, _DEFAULT)
+        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
+        return opencv_lens(K, 640, 480, distortion).scale_to(width, height)
+
+    return open_sequence(path, "TUM RGB-D sequence", config, lens, 5000.0)
+
+
+def open_sequence(
+    path: Path, kind: str, config: CaptureConfig, lens: Callable[[int, int], Lens], unit: float
+) -> Capture:
+    """Opens lists and images as TUM has them, of any camera.
+
+    Args:
+        path: the folder of the lists.
+        kind: what it is called in `Capture.source`.
+        lens: gives the camera of images of a width and height [px].
+        unit: how many units of the stored depth make a metre, unless `config` says.
+
+    Raises:
+        FileNotFoundError, ValueError: see `read_tum`.
+    """
     color_times, colors = _read_list(path / "rgb.txt")
     depth_times, depths = _read_list(path / "depth.txt")
     pose_file = path / "groundtruth.txt"
@@ -76,19 +103,10 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
         f"{_MAX_APART} s, or neither two poses within {_MAX_GAP} s around them nor one within "
         f"{_SAME_TIME} s"
     ]
-    unit = config.depth_unit or 5000.0
-
-    def lens(width: int, height: int) -> Lens:
-        if config.intrinsics:
-            return Lens(pinhole(*config.intrinsics), width, height)
-        name = next((name for name in _CAMERAS if name in path.resolve().name), "")
-        (fx, fy, cx, cy), distortion = _CAMERAS.get(name, _DEFAULT)
-        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
-        return opencv_lens(K, 640, 480, distortion).scale_to(width, height)
-
+    unit = config.depth_unit or unit
     capture = open_frames(
         path,
-        "TUM RGB-D sequence",
+        kind,
         frames,
         axes=OPTICAL_AXES,
         lens=lens,
