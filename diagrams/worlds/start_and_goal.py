@@ -24,8 +24,9 @@ def choose_start_and_goal(
     The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
     [m] to spare can fly through space known to be free, at least `SHORTEST`: in the largest
     connected part of a grid, the node farthest from any node, and the node farthest from that (the
-    double sweep, exact on trees). If no space has that much margin, half of it is tried, and then
-    none. Paths longer than `longest` [m] are not considered: a flight should end in good time.
+    double sweep, exact on trees). If no space has that much margin, half of it is tried: through
+    less, vehicles hover before gaps that planners do not trust. Paths longer than `longest` [m] are
+    not considered: a flight should end in good time.
 
     Raises:
         ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
@@ -39,7 +40,7 @@ def choose_start_and_goal(
         if length >= SHORTEST:
             return p_WN[start], p_WN[goal], length
         reach = max(reach, length)
-    raise _no_room(esdf, radius, reach, SHORTEST)
+    raise _no_room(esdf, radius, margin, reach, SHORTEST)
 
 
 def draw_start_and_goal(
@@ -76,14 +77,14 @@ def draw_start_and_goal(
             if len(far):
                 goal = int(rng.choice(far))
                 return p_WN[start], p_WN[goal], float(lengths[goal])
-    raise _no_room(esdf, radius, reach, least)
+    raise _no_room(esdf, radius, margin, reach, least)
 
 
 def _free_graphs(
     esdf: Esdf, radius: float, margin: float
 ) -> Iterator[tuple[csr_array, NDArray[np.float64]]]:
     """Graphs of the space free for a sphere of `radius` [m], and their nodes (N, 3) [m], with ever
-    less margin: all, half and none of `margin` [m]."""
+    less margin: all of `margin` [m] and half of it."""
     field = esdf.conservative()
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
@@ -93,23 +94,23 @@ def _free_graphs(
     ]
     p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
     clearance = field.distance(p_WN) - radius  # [m]
-    for need in (margin, margin / 2, 0.0):
+    for need in (margin, margin / 2):
         if np.count_nonzero(clearance > need) >= 2:
             graph, nodes = grid_graph(clearance > need, spacing)
             yield graph, p_WN.reshape(-1, 3)[nodes]
 
 
-def _no_room(esdf: Esdf, radius: float, reach: float, least: float) -> ValueError:
+def _no_room(esdf: Esdf, radius: float, margin: float, reach: float, least: float) -> ValueError:
+    room = f"a vehicle of radius {radius} m with {margin / 2:g} m to spare"
     if reach > 0:
         return ValueError(
-            f"the longest way of a vehicle of radius {radius} m through free space is {reach:.2f} "
-            f"m, at least {least:g} m is needed, and unknown space counts as occupied; "
-            "capture more of the place"
+            f"the longest way of {room} through free space is {reach:.2f} m, at least {least:g} m "
+            "is needed, and unknown space counts as occupied; capture more of the place"
         )
     largest = float(esdf.conservative().distances.max())
     return ValueError(
-        f"no free space for a vehicle of radius {radius} m: the largest clearance is "
-        f"{largest:.2f} m, and unknown space counts as occupied; capture more of the place"
+        f"no free space for {room}: the largest clearance is {largest:.2f} m, and unknown space "
+        "counts as occupied; capture more of the place"
     )
 
 

@@ -3,6 +3,8 @@ import pytest
 
 from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
 
 RADIUS = 0.354
 
@@ -58,22 +60,29 @@ def test_unknown_space_is_not_flown_through():
 
 
 def test_narrow_places_get_less_margin():
-    """Where no space has the margin, less is asked for, but never less than the radius."""
-    esdf = corridors(((0.2, 0.2, 0.2), (5.8, 1.1, 1.1)))
+    """Where no space has the margin, half of it is asked for, and that the planner can fly."""
+    esdf = corridors(((0.2, 0.2, 0.2), (5.8, 1.3, 1.3)))
     p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
     assert length > 3
-    assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS).all()
+    assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS + 0.1).all()
+    way = time_of_arrival(esdf.conservative(), p_WG, LatticeConfig().margin)
+    assert way.is_reachable(p_WS)
+    with pytest.raises(ValueError, match="no free space"):
+        choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.95, 0.95))), RADIUS)
 
 
 def test_no_room_at_all():
     """A place too narrow for the vehicle is an error that names radius and largest clearance."""
-    with pytest.raises(ValueError, match=r"radius 0\.354 m: the largest clearance is 0\.\d\d m"):
+    with pytest.raises(
+        ValueError,
+        match=r"radius 0\.354 m with 0\.1 m to spare: the largest clearance is 0\.\d\d m",
+    ):
         choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.7, 0.7))), RADIUS)
 
 
 def test_no_way_worth_a_flight():
     """A place in which the vehicle cannot fly a metre is an error that names the longest way."""
-    cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.2, 1.2)))
+    cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.4, 1.4)))
     for choose in (choose_start_and_goal, lambda *given: draw_start_and_goal(*given, seed=0)):
         with pytest.raises(
             ValueError, match=r"longest way .* is 0\.\d\d m, at least 1 m is needed"
