@@ -1,9 +1,12 @@
 """Whose the seeds of worlds are: the benchmark's, training's or validation's, never two of them.
 
-The benchmark flies in worlds of seeds below `TRAINING_SEEDS`. From there on each run of training
-has `SEEDS_PER_RUN` of its own; those from `VALIDATION_SEEDS` on choose among checkpoints.
+The benchmark flies in worlds of seeds below `TRAINING_SEEDS`. Those from 0 on are in its tables,
+and by what they showed policies, worlds and recipes were mended; by those from `FRESH_SEEDS` on
+nothing was. From `TRAINING_SEEDS` on each run of training has `SEEDS_PER_RUN` of its own; those
+from `VALIDATION_SEEDS` on choose among checkpoints.
 """
 
+FRESH_SEEDS = 500_000
 TRAINING_SEEDS = 1_000_000
 VALIDATION_SEEDS = 2_000_000
 SEEDS_PER_RUN = 1000

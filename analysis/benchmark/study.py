@@ -46,8 +46,10 @@ class StudyConfig:
     policies: list[str] = field(default_factory=lambda: list(BENCHMARK_POLICIES))
     # [m/s] Nominal speeds.
     speeds: list[float] = field(default_factory=lambda: [2.0])
-    # Flights of each, with the seeds from 0 on.
+    # Flights of each, with so many seeds.
     seeds: int = 20
+    # The first of them; from `splatpilot.systems.seeds.FRESH_SEEDS` on nothing was chosen by any.
+    first_seed: int = 0
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
 
@@ -72,7 +74,7 @@ class StudyConfig:
         return [
             RolloutSpec(Path(scenario).stem, policy, speed, seed)
             for scenario in self.scenarios
-            for seed in range(self.seeds)
+            for seed in range(self.first_seed, self.first_seed + self.seeds)
             for speed in self.speeds
             for policy in policies
         ]
@@ -109,6 +111,11 @@ class StudyConfig:
         """
         if not 1 <= self.seeds <= TRAINING_SEEDS:
             raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
+        if not 0 <= self.first_seed <= TRAINING_SEEDS - self.seeds:
+            raise ValueError(
+                f"first_seed is {self.first_seed}; it must be 0 to {TRAINING_SEEDS - self.seeds}, "
+                f"so that none of {self.seeds} seeds is one of training"
+            )
         for speed in self.speeds:
             if not 0.0 < speed < math.inf:
                 raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")

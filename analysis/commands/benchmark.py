@@ -61,6 +61,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     )
     benchmark.add_argument("--speeds", type=_names, metavar="2,3", help="nominal, m/s; default: 2")
     benchmark.add_argument("--seeds", type=int, metavar="N", help="flights of each; default: 20")
+    benchmark.add_argument(
+        "--first-seed",
+        type=int,
+        metavar="K",
+        help="of the N seeds; default: 0. By those from 500000 on nothing was chosen",
+    )
     benchmark.add_argument("--jobs", type=int, metavar="N", help="worker processes; default: cores")
     benchmark.add_argument(
         "--cluster", metavar="ADDRESS", help="fly on the workers of this dask scheduler instead"
@@ -106,7 +112,7 @@ def _benchmark(options: argparse.Namespace) -> Any:
         config.seeds = QUICK_SEEDS
     if options.dodgedrone:
         config.scenarios, config.speeds = list(DODGEDRONE), list(DODGEDRONE_SPEEDS)
-    for name in ("scenarios", "seeds"):
+    for name in ("scenarios", "seeds", "first_seed"):
         value = getattr(options, name)
         if value is not None:
             setattr(config, name, value)
