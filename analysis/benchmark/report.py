@@ -87,8 +87,8 @@ def _scope(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
     return (
         f"{len(rows)} flights: {len(config.scenarios)} scenarios, {len(config.policies)} policies, "
         f"{config.seeds} seeds from {config.first_seed} on, nominal speeds {speeds} m/s. A flight "
-        "succeeds when it reaches the goal and its clearance at the vehicle's radius is never below "
-        "zero. Brackets are 95 % Wilson intervals."
+        "succeeds when it reaches the goal and its clearance at the vehicle's radius is never "
+        "below zero. Brackets are 95 % Wilson intervals."
     )
 
 

@@ -51,7 +51,7 @@ def test_chunks_are_flights_through_one_place(short_scenario):
         ({"speeds": [50.0], "policies": ["straight"]}, "speed is 50"),
         ({"seeds": 0}, "seeds is 0; it must be 1 to"),
         ({"first_seed": -1}, "first_seed is -1; it must be 0 to"),
-        ({"first_seed": 1_000_000}, "first_seed is 1000000; it must be 0 to 999980, so that none"),
+        ({"first_seed": 1_000_000}, "first_seed is 1000000; it must be 0 to 999997, so that none"),
         ({"overrides": ["world.spacing=0.1"]}, "scenario short: .*spacing"),
         ({"overrides": ["policy.rate=3"]}, "write it as one of them, --policies NAME:rate=3"),
         ({"overrides": ["seed=3"]}, "say how many with --seeds"),
