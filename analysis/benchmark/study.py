@@ -48,10 +48,10 @@ class StudyConfig:
     speeds: list[float] = field(default_factory=lambda: [2.0])
     # Flights of each, with so many seeds.
     seeds: int = 20
-    # The first of them; from `splatpilot.systems.seeds.FRESH_SEEDS` on nothing was chosen by any.
-    first_seed: int = 0
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
+    # The least seed; by those from `splatpilot.systems.seeds.FRESH_SEEDS` on nothing was chosen.
+    first_seed: int = 0
 
     @property
     def variants(self) -> list[Variant]:

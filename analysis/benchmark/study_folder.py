@@ -94,11 +94,12 @@ class StudyFolder:
 
     def _check_same(self, described: dict[str, Any]) -> None:
         there = self._described()
+        begun = yaml.safe_load(dump_config(StudyConfig())) | there["study"]
         for name, value in described["study"].items():
-            if there["study"].get(name) != value:
+            if begun[name] != value:
                 raise ValueError(
-                    f"{self.path} holds a study with {name} {there['study'].get(name)}, not "
-                    f"{value}; choose another folder with --out, or ask for the same study"
+                    f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
+                    "another folder with --out, or ask for the same study"
                 )
         parts = [f"shard {d['shard']}" if "shard" in d else "all" for d in (there, described)]
         if parts[0] != parts[1]:

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,3 +69,18 @@ def test_study_that_was_killed_before_it_began_is_begun(study, tmp_path, content
     assert not list(out.rglob("*.partial*"))
     benchmark.run(config=config, out=out, jobs=1)
     assert contents(out) == contents(whole)
+
+
+def test_fields_that_came_later_are_as_they_are_by_default(study, tmp_path):
+    """A study that was begun before a field was known goes on with the field's default, and not
+    with another value."""
+    config, _ = study
+    folder = StudyFolder(tmp_path / "out")
+    folder.claim(config, program())
+    file = tmp_path / "out/study.yaml"
+    begun = file.read_text()
+    assert "  first_seed: 0\n" in begun
+    file.write_text(begun.replace("  first_seed: 0\n", ""))
+    folder.claim(config, program())
+    with pytest.raises(ValueError, match="holds a study with first_seed 0, not 500000; choose"):
+        folder.claim(replace(config, first_seed=500_000), program())
