@@ -1,7 +1,7 @@
 """Rolling shutters: each row of an image is seen from where the camera was when it was read.
 
-Rows are read one after the other at even times, the first at the pose X_WC0 and the last at X_WC1;
-between them the position moves evenly, and the rotation about one axis. Rows between which an image
+Rows are read one after the other at even times, the first at the pose X_WC0 and the last at X_WC1,
+those between at `pose_between`. Rows between which an image
 hardly moves are rendered together, as a band, from the pose of their middle.
 """
 
@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 _STEP = 0.5
 """[px] that an image may move between two bands, so that no row is off by more than half of it."""
@@ -35,14 +35,6 @@ def row_bands(
     count = min(height, max(fewest, math.ceil(moved / _STEP)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
-
-
-def pose_between(X_WC0: RigidTransform, X_WC1: RigidTransform, s: float) -> RigidTransform:
-    """The pose at the fraction s of the way from X_WC0 to X_WC1."""
-    turn = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis()
-    turn.set_angle(s * turn.angle())
-    p_WC = (1.0 - s) * X_WC0.translation() + s * X_WC1.translation()
-    return RigidTransform(X_WC0.rotation() @ RotationMatrix(turn), p_WC)
 
 
 def band_intrinsics(K: NDArray[np.float64], first: int) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from pydrake.systems.sensors import (
 )
 
 from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.pose_between import pose_between
 from splatpilot.systems.splats.background import BLACK, Background
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.distortion import Distortion
@@ -31,7 +32,7 @@ from splatpilot.systems.splats.moving_gaussians import (
     MovingGaussians,
     PlacedGaussians,
 )
-from splatpilot.systems.splats.rolling_shutter import band_intrinsics, pose_between, row_bands
+from splatpilot.systems.splats.rolling_shutter import band_intrinsics, row_bands
 from splatpilot.systems.weakly import weakly
 
 _BANDS = 8

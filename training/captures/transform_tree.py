@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.systems.pose_between import pose_between
+
 _MAX_GAP = 0.12
 """[s] between two poses that one is interpolated from."""
 
@@ -70,6 +72,4 @@ class TransformTree:
         if not 0 < after < len(times) or times[after] - times[after - 1] > _MAX_GAP:
             return None
         (t0, a), (t1, b) = poses[after - 1], poses[after]
-        s = (time - t0) / (t1 - t0)
-        q = a.rotation().ToQuaternion().slerp(s, b.rotation().ToQuaternion())
-        return RigidTransform(q, (1 - s) * a.translation() + s * b.translation())
+        return pose_between(a, b, (time - t0) / (t1 - t0))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.systems.pose_between import pose_between
 from splatpilot.systems.read_limit import read_text
 from splatpilot.training.captures.capture import OPTICAL_AXES, Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -149,10 +150,8 @@ def _frame(
         ]
         if len(poses) == 1:
             return poses[0]
-        a, b = poses
         s = (time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
-        q = a.rotation().ToQuaternion().slerp(s, b.rotation().ToQuaternion())
-        return RigidTransform(q, (1 - s) * a.translation() + s * b.translation())
+        return pose_between(poses[0], poses[1], s)
 
     return FrameFiles(path / color, X_FC, path / depth)
 

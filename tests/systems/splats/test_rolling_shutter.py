@@ -5,12 +5,13 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.systems.pose_between import pose_between
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.distortion import Distortion
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.splats.moving_gaussians import MovingGaussians, PlacedGaussians
-from splatpilot.systems.splats.rolling_shutter import pose_between, row_bands
+from splatpilot.systems.splats.rolling_shutter import row_bands
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
@@ -76,16 +77,6 @@ def test_bands():
     assert len(bands) == 8  # 0.1 m at 1 m are 4 px
     assert [row for band in bands for row in range(*band)] == list(range(HEIGHT))
     assert len(row_bands(X, yawed(1.0), FOCAL, HEIGHT)) == HEIGHT
-
-
-def test_poses_between():
-    """Half of the way is half of the turn about the same axis, and half of the distance."""
-    X_0 = RigidTransform(RotationMatrix.MakeZRotation(0.4), [1.0, 0, 0])
-    X_1 = RigidTransform(RotationMatrix.MakeZRotation(1.0), [3.0, 2, 0])
-    expected = RigidTransform(RotationMatrix.MakeZRotation(0.7), [2.0, 1, 0])
-    assert pose_between(X_0, X_1, 0.5).IsNearlyEqualTo(expected, 1e-12)
-    assert pose_between(X_0, X_1, 0.0).IsNearlyEqualTo(X_0, 1e-12)
-    assert pose_between(X_0, X_1, 1.0).IsNearlyEqualTo(X_1, 1e-12)
 
 
 def ports(camera: SplatCamera, X_0: RigidTransform, X_1: RigidTransform, names: list[str]):
