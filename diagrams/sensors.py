@@ -29,8 +29,9 @@ class SensorKind:
     config: type
     """The type of its configurations."""
     build: Callable[[Any, World], System]
-    """From a configuration and the world to a system. Its inputs `body_pose` (X_WB) and `state`,
-    where it has them, are connected to the vehicle; an output `p` of the sensor `s` is the flight's
+    """From a configuration and the world to a system. Its inputs `body_pose` (X_WB), `state` and
+    `start_pose` (X_WB of the configuration's `readout` [s] before), where it has them, are
+    connected to the vehicle; an output `p` of the sensor `s` is the flight's
     output `s_p`, and a policy that has an input of that name gets it."""
 
 
