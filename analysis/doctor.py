@@ -17,12 +17,14 @@ _DRIVER = Path("/proc/driver/nvidia")
 
 _SERVED = {
     "cluster": "`splatpilot benchmark --cluster`",
+    "exr": "depth of Record3D's exports",
     "mesh": "`splatpilot mesh`",
     "mocap": "OptiTrack in `splatpilot px4`",
     "photos": "photographs without poses, and COLMAP models",
     "px4": "`splatpilot px4`",
     "tensorboard": "curves in TensorBoard",
     "train": "training, reconstruction and measures of scenes",
+    "ros": "captures in ROS bags",
     "spz": "Gaussians in SPZ of version 4",
     "viser": "`splatpilot view --viser`",
 }

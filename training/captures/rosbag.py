@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
+from splatpilot.systems.extras import import_extra
 from splatpilot.systems.files import folder_written_atomically, remove_leftovers
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -67,6 +68,7 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
     Raises:
         ValueError: if it is no readable bag, lacks what is needed, or has it more than once.
         OSError: if the cache cannot be written.
+        ModuleNotFoundError: if the extra `ros` is not installed.
     """
     if path.suffix in {".db3", ".mcap"}:
         raise ValueError(f"{path}: a part of a bag; name its folder, in which {_METADATA} lies")
@@ -101,13 +103,11 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
+    highlevel: Any = import_extra("rosbags.highlevel", "ros")
+    typesys: Any = import_extra("rosbags.typesys", "ros")
     try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise ValueError(f"{path}: a ROS bag needs rosbags; install splatpilot[ros]") from None
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        types = typesys.get_typestore(typesys.Stores.LATEST)
+        reader = highlevel.AnyReader([path], default_typestore=types)
         reader.open()
     except Exception as error:  # rosbags raises anything of damaged files
         raise ValueError(f"{path}: not a readable ROS bag ({error}); copy it again") from None

@@ -93,7 +93,8 @@ def test_registered_kinds_are_listed(folder):
     )
     (folder / "0.png").unlink()
     with pytest.raises(
-        ValueError, match=r"known are TartanAir V1 .*, photographs alone, a video .*, cubes"
+        ValueError,
+        match=r"known are TartanAir V1 .*, photographs alone, a ROS bag, a video .*, cubes",
     ):
         read_capture(folder)
     with pytest.raises(ValueError, match="there is a kind of capture 'tum' already"):
