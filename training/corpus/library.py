@@ -4,16 +4,17 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.diagrams.worlds.make_world import is_procedural
-from splatpilot.diagrams.worlds.scene import SceneConfig, SceneSource, find_scene
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.configuration import load_config
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.training.corpus.world_record import WorldSource
-from splatpilot.training.world_kinds import PROCEDURAL, ROUNDABOUT, world_of
+from splatpilot.training.world_kinds import (
+    PROCEDURAL,
+    ROUNDABOUT,
+    check_generated,
+    place_to_learn_in,
+    world_of,
+)
 
 
 @dataclass
@@ -38,11 +39,7 @@ class LibraryConfig:
         if not self.kinds and not self.scenes:
             raise ValueError("worlds has neither kinds nor scenes; name some")
         for kind in self.kinds:
-            if not is_procedural(world_of(kind)):
-                raise ValueError(
-                    f"worlds.kinds has {kind}, whose world is not generated; choose kinds from "
-                    f"{', '.join(PROCEDURAL)} and files, and put scene folders into worlds.scenes"
-                )
+            check_generated(kind)
         for scene in self.scenes:
             fidelity_bound(scene)
 
@@ -80,24 +77,11 @@ def fidelity_bound(scene: str) -> float:
         FileNotFoundError: if there is no such scene.
         ValueError: if nobody measured it, or the benchmark flies in it.
     """
-    folder = find_scene(SceneConfig(path=scene))
-    if not folder.is_dir():
-        raise ValueError(f"{folder} is no scene folder; `splatpilot reconstruct` makes one")
+    folder = place_to_learn_in(scene)
     metadata = read_scene_metadata(folder)
-    flown = {folder.name, metadata.name} & _benchmark_scenes()
-    if flown:
-        raise ValueError(
-            f"{folder}: the benchmark flies in {min(flown)}, so nothing may be learned there; "
-            "leave it out of worlds.scenes"
-        )
     if metadata.perturbation_bound is None:
         raise ValueError(
             f"{folder / 'scene.yaml'} does not say how far from the capture its images can be "
             f"trusted (perturbation_bound); measure it with `splatpilot fidelity {folder}`"
         )
     return metadata.perturbation_bound
-
-
-def _benchmark_scenes() -> set[str]:
-    worlds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
-    return {Path(world.path).name for world in worlds if isinstance(world, SceneSource)}

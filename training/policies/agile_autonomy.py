@@ -172,7 +172,7 @@ class AgileAutonomyTrainer:
         config = self._config
         return evaluate_agent(
             self._agent, self._validation, config.validation, config.noise
-        ).measures(config.worlds.kinds)
+        ).measures(config.worlds.turns)
 
     def state_dict(self) -> dict[str, Any]:
         return {"data": self._data, "generator": self._generator.get_state()}

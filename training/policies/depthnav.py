@@ -45,8 +45,10 @@ class DepthNavLoss:
 
     # [s/m] Smooth L1 of the mean velocity less the velocity wanted.
     velocity: float = 4.0
-    # [-] Velocity towards the nearest obstacle times max(0, 1 - d)² + 2.5 ln(1 + exp(-6 d)), d [m].
+    # [-] Velocity towards the nearest obstacle times max(0, 1 - d)², d [m], and its nearness.
     collision: float = 6.0
+    # [m/s] Of that, times ln(1 + exp(-6 d)): what nearness costs, however one moves.
+    nearness: float = 2.5
     # [s^4/m^2] Square of the acceleration.
     acceleration: float = 0.01
     # [s^6/m^2] Square of the jerk.
@@ -116,7 +118,7 @@ class DepthNavLearner:
         weights = self._loss
         d, approach = transitions.clearance[:, 0], transitions.approach[:, 0].clamp(min=0.0)
         collision = approach * (1.0 - d).clamp(min=0.0).square()
-        collision = collision + 2.5 * torch.nn.functional.softplus(-6.0 * d)
+        collision = collision + weights.nearness * torch.nn.functional.softplus(-6.0 * d)
         velocity = torch.nn.functional.smooth_l1_loss(
             transitions.v_mean, transitions.v_target, reduction="none"
         )

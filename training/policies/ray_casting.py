@@ -5,7 +5,7 @@ normal that is returned with it. Tensors may be on any device; what is asked is 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol, get_args
 
 import numpy as np
@@ -155,6 +155,51 @@ class EsdfGeometry(Grids):
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
         distances, gradients = self.interpolate(p_WQ, world)
         return distances[:, None], gradients[:, None]
+
+
+class MixedGeometry:
+    """Worlds of shapes beside worlds of distance fields; those that share a field hold it once.
+
+    Args:
+      worlds: the shapes of each, or its distance field.
+      threads, simd: see `ShapeGeometry`.
+    """
+
+    def __init__(
+        self, worlds: Sequence[Sequence[Shape] | Esdf], threads: int = 1, simd: str = ""
+    ) -> None:
+        shapes = [world for world in worlds if not isinstance(world, Esdf)]
+        fields = list({id(world): world for world in worlds if isinstance(world, Esdf)}.values())
+        self._parts: list[Geometry] = [ShapeGeometry(shapes, threads, simd)]
+        if fields:
+            self._parts.append(EsdfGeometry(fields, threads, simd))
+        self._part = torch.tensor([isinstance(world, Esdf) for world in worlds], dtype=torch.long)
+        of_shapes, of_field = iter(range(len(shapes))), {id(f): n for n, f in enumerate(fields)}
+        self._number = torch.tensor(
+            [of_field[id(w)] if isinstance(w, Esdf) else next(of_shapes) for w in worlds]
+        )
+
+    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
+        depth = p_WC.new_empty(len(p_WC), len(rays.directions_C))
+        for part, rows, number in self._rows(world):
+            depth[rows] = part.depth(p_WC[rows], R_WC[rows], rays, number)
+        return depth
+
+    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        distances = p_WQ.new_full((len(p_WQ), count), torch.inf)
+        gradients = p_WQ.new_zeros(len(p_WQ), count, 3)
+        for part, rows, number in self._rows(world):
+            d, gradient = part.nearest(p_WQ[rows], number, count)
+            distances[rows, : d.shape[1]], gradients[rows, : d.shape[1]] = d, gradient
+        return distances, gradients
+
+    def _rows(self, world: Tensor) -> Iterator[tuple[Geometry, Tensor, Tensor]]:
+        """Of each part that is asked, the rows of a query and the numbers of their worlds there."""
+        asked = self._part.to(world.device)[world]
+        for number, part in enumerate(self._parts):
+            rows = (asked == number).nonzero()[:, 0]
+            if len(rows):
+                yield part, rows, self._number.to(world.device)[world[rows]]
 
 
 def _depth(

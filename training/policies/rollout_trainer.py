@@ -76,7 +76,7 @@ class RolloutTrainer:
         config = self._config
         return evaluate_agent(
             self._learner, self._validation, config.validation, config.rollout.noise
-        ).measures(config.worlds.kinds)
+        ).measures(config.worlds.turns)
 
     def state_dict(self) -> dict[str, Any]:
         rollouts = [rollout for rollout in (self._main, self._empty) if rollout is not None]

@@ -1,4 +1,4 @@
-"""What policies train in: procedural worlds with the time of arrival at their goals."""
+"""What policies train in: worlds, generated or captured, and the time of arrival at their goals."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -15,7 +15,12 @@ from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_dist
 from splatpilot.systems.collision.shapes import HalfSpace, Shape
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.ray_casting import Geometry, Grids, ShapeGeometry
+from splatpilot.training.policies.ray_casting import (
+    Geometry,
+    Grids,
+    MixedGeometry,
+    ShapeGeometry,
+)
 
 STARTS = 256
 """Places that flights of training start from, in each world."""
@@ -26,9 +31,11 @@ _NEAR_GOAL = 1.0  # [m], within which the way is straight
 
 @dataclass(frozen=True, eq=False)
 class TrainingWorld:
-    """One world: its shapes and volume, and where to fly."""
+    """One world: what stands in its volume, and where to fly."""
 
-    shapes: Sequence[Shape]
+    # Its shapes, or of a captured place the distance field in which all that is unknown counts as
+    # occupied (`Esdf.conservative`); worlds of the same place share it.
+    surfaces: Sequence[Shape] | Esdf
     lower_W: np.ndarray  # (3,) [m]
     upper_W: np.ndarray  # (3,) [m]
     p_WS: np.ndarray  # (3,) [m] start
@@ -36,7 +43,7 @@ class TrainingWorld:
 
 
 class WorldBatch:
-    """W worlds as tensors: shapes, volumes, starts, goals, and the way to each goal.
+    """W worlds as tensors: surfaces, volumes, starts, goals, and the way to each goal.
 
     Args:
       worlds: W of them.
@@ -60,8 +67,8 @@ class WorldBatch:
         self.p_WS, self.p_WG = (
             tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
-        self._shapes = [world.shapes for world in worlds]
-        self.geometry: Geometry = ShapeGeometry(self._shapes)
+        self._surfaces = [world.surfaces for world in worlds]
+        self.geometry: Geometry = MixedGeometry(self._surfaces)
         self._times = None
         if voxel_size is not None:
             grids = [_march(world, voxel_size, seed) for seed, world in enumerate(worlds)]
@@ -81,9 +88,7 @@ class WorldBatch:
     def without_obstacles(self) -> "WorldBatch":
         """The same volumes, starts and goals with nothing but ground, and straight ways."""
         empty = copy(self)
-        empty.geometry = ShapeGeometry(
-            [[s for s in shapes if isinstance(s, HalfSpace)] for shapes in self._shapes]
-        )
+        empty.geometry = ShapeGeometry([_ground(surfaces) for surfaces in self._surfaces])
         empty._times = None
         return empty
 
@@ -107,6 +112,12 @@ class WorldBatch:
         return self._distances.interpolate(p_WQ, world)[0]
 
 
+def _ground(surfaces: Sequence[Shape] | Esdf) -> list[Shape]:
+    if isinstance(surfaces, Esdf):
+        return [HalfSpace([0.0, 0.0, 1.0], float(surfaces.lower_W[2]))]
+    return [shape for shape in surfaces if isinstance(shape, HalfSpace)]
+
+
 class _Arrival(NamedTuple):
     esdf: Esdf  # conservative
     toa: TimeOfArrival
@@ -115,7 +126,9 @@ class _Arrival(NamedTuple):
 
 def _march(world: TrainingWorld, voxel_size: float, seed: int) -> _Arrival:
     """The time of arrival at the goal of a world, and free places from which it can be reached."""
-    field = AnalyticDistanceField(world.shapes, world.lower_W, world.upper_W)
+    field = world.surfaces
+    if not isinstance(field, Esdf):
+        field = AnalyticDistanceField(field, world.lower_W, world.upper_W)
     esdf = esdf_from_distance_field(field, voxel_size).conservative()
     toa = time_of_arrival(esdf, world.p_WG)
     roomy = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
