@@ -12,6 +12,7 @@ from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.forest.forest import forest_blueprint
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
+from splatpilot.diagrams.worlds.office import OfficeConfig, office_blueprint
 from splatpilot.diagrams.worlds.over_under import OverUnderConfig, over_under_blueprint
 from splatpilot.diagrams.worlds.room import RoomConfig, room_blueprint
 from splatpilot.diagrams.worlds.scene import SceneConfig, read_scene_world
@@ -118,6 +119,7 @@ register_world(BranchesConfig, make_blueprint=branches_blueprint)
 register_world(ClutterConfig, make_blueprint=clutter_blueprint)
 register_world(WallsConfig, make_blueprint=walls_blueprint)
 register_world(RoomConfig, make_blueprint=room_blueprint)
+register_world(OfficeConfig, make_blueprint=office_blueprint)
 register_world(OverUnderConfig, make_blueprint=over_under_blueprint)
 register_world(SceneConfig, read_scene_world)
 register_world(InsertedConfig, inserted_world)
