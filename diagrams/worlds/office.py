@@ -59,7 +59,7 @@ class OfficeConfig:
         check_ground(self)
         check_count(self, "items")
         check_range(self, "door_min", "door_max")
-        check_size(self, "office", 6, 4, 2.4)
+        check_size(self, "floor", 6, 4, 2.4)
         if self.door_min < PASSAGE:
             raise ValueError(
                 f"door_min = {self.door_min} m must be at least {PASSAGE:.2f} m, for the vehicle"

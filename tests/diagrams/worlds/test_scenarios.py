@@ -13,6 +13,7 @@ from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
 from splatpilot.diagrams.worlds.inserted import GAP, InsertedConfig
 from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, voxel_gaussians
+from splatpilot.diagrams.worlds.office import OfficeConfig
 from splatpilot.diagrams.worlds.over_under import OverUnderConfig
 from splatpilot.diagrams.worlds.room import RoomConfig
 from splatpilot.diagrams.worlds.scene import SceneConfig, find_scene
@@ -145,6 +146,11 @@ def test_what_is_drawn_is_where_it_is_hit():
         (ClutterConfig(spheres=-1), "spheres = -1 must be 0 to 1000"),
         (ClutterConfig(half_min=2.0), "half_min = 2.0 and half_max = 0.9 m"),
         (RoomConfig(height=1.0), "a room of 12 x 10 x 1 m is too small"),
+        (OfficeConfig(width=3.0), "a floor of 22 x 3 x 3 m is too small"),
+        (OfficeConfig(door_min=0.7), "door_min = 0.7 m must be at least 0.81 m"),
+        (OfficeConfig(door_height=3.1), "door_height = 3.1 m must be .* to height = 3 m"),
+        (OfficeConfig(room=2.0), "room = 2.0 m must be 2.1 m, for a door"),
+        (OfficeConfig(second_doors=1.5), "second_doors = 1.5 must be 0 to 1"),
         (OverUnderConfig(over=5.5), "over = 5.5 m must be at most height"),
         (OverUnderConfig(barriers=30), "barriers = 30 must be 1 to 50 and need a length"),
         (InsertedConfig(), "world.path is empty"),

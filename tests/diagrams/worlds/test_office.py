@@ -1,0 +1,77 @@
+"""Floors of rooms: what divides them, and that every room can be reached."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import label
+
+from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
+from splatpilot.diagrams.worlds.office import PARTITION, OfficeConfig, office_blueprint
+from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+
+EMPTY = OfficeConfig(items=0)
+
+
+def plan(blueprint: Blueprint, z: float, step: float = 0.05) -> np.ndarray:
+    """Distances (nx, ny) [m] on a level plane to everything but signs."""
+    shapes = [solid.shape for solid in blueprint.solids if solid.material != "signage"]
+    field = AnalyticDistanceField(shapes, blueprint.lower_W, blueprint.upper_W)
+    x, y = (
+        np.arange(low + step / 2, high, step)
+        for low, high in zip(blueprint.lower_W[:2], blueprint.upper_W[:2], strict=True)
+    )
+    p = np.stack(np.meshgrid(x, y, [z], indexing="ij"), axis=-1)
+    return field.distance(p.reshape(-1, 3)).reshape(len(x), len(y))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_room_has_a_door_that_the_vehicle_passes(seed):
+    """Without furniture, where a vehicle finds room it comes to from anywhere else, at the height
+    of doors; above the doors there are fewer ways, or as many where all reach the ceiling."""
+    blueprint = office_blueprint(EMPTY, seed)
+    free = plan(blueprint, 1.2) > VEHICLE_RADIUS
+    count = np.asarray(label(free)[0]).max()
+    assert count == 1 and free.mean() > 0.4
+    assert np.asarray(label(plan(blueprint, 2.55) > VEHICLE_RADIUS)[0]).max() >= count
+
+
+def test_rooms_and_doors_have_the_sizes_asked_for():
+    """Straight lines through the floor meet walls of the thickness of partitions, no nearer to
+    one another than rooms are wide, and nowhere gaps of less than a door."""
+    config = replace(EMPTY, second_doors=1.0)
+    gaps = []
+    for seed in range(3):
+        walls = plan(office_blueprint(config, seed), 1.2, 0.02) < 0.0
+        for lines in (walls, walls.T):
+            for line in lines[:: len(lines) // 80]:
+                edges = np.flatnonzero(np.diff(np.concatenate([[1], line, [1]]).astype(int)))
+                gaps += [0.02 * (b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    gaps = np.array(gaps)
+    doors = gaps[gaps < config.room - PARTITION - 0.1]
+    assert doors.min() >= config.door_min - 0.05
+    assert np.quantile(doors, 0.9) <= config.door_max + 0.05  # two doors in line look wider
+    assert len(gaps) - len(doors) > 100
+
+
+def test_ends_are_at_both_ends_and_the_way_leads_through_doors():
+    """Start and goal lie in rooms at the two ends; most ways are longer than the straight one."""
+    detours = []
+    for seed in range(8):
+        blueprint = office_blueprint(OfficeConfig(), seed)
+        field, ends = blueprint.distance_field, np.stack([blueprint.p_WS, blueprint.p_WG])
+        assert field.distance(ends).min() >= CLEARANCE
+        assert ends[1, 0] - ends[0, 0] > 8.0
+        line = np.linspace(*ends, 200)
+        detours.append(field.distance(line).min() < VEHICLE_RADIUS)
+        assert seed > 0 or connects(field, *ends, VEHICLE_RADIUS, 0.12)
+    assert sum(detours) >= 7
+
+
+def test_same_seed_same_floor():
+    """The same seed gives the same bits, another another floor."""
+    one, again, other = (plan(office_blueprint(OfficeConfig(), seed), 1.2) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, again)
+    assert np.abs(one - other).max() > 0.5

@@ -1,0 +1,143 @@
+"""Which worlds policies train in, and that captured places are worlds among the others."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.scene import SceneConfig
+from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import Capsule, HalfSpace
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
+from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.ray_casting import EsdfGeometry, PixelRays
+from splatpilot.training.policies.training_worlds import (
+    WorldSelection,
+    make_training_world,
+    training_worlds,
+    validation_worlds,
+)
+
+UPPER = np.array([12.0, 7.0, 4.0])
+
+
+def write_place(folder: Path) -> str:
+    """A captured yard with a post in it."""
+    shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
+    esdf = esdf_from_distance_field(AnalyticDistanceField(shapes, np.zeros(3), UPPER), 0.2)
+    one = np.ones((1, 3))
+    world = World(
+        name=folder.name,
+        gaussians=GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one),
+        distance_field=esdf,
+        esdf=esdf,
+        background=(0.0, 0.0, 0.0),
+        p_WS=np.ones(3),
+        p_WG=2 * np.ones(3),
+    )
+    write_scene_folder(folder, world, provenance="a test")
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory) -> str:
+    return write_place(tmp_path_factory.mktemp("places") / "yard")
+
+
+def selection(yard: str, **fields) -> WorldSelection:
+    return WorldSelection(kinds=["P02"], scenes=[yard], count=4, held_out=2, **fields)
+
+
+def field_of(yard: str) -> Esdf:
+    return make_world(SceneConfig(path=yard), seed=0).esdf
+
+
+def test_kinds_and_places_come_in_turn(yard):
+    """Every other world is the scenario's own of its seed, the rest are flights through the place:
+    each from another start to another goal, clear of everything, also those held out."""
+    worlds = training_worlds(selection(yard, voxel_size=0.5), seed=3)
+    held_out = validation_worlds(selection(yard))
+    for batch, number, seed in ((worlds, 2, 1_003_002), (held_out, 0, 2_000_000)):
+        generated = make_training_world("P02", seed)
+        np.testing.assert_allclose(batch.p_WS[number], generated.p_WS, rtol=1e-6)
+        np.testing.assert_allclose(batch.p_WG[number], generated.p_WG, rtol=1e-6)
+    np.testing.assert_allclose(worlds.upper_W[1::2], [UPPER] * 2, atol=1e-5)
+    ends = torch.cat([b.p_WS[1::2] for b in (worlds, held_out)]).numpy()
+    goals = torch.cat([b.p_WG[1::2] for b in (worlds, held_out)]).numpy()
+    assert len(np.unique(ends.round(3), axis=0)) == len(ends) == 3
+    assert (np.linalg.norm(goals - ends, axis=1) > 3.0).all()
+    field = field_of(yard)
+    assert (field.distance(np.concatenate([ends, goals]).astype(float)) > VEHICLE_RADIUS).all()
+
+
+def test_what_is_seen_in_places_is_their_distance_field(yard):
+    """Images and distances are those of the place's field alone, where all unknown is full, bit for
+    bit, in a batch with generated worlds."""
+    worlds = training_worlds(selection(yard, voxel_size=0.5), seed=0)
+    alone = EsdfGeometry([field_of(yard).conservative()])
+    rays = PixelRays.of(16, 9, 90.0)
+    p = torch.tensor([[2.0, 3.0, 1.5], [3.0, 2.0, 1.0], [9.0, 4.0, 2.0], [2.0, 3.5, 2.0]])
+    R = torch.tensor([[[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]]).expand(4, 3, 3)
+    world, first = torch.tensor([1, 0, 3, 1]), torch.zeros(4, dtype=torch.long)
+    depth = worlds.geometry.depth(p, R, rays, world)
+    distances, normals = worlds.geometry.nearest(p, world, 4)
+    expected = alone.depth(p, R, rays, first)
+    nearest, gradients = alone.nearest(p, first, 1)
+    for n in (0, 2, 3):
+        assert torch.equal(depth[n], expected[n])
+        assert distances[n].tolist() == [nearest[n, 0].item(), *[torch.inf] * 3]
+        assert torch.equal(normals[n, 0], gradients[n, 0]) and not normals[n, 1:].any()
+    assert not torch.equal(depth[1], expected[1])
+    assert distances[1].isfinite().all()  # a forest has more than four trees
+
+
+def test_ways_in_places_lead_around_what_stands_there(yard):
+    """Steps down the time of arrival reach the goal behind the post, and never the post."""
+    worlds = training_worlds(selection(yard), seed=0)
+    p, world = torch.tensor([[3.0, 3.5, 1.5]]), torch.tensor([1])
+    field = field_of(yard)
+    for _ in range(300):
+        p = p + 0.05 * worlds.way(p, world)
+        assert field.distance(p[0].double().numpy()) > 0.2
+    assert (p - worlds.p_WG[1]).norm() < 0.2
+
+
+def test_policies_learn_in_places(yard):
+    """Gradients of rollouts through a place are finite, and those of an empty one."""
+    worlds = training_worlds(WorldSelection(kinds=[], scenes=[yard], count=2), seed=0)
+    for batch in (worlds, worlds.without_obstacles()):
+        learner = DiffAeroLearner(DiffAeroLoss())
+        rollout = DifferentiableRollout(
+            learner,
+            batch,
+            RolloutConfig(environments=8, steps=6),
+            torch.Generator().manual_seed(0),
+        )
+        torch.stack(list(rollout.losses().values())).sum().backward()
+        gradients = [weight.grad for weight in learner.network.parameters()]
+        assert all(g is not None and g.isfinite().all() and g.any() for g in gradients)
+
+
+def test_bad_selections_are_refused(yard, tmp_path):
+    """Nothing to choose from, places that are flown in, and kinds that are captured places."""
+    WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
+    flown = write_place(tmp_path / "warehouse")
+    for fields, message in (
+        ({"kinds": []}, "worlds has neither kinds nor scenes"),
+        ({"kinds": ["R13"]}, "worlds.kinds has R13, whose world is not generated"),
+        ({"scenes": [flown]}, "the benchmark flies in warehouse"),
+        ({"scenes": [f"{yard}/gaussians.ply"]}, "is no scene folder"),
+        ({"count": 1001}, "worlds.count is 1001; it must be 1 to 1000"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            WorldSelection(**fields).validate()
+    with pytest.raises(FileNotFoundError, match="there is no such scene"):
+        WorldSelection(scenes=["nowhere"]).validate()
