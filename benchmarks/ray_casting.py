@@ -20,6 +20,7 @@ from harness import header, machine, row
 from torch import Tensor
 from torch_geometry import TorchGeometry
 
+from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.systems.seeds import first_training_seed
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.differentiable_rollout import (
@@ -32,10 +33,10 @@ from splatpilot.training.policies.ray_casting import Geometry
 from splatpilot.training.policies.train import step_optimizer
 from splatpilot.training.policies.training_worlds import (
     WorldSelection,
-    make_training_world,
     training_worlds,
 )
 from splatpilot.training.policies.world_batch import WorldBatch
+from splatpilot.training.world_kinds import world_of
 
 COUNT = 16
 WORLDS = {"forests": ["P02", "P03"], "walls": ["P06", "P09"], "rooms": ["P04", "P05"]}
@@ -55,14 +56,15 @@ def in_turns(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, f
 
 def with_torch(worlds: WorldBatch, kinds: list[str]) -> WorldBatch:
     """The same worlds with casting in torch."""
-    made = [
-        make_training_world(kinds[i % len(kinds)], first_training_seed(0) + i) for i in range(COUNT)
+    plans = [
+        make_blueprint(world_of(kinds[i % len(kinds)]), first_training_seed(0) + i)
+        for i in range(COUNT)
     ]
     other = copy(worlds)
     other.geometry = TorchGeometry(
-        [world.shapes for world in made],
-        np.array([world.lower_W for world in made]),
-        np.array([world.upper_W for world in made]),
+        [[solid.shape for solid in plan.solids] for plan in plans],
+        np.array([plan.lower_W for plan in plans]),
+        np.array([plan.upper_W for plan in plans]),
     )
     return other
 
