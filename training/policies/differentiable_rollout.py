@@ -43,7 +43,8 @@ class Transitions(NamedTuple):
     v_target: Tensor  # (M, 3) [m/s], along the way to the goal
     a: Tensor  # (M, 3) [m/s^2]
     jerk: Tensor  # (M, 3) [m/s^3]
-    clearance: Tensor  # (M, K) [m], beyond the vehicle's radius, of the K <= 4 nearest obstacles
+    # (M, K) [m], beyond the vehicle's radius, of the lid of the volume and the nearest obstacles
+    clearance: Tensor
     approach: Tensor  # (M, K) [m/s], velocity towards them
     heading: Tensor | None  # (M,) [rad], asked for
 
@@ -235,6 +236,10 @@ class DifferentiableRollout:
         everyone = torch.arange(len(world), device=world.device).repeat(config.steps)
         world, p_WG, speed = world[everyone], p_WG[everyone], speed[everyone]
         clearance, approach = _obstacles(worlds.geometry, p, v, world)
+        # Vehicles keep clear of the lid of the volume, which images of an open world do not show.
+        under_lid = worlds.upper_W[world, 2] - VEHICLE_RADIUS - p[:, 2]
+        clearance = torch.cat([clearance, under_lid[:, None]], 1)
+        approach = torch.cat([approach, v[:, 2:]], 1)
         with torch.no_grad():
             v_target = worlds.way(p, world) * torch.minimum(speed, (p_WG - p).norm(dim=1))[:, None]
         transitions = Transitions(
