@@ -43,7 +43,7 @@ class Transitions(NamedTuple):
     v_target: Tensor  # (M, 3) [m/s], along the way to the goal
     a: Tensor  # (M, 3) [m/s^2]
     jerk: Tensor  # (M, 3) [m/s^3]
-    # (M, K) [m], beyond the vehicle's radius, of the lid of the volume and the nearest obstacles
+    # (M, K) [m], beyond the vehicle's radius, of the nearest obstacles and last the volume's lid
     clearance: Tensor
     approach: Tensor  # (M, K) [m/s], velocity towards them
     heading: Tensor | None  # (M,) [rad], asked for
