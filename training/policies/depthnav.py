@@ -47,8 +47,8 @@ class DepthNavLoss:
     velocity: float = 4.0
     # [-] Velocity towards the nearest obstacle times max(0, 1 - d)², d [m], and its nearness.
     collision: float = 6.0
-    # [m/s] Of that, times ln(1 + exp(-6 d)): what nearness costs, however one moves. With the 2.5 of
-    # the publication slits are never flown through.
+    # [m/s] Of that, times ln(1 + exp(-6 d)): what nearness costs, however one moves. With the 2.5
+    # of the publication slits are never flown through.
     nearness: float = 0.5
     # [s^4/m^2] Square of the acceleration.
     acceleration: float = 0.01
