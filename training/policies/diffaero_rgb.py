@@ -71,6 +71,8 @@ class DiffAeroRgbTraining:
     bfloat16: bool = False
     # File of DiffAero's weights, which decide; those that ship where left empty.
     policy: str = ""
+    # File of this policy's weights, whose sight is trained further; from nothing where left empty.
+    begin: str = ""
     # How far images are relit.
     appearance: Appearance = field(default_factory=Appearance)
     # What the images are disturbed by.
@@ -109,6 +111,8 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         require_view(self._data.camera.width, self._data.camera.height)
         self.network = DiffAeroRgbModule().to(config.device)
         self.network.load_policy(config.policy)
+        if config.begin:
+            self.network.load_sight(config.begin)
         self._rays_B = torch.from_numpy(rays_B()).flatten(0, 1).to(config.device)
         self._targets = torch.from_numpy(self._nearest()).to(config.device)
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
@@ -252,6 +256,17 @@ class DiffAeroRgbModule(nn.Module):
         checkpoint = PolicyCheckpoint.load(weights, "diffaero", DIFFAERO_NETWORK)
         self.policy.load_state_dict(
             {name: torch.from_numpy(values) for name, values in checkpoint.weights.items()}
+        )
+
+    def load_sight(self, weights: str) -> None:
+        """Has it see as the `diffaero_rgb` of a file of weights."""
+        checkpoint = PolicyCheckpoint.load(weights, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
+        self.monocular.load_state_dict(
+            {
+                name.removeprefix("monocular."): torch.from_numpy(values)
+                for name, values in checkpoint.weights.items()
+                if name.startswith("monocular.")
+            }
         )
 
 

@@ -55,7 +55,7 @@ lower penalty, of error and clearance."""
         self._config = config
         self.policy = f"student_{config.observation}"
         corpora = [Corpus(Path(path)) for path in config.corpora]
-        self._data = StudentData(corpora, config.held_out, config.device)
+        self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
         camera = self._data.camera
         self.spec = StudentSpec(config.observation, camera.width, camera.height, camera.fov_x)
         self.network = StudentModule(self.spec)

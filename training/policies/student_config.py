@@ -35,6 +35,8 @@ class StudentTraining:
     corpora: list[str] = field(default_factory=lambda: ["out/corpus"])
     # [-] Part of the corpora's worlds, by name, that choose among checkpoints instead.
     held_out: float = 0.1
+    # [-] Worlds that are trained in, of those that are left; all of them where 0.
+    worlds: int = 0
     # [-] Held-out samples that are looked at, evenly spaced.
     validation_samples: int = 2000
     schedule: Schedule = field(
@@ -74,6 +76,8 @@ class StudentTraining:
         self.schedule.validate()
         if not self.corpora:
             raise ValueError("corpora is empty; name one or more folders of corpora")
+        if self.worlds < 0:
+            raise ValueError(f"worlds is {self.worlds}; it must be at least 0, which is all")
         for name, limit in (("held_out", 0.9), ("epsilon", 0.5)):
             value = getattr(self, name)
             if not 0.0 <= value <= limit:

@@ -1,6 +1,6 @@
 """What the student learns from: samples of several corpora, and the distances in their worlds."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from typing import NamedTuple
@@ -33,12 +33,15 @@ class StudentData:
         held_out: part of the worlds whose samples are not trained with. Which they are their names
             decide, so that samples gathered in them later stay on the same side.
         device: where labels live; images stay on disk.
+        worlds: how many of the others are trained in, all if 0. More of them are the same and more.
 
     Raises:
         ValueError: if the corpora's samples differ in kind, or too few worlds are left to train in.
     """
 
-    def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
+    def __init__(
+        self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu", worlds: int = 0
+    ) -> None:
         configs = [corpus.config for corpus in corpora]
         self.camera = configs[0].camera
         for config in configs:
@@ -49,10 +52,18 @@ class StudentData:
                     "gather them alike"
                 )
         records = {world.name: world for corpus in reversed(corpora) for world in corpus.worlds}
-        self.worlds = sorted(records)
+        self.held_out_worlds = held_out_names(list(records), held_out)
+        others = _ranked(records.keys() - set(self.held_out_worlds))
+        if worlds > len(others):
+            raise ValueError(
+                f"worlds is {worlds}, but of the corpora's {len(records)} worlds {len(others)} are "
+                "left to train in; gather in more worlds, or say fewer"
+            )
+        self.worlds = sorted([*self.held_out_worlds, *others[: worlds or None]])
         """Names."""
-        self.held_out_worlds = held_out_names(self.worlds, held_out)
-        self.shards = [shard for corpus in corpora for shard in corpus.shards if len(shard)]
+        chosen = set(self.worlds)
+        shards = [shard for corpus in corpora for shard in corpus.shards if len(shard)]
+        self.shards = [shard for shard in shards if shard.world in chosen]
         """Blocks of samples, which are numbered through them."""
         counts = [len(shard) for shard in self.shards]
         self.first = np.cumsum([0, *counts])
@@ -116,8 +127,12 @@ class StudentData:
 
 def held_out_names(names: Sequence[str], share: float) -> list[str]:
     """At least one of the names, about `share` of them: those of the least digests."""
-    ranked = sorted(names, key=lambda name: blake2b(name.encode()).digest())
-    return sorted(ranked[: max(1, round(share * len(names)))])
+    return sorted(_ranked(names)[: max(1, round(share * len(names)))])
+
+
+def _ranked(names: Iterable[str]) -> list[str]:
+    """In an order that depends on nothing but themselves."""
+    return sorted(names, key=lambda name: blake2b(name.encode()).digest())
 
 
 def _trusted(esdf: Esdf) -> Esdf:

@@ -124,6 +124,23 @@ def test_it_learns_what_it_is_shown_and_flies(trained):
     assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
 
 
+def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
+    """A run that begins with weights sees as they do at first, and decides by the DiffAero that it is
+    given; a file of another policy is refused."""
+    file = trained / "diffaero_rgb.npz"
+    trainer = DiffAeroRgbTrainer(training(wide_corpus, f"begin={file}"))
+    with np.load(file) as weights:
+        for name, values in trainer.network.state_dict().items():
+            np.testing.assert_array_equal(values.numpy(), weights[name])
+    curve = list(csv.DictReader((trained / "curves.csv").open()))
+    best = max(float(row["success"]) for row in curve if row["success"])
+    assert trainer.evaluate()["success"] == pytest.approx(best, abs=1e-6)
+    other = tmp_path / "diffaero.npz"
+    PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).save(other)
+    with pytest.raises(ValueError, match="holds weights of the policy 'diffaero'"):
+        DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
+
+
 def test_interrupted_training_ends_as_whole(wide_corpus, tmp_path):
     """A run that was interrupted between two checkpoints ends with the same weights and curves, bit
     for bit."""

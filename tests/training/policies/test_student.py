@@ -142,6 +142,7 @@ def test_frozen_modules_keep_the_weights_they_began_with(student_corpus, tmp_pat
     [
         ("corpora=[]", "corpora is empty"),
         ("held_out=1", r"held_out is 1\.0; it must be 0 to 0\.9"),
+        ("worlds=-1", "worlds is -1; it must be at least 0"),
         ("frozen=20", "frozen is 20; the encoder has 0 to 19 modules"),
         ("draws=0", "draws is 0; it must be at least 1"),
         ("frozen=3", "set pretrained=true or frozen=0"),
