@@ -1,0 +1,100 @@
+"""What decides how well a student imitates: trainings that differ in some fields.
+
+    python benchmarks/imitation.py OUT student_rgb --measure CORPUS --set 'corpora=[CORPUS]' \\
+        --case 8 worlds=8 --case 32 worlds=32 --case 128 worlds=128 --seeds 0 1 2
+
+Each case is trained once for each seed, in a folder of OUT; the same command goes on where it was
+interrupted, and with more cases or seeds it adds to them. What is printed is measured on the worlds
+that the corpus of --measure holds out, whatever a case was trained on, of the same worlds: the mean
+over seeds and its 95 % interval by Student's t. Where all cases are numbers they are also drawn, in
+OUT/curve.png.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from scipy.stats import t
+
+from splatpilot.systems.configuration import load_config
+from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.policies.train import run
+
+MEASURES = "success", "clear", "error", "best_chosen"
+
+
+def measured(policy: str, overrides: list[str], corpus: str, out: Path) -> list[float]:
+    """`MEASURES` of a training, which is done if it is not yet there, on another corpus."""
+    kind = TRAINERS.find(policy)
+    config = load_config(kind.config(), overrides=overrides)
+    if not (out / "summary.json").exists():
+        run(config=config, out=out, make=kind.make)
+    trainer = kind.make(replace(config, corpora=[corpus], worlds=1))
+    with np.load(out / f"{policy}.npz") as weights:
+        state = {name: torch.from_numpy(weights[name]) for name in trainer.network.state_dict()}
+    trainer.network.load_state_dict(state)
+    found = trainer.evaluate()
+    return [found[name] for name in MEASURES]
+
+
+def half_interval(values: np.ndarray) -> np.ndarray:
+    """Of the mean over the first axis, at 95 %; infinite for one value."""
+    n = len(values)
+    if n == 1:
+        return np.full(values.shape[1:], np.inf)
+    return t.ppf(0.975, n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
+
+
+def draw(cases: list[float], means: np.ndarray, halves: np.ndarray, path: Path) -> None:
+    """Success over the cases, with intervals."""
+    figure, axes = plt.subplots(figsize=(5.0, 3.2), layout="constrained")
+    axes.errorbar(cases, 100.0 * means, 100.0 * halves, marker="o", capsize=3.0)
+    axes.set(xscale="log", xlabel="case", ylabel="success on held-out worlds [%]")
+    axes.set_xticks(cases, [f"{case:g}" for case in cases])
+    axes.minorticks_off()
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", type=Path)
+    parser.add_argument("policy")
+    parser.add_argument("--measure", required=True, metavar="CORPUS")
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
+    parser.add_argument(
+        "--case", action="append", nargs="+", required=True, metavar="NAME FIELD=VALUE"
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    args = parser.parse_args()
+    rows = {}
+    for name, *overrides in args.case:
+        rows[name] = np.array(
+            [
+                measured(
+                    args.policy,
+                    [*args.set, *overrides, f"seed={seed}"],
+                    args.measure,
+                    args.out / name / f"seed_{seed}",
+                )
+                for seed in args.seeds
+            ]
+        )
+    print("| case | " + " | ".join(MEASURES) + " |")
+    for name, values in rows.items():
+        shown = zip(values.mean(axis=0), half_interval(values), strict=True)
+        print(
+            f"| {name} | " + " | ".join(f"{mean:.3f} ± {half:.3f}" for mean, half in shown) + " |"
+        )
+    if all(name.replace(".", "", 1).isdigit() for name in rows):
+        successes = np.stack([values[:, 0] for values in rows.values()], axis=1)
+        cases = [float(name) for name in rows]
+        draw(cases, successes.mean(axis=0), half_interval(successes), args.out / "curve.png")
+
+
+if __name__ == "__main__":
+    main()
