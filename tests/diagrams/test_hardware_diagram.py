@@ -20,6 +20,8 @@ from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_trajectory_hypotheses
@@ -70,18 +72,22 @@ class Halves:
         return self.hardware.GetOutputPort("status").Eval(self.root)
 
 
+@pytest.fixture(scope="module")
+def forest():
+    """Trunks on a ground that is drawn, which policies that see were trained to fly over."""
+    return make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 0)
+
+
 @pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "diffaero", "diffaero_tof"])
-def test_the_two_halves_fly_as_the_whole(post_world, name):
+def test_the_two_halves_fly_as_the_whole(forest, name):
     """Cut in two, and with limits beyond what it does, a flight is the same but for the 6 ms of
     messages: within 10 cm after 3 s, for policies with plans, with accelerations, with velocities
     and with headings, blind and seeing."""
-    scenario = Scenario(
-        timeout=3.0, policy=policy_named(name), start=[1.0, 1.0, 2.0], goal=[9.0, 1.0, 2.0]
-    )
-    whole = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    scenario = Scenario(timeout=3.0, policy=policy_named(name))
+    whole = fly(BuildFlightDiagram(scenario, forest, camera=False), scenario, forest)
     limits = FlightLimits(max_speed=20.0, max_tilt=1.5, deceleration=100.0, min_clearance=0.0)
     config = HardwareConfig(failsafe=FailsafeConfig(limits=limits))
-    halves = Halves(scenario, post_world, config=config)
+    halves = Halves(scenario, forest, config=config)
     halves.advance_to(3.0)
     np.testing.assert_allclose(halves.state()[:3], whole.states[-1, :3], atol=0.1)
     assert np.linalg.norm(whole.states[-1, :3] - whole.states[0, :3]) > 2.0

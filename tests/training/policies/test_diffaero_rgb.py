@@ -125,8 +125,8 @@ def test_it_learns_what_it_is_shown_and_flies(trained):
 
 
 def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
-    """A run that begins with weights sees as they do at first, and decides by the DiffAero that it is
-    given; a file of another policy is refused."""
+    """A run that begins with weights sees as they do at first, and decides by the DiffAero that it
+    is given; a file of another policy is refused."""
     file = trained / "diffaero_rgb.npz"
     trainer = DiffAeroRgbTrainer(training(wide_corpus, f"begin={file}"))
     with np.load(file) as weights:

@@ -41,12 +41,10 @@ def test_fewer_worlds_are_a_part_of_more(two):
     assert len(one.worlds) == 2 and set(one.worlds) < set(whole.worlds)
     trained_in = {one.worlds[w] for w in one.labels(one.training).world}
     assert trained_in == set(one.worlds) - set(one.held_out_worlds)
-    np.testing.assert_array_equal(
-        one.labels(one.held_out).X_WB, whole.labels(whole.held_out).X_WB
-    )
+    np.testing.assert_array_equal(one.labels(one.held_out).X_WB, whole.labels(whole.held_out).X_WB)
     both = StudentData(two, 0.34, worlds=2)
     assert both.worlds == whole.worlds and len(both.training) == len(whole.training)
-    with pytest.raises(ValueError, match="worlds is 3, but .* 2 are left"):
+    with pytest.raises(ValueError, match=r"worlds is 3, but .* 2 are left"):
         StudentData(two, 0.34, worlds=3)
 
 
