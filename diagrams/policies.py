@@ -125,7 +125,6 @@ register_policy(
     DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
-# Of these no weights ship.
 for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
     register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
 

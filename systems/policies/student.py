@@ -25,7 +25,7 @@ class StudentConfig:
     """What it sees: rgb or depth."""
     rate: ClassVar[float] = RATE
 
-    # File of weights, as `splatpilot train` writes them.
+    # File of weights, as `splatpilot train` writes them; those that ship where left empty.
     weights: str = ""
     # With the size and field of view that it was trained with.
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(width=160, height=120))

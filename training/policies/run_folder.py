@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 
 from splatpilot.systems.files import written_atomically
@@ -38,8 +39,16 @@ class RunFolder:
     def write_weights(
         self, policy: str, spec: Any, network: torch.nn.Module, best: dict[str, Any]
     ) -> None:
-        """Writes `POLICY.npz`; `best` is what was measured of these weights."""
-        weights = {name: w.detach().cpu().numpy() for name, w in network.state_dict().items()}
+        """Writes `POLICY.npz`; `best` is what was measured of these weights.
+
+        They are written in single precision, or in the type that the architecture names as its
+        `weights_type`.
+        """
+        kept_as = getattr(spec, "weights_type", np.float32)
+        weights = {
+            name: w.detach().cpu().numpy().astype(kept_as)
+            for name, w in network.state_dict().items()
+        }
         provenance = {
             "command": f"splatpilot train {policy}",
             "config": self.config,

@@ -41,7 +41,7 @@ class StudentTraining:
     validation_samples: int = 2000
     schedule: Schedule = field(
         default_factory=lambda: Schedule(
-            updates=6000, validate_every=1000, checkpoint_every=500, learning_rate=3e-4, decay=0.5
+            updates=4000, validate_every=1000, checkpoint_every=500, learning_rate=3e-4, decay=0.5
         )
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
@@ -49,15 +49,18 @@ class StudentTraining:
     # File of those weights; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""
     # [-] First modules of the encoder, of 19, that keep their weights; what they make of images is
-    # computed once.
-    frozen: int = 18
+    # computed once. These 7 see edges, at an eighth of the image's size, which depth has too; what
+    # 18 see in photographs is not what keeps clear of things.
+    frozen: int = 7
     # [-] Draws of light and noise that are kept of each image, where modules are frozen; a new one
     # for each step where none are.
-    draws: int = 2
+    draws: int = 1
     # Folder that they are kept in, for other runs too.
     features: str = "out/features"
     # [-] Samples a step of the optimiser.
     batch: int = 32
+    # [-] Trajectories of a sample that vote, the cheapest first, K; all of them where 0.
+    experts: int = 0
     # [-] Part of an expert's pull that hypotheses without votes share; more of it makes all
     # hypotheses alike, none lets those that begin badly never be used.
     epsilon: float = 0.05
@@ -76,8 +79,11 @@ class StudentTraining:
         self.schedule.validate()
         if not self.corpora:
             raise ValueError("corpora is empty; name one or more folders of corpora")
-        if self.worlds < 0:
-            raise ValueError(f"worlds is {self.worlds}; it must be at least 0, which is all")
+        for name in ("worlds", "experts"):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}; it must be at least 0, which is all"
+                )
         for name, limit in (("held_out", 0.9), ("epsilon", 0.5)):
             value = getattr(self, name)
             if not 0.0 <= value <= limit:
