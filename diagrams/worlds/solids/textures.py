@@ -21,9 +21,17 @@ def hash_unit(cell: ArrayLike, seed: int = 0) -> Array:
     those of the `lowbias32` mixer).
     """
     cell = np.asarray(cell).astype(np.int64).astype(np.uint32)  # wraps negative cells
-    h = np.full(cell.shape[:-1], (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF, dtype=np.uint32)
+    h = np.full(cell.shape[:-1], _seeded(seed), dtype=np.uint32)
     for axis in range(cell.shape[-1]):
         h = _mix_bits(h ^ (cell[..., axis] * _PRIMES[axis]))
+    return _unit_of(h)
+
+
+def _seeded(seed: int) -> int:
+    return (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF
+
+
+def _unit_of(h: NDArray[np.uint32]) -> Array:
     return (h >> np.uint32(8)).astype(np.float32) * np.float32(2**-24)
 
 
@@ -40,14 +48,20 @@ def value_noise(p: ArrayLike, seed: int = 0) -> Array:
     and second derivatives vanish at the lattice.
     """
     p = np.asarray(p, dtype=np.float64)
-    cell = np.floor(p)
-    t = (p - cell).astype(np.float32)
-    fade = t * t * t * (t * (t * 6 - 15) + 10)
-    total = np.zeros(p.shape[:-1], dtype=np.float32)
-    for corner in np.ndindex(*(2,) * p.shape[-1]):
-        weight = np.where(corner, fade, 1 - fade).prod(axis=-1)
-        total += weight * hash_unit(cell + corner, seed)
-    return 2 * total - 1
+    # Of each corner of a cell `hash_unit` and the product of its fades, axis by axis, so that
+    # corners share what they have in common.
+    corners = [(np.float32(1.0), np.uint32(_seeded(seed)))]
+    for along, prime in zip(p.reshape(-1, p.shape[-1]).T, _PRIMES, strict=False):
+        cell = np.floor(along)
+        t = (along - cell).astype(np.float32)
+        fade = t * t * t * (t * (t * 6 - 15) + 10)
+        near = cell.astype(np.int64).astype(np.uint32) * prime
+        ends = (1 - fade, near), (fade, near + prime)
+        corners = [
+            (weight * part, _mix_bits(h ^ place)) for weight, h in corners for part, place in ends
+        ]
+    total = sum(weight * _unit_of(h) for weight, h in corners)
+    return (2 * total - 1).reshape(p.shape[:-1])
 
 
 def fbm(p: ArrayLike, octaves: int, seed: int = 0) -> Array:
