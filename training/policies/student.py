@@ -63,7 +63,7 @@ lower penalty, of error and clearance."""
             self.network.load_encoder(imagenet_weights(config.encoder))
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
-        self.network.to(config.device, memory_format=torch.channels_last)
+        self.network.to(config.device).to(memory_format=torch.channels_last)
         self._features = None
         if config.frozen:
             self._features = FrozenFeatures(
