@@ -136,6 +136,18 @@ class ShapeWorlds:
         Writes the distances (N, K) of the K nearest shapes and their gradients (N, K, 3).
         """
 
+class ShapeField:
+    """The distance field of analytic shapes."""
+
+    def __init__(self, *, shapes: Annotated[NDArray[numpy.float64], dict(shape=(None, 15), order='C', device='cpu', writable=False)], kinds: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)]) -> None:
+        """Rows and kinds as of `ShapeWorlds`."""
+
+    def nearest(self, *, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], shapes: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu')]) -> None:
+        """
+        Writes the least signed distances (N,) of N points, infinite where there is no shape,
+        and the shapes that have them, the first of several, -1 where there is none.
+        """
+
 class GridWorlds:
     """Regular grids of several worlds, one of each."""
 

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from splatpilot import _native
 from splatpilot.systems.collision.distance_field import FieldSample, FieldState
-from splatpilot.systems.collision.shapes import Shape, as_point
+from splatpilot.systems.collision.shapes import Shape, as_point, shape_rows
 
 
 class AnalyticDistanceField:
@@ -26,9 +27,6 @@ class AnalyticDistanceField:
             empty bounds.
     """
 
-    # Points handled at once. Points near each other share their candidates for the nearest shape.
-    _BATCH = 512
-
     def __init__(self, shapes: Sequence[Shape], lower_W: ArrayLike, upper_W: ArrayLike) -> None:
         self.lower_W = as_point(lower_W, "AnalyticDistanceField.lower_W").copy()
         self.upper_W = as_point(upper_W, "AnalyticDistanceField.upper_W").copy()
@@ -39,19 +37,18 @@ class AnalyticDistanceField:
             )
         self.shapes = tuple(shapes)
         kinds = dict.fromkeys(type(shape) for shape in self.shapes)
-        # Of each kind the shapes' parameters, stacked: arrays with a leading axis (M,).
-        self._groups = [
-            (
-                kind,
-                tuple(
-                    np.array(values)
-                    for values in zip(
-                        *(s.parameters() for s in self.shapes if type(s) is kind), strict=True
-                    )
-                ),
-            )
-            for kind in kinds
-        ]
+        # Shapes of one kind stand together: of those equally far the first is the nearest.
+        ordered = [shape for kind in kinds for shape in self.shapes if type(shape) is kind]
+        rows, numbers = shape_rows(ordered)
+        self._native = _native.ShapeField(shapes=rows, kinds=numbers)
+        # Of each kind its first shape, and the shapes' parameters, stacked: arrays with a leading
+        # axis (M,).
+        self._groups = []
+        for kind in kinds:
+            own = [shape.parameters() for shape in ordered if type(shape) is kind]
+            parameters = tuple(np.array(values) for values in zip(*own, strict=True))
+            first = next(i for i, shape in enumerate(ordered) if type(shape) is kind)
+            self._groups.append((kind, first, len(own), parameters))
 
     def distance(self, p_WQ: ArrayLike) -> np.ndarray:
         """Signed distance at the points p_WQ (..., 3) [m]: (...,) [m], NaN outside the bounds."""
@@ -75,49 +72,16 @@ class AnalyticDistanceField:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of points (N, 3): distance (N,), gradient (N, 3) (zero unless asked for), inside (N,)."""
         inside = ((p >= self.lower_W) & (p <= self.upper_W)).all(axis=1)
-        distance = np.full(len(p), np.inf)
+        distance, shape = np.empty(len(p)), np.empty(len(p), np.int64)
+        self._native.nearest(p_WQ=np.ascontiguousarray(p), distances=distance, shapes=shape)
         gradient = np.zeros_like(p)
-        for start in range(0, len(p), self._BATCH):
-            part = slice(start, start + self._BATCH)
-            self._nearest_of_batch(
-                p[part], distance[part], gradient[part] if with_gradient else None
-            )
+        if with_gradient:
+            for kind, first, count, parameters in self._groups:
+                own = np.flatnonzero((shape >= first) & (shape < first + count))
+                if len(own):
+                    nearest = shape[own] - first
+                    gradient[own] = kind.gradients(p[own], *(v[nearest] for v in parameters))
         if not inside.all():
             distance[~inside] = np.nan
             gradient[~inside] = 0.0
         return distance, gradient, inside
-
-    def _nearest_of_batch(
-        self, p: np.ndarray, distance: np.ndarray, gradient: np.ndarray | None
-    ) -> None:
-        """Fills distance (N,) and gradient (N, 3) of points (N, 3)."""
-        groups = self._groups if len(p) < 32 else self._near(p)
-        for kind, parameters in groups:
-            of_kind = kind.distances(p[:, None, :], *parameters)  # (N, M)
-            nearest = of_kind.argmin(axis=1)
-            nearest_distance = of_kind[np.arange(len(p)), nearest]
-            if gradient is None:
-                np.minimum(distance, nearest_distance, out=distance)
-                continue
-            closer = np.flatnonzero(nearest_distance < distance)
-            if len(closer):
-                own = (values[nearest[closer]] for values in parameters)
-                gradient[closer] = kind.gradients(p[closer], *own)
-                distance[closer] = nearest_distance[closer]
-
-    def _near(self, p: np.ndarray) -> list[tuple[type[Shape], tuple[np.ndarray, ...]]]:
-        """The groups with those shapes only that can be nearest to one of the points (N, 3).
-
-        Distances are 1-Lipschitz: within R of a centre c the nearest shape is at most min d(c) + R
-        away, so a shape with d(c) > min d(c) + 2 R is nowhere the nearest.
-        """
-        lower, upper = p.min(axis=0), p.max(axis=0)
-        center, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
-        at_center = [kind.distances(center, *values) for kind, values in self._groups]
-        limit = min((d.min() for d in at_center), default=0.0) + reach + 1e-9
-        near = []
-        for (kind, parameters), d in zip(self._groups, at_center, strict=True):
-            keep = ~(d > limit)  # keeps all when a point is not finite
-            if keep.any():
-                near.append((kind, tuple(values[keep] for values in parameters)))
-        return near

@@ -34,7 +34,7 @@ def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
 
 
 def cubes_of_points(
-    x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: int = 8
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: int = 16
 ) -> Iterator[tuple[tuple[slice, slice, slice], np.ndarray]]:
     """The points of the grid x (nx,), y (ny,), z (nz,) in cubes of `edge` points a side: the part
     of the grid that a cube is, and its points (n, n, n, 3).

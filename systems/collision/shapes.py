@@ -6,8 +6,9 @@ pairs (M,). `parameters()` raises ValueError on a value out of range, naming it 
 a shape's own frame.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -184,6 +185,23 @@ class HalfSpace:
 
 
 Shape = Sphere | Capsule | Cylinder | Box | HalfSpace
+
+_KINDS = {kind: number for number, kind in enumerate(get_args(Shape))}
+_ROW = 15
+"""Numbers that describe a shape, those of a box; others have zeros after their own."""
+
+
+def shape_rows(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes as native code takes them: their parameters (M, 15) and kinds (M,) uint8.
+
+    Raises:
+        ValueError: on a shape out of range.
+    """
+    rows = np.zeros((len(shapes), _ROW))
+    for row, shape in zip(rows, shapes, strict=True):
+        numbers = np.concatenate([np.ravel(number) for number in shape.parameters()])
+        row[: len(numbers)] = numbers
+    return rows, np.array([_KINDS[type(shape)] for shape in shapes], np.uint8)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

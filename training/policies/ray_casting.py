@@ -6,7 +6,7 @@ normal that is returned with it. Tensors may be on any device; what is asked is 
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol, get_args
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -14,11 +14,7 @@ from torch import Tensor
 
 from splatpilot import _native
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import Shape
-
-_KINDS = {kind: number for number, kind in enumerate(get_args(Shape))}
-_SHAPE_SIZE = 15
-"""Numbers that describe a shape, those of a box; others have zeros after their own."""
+from splatpilot.systems.collision.shapes import Shape, shape_rows
 
 
 class PixelRays(NamedTuple):
@@ -74,14 +70,10 @@ class ShapeGeometry:
     """
 
     def __init__(self, worlds: Sequence[Sequence[Shape]], threads: int = 1, simd: str = "") -> None:
-        shapes = [shape for world in worlds for shape in world]
-        rows = np.zeros((len(shapes), _SHAPE_SIZE), np.float32)
-        for row, shape in zip(rows, shapes, strict=True):
-            numbers = np.concatenate([np.ravel(number) for number in shape.parameters()])
-            row[: len(numbers)] = numbers
+        rows, kinds = shape_rows([shape for world in worlds for shape in world])
         self._native = _native.ShapeWorlds(
-            shapes=rows,
-            kinds=np.array([_KINDS[type(shape)] for shape in shapes], np.uint8),
+            shapes=rows.astype(np.float32),
+            kinds=kinds,
             first=np.cumsum([0, *map(len, worlds)]),
             threads=threads,
             simd=simd,
