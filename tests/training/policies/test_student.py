@@ -113,6 +113,20 @@ def test_interrupted_training_ends_as_whole(student_corpus, tmp_path):
     assert curves[0] == curves[1]
 
 
+def test_as_many_trajectories_vote_as_asked(student_corpus, tmp_path):
+    """The pull of a sample is the sum over those that vote: where only the cheapest does it is less
+    than half that of all three, which are much alike."""
+    pulls = []
+    for experts in (0, 1):
+        steps = ["schedule.updates=1", "schedule.validate_every=1", "schedule.checkpoint_every=1"]
+        config = training(student_corpus, "depth", *steps, f"experts={experts}")
+        out = tmp_path / str(experts)
+        run(config=config, out=out, make=TRAINERS.find("student_depth").make)
+        (row,) = csv.DictReader((out / "curves.csv").open())
+        pulls.append(float(row["winners"]))
+    assert 0.2 * pulls[0] < pulls[1] < 0.5 * pulls[0]
+
+
 def test_frozen_modules_keep_the_weights_they_began_with(student_corpus, tmp_path):
     """Of an encoder read from a file all modules but the last are, in the weights that fly, what
     they were in the file, in half precision."""
