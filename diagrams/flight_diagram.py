@@ -18,6 +18,7 @@ from splatpilot.diagrams.observation import (
 )
 from splatpilot.diagrams.pilot import AddPilot, ConnectObservation, require_ports
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.appearance import seen_otherwise
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
@@ -93,6 +94,7 @@ def BuildFlightDiagram(
             f"camera is False, but {'video' if video else 'meshcat'} shows its images; leave "
             "camera out"
         )
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
     sensors = sensors_of(scenario, policy)
     if plant is None:

@@ -11,6 +11,7 @@ from splatpilot.diagrams.flight_diagram import camera_info, camera_mount
 from splatpilot.diagrams.meshcat import open_meshcat
 from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.appearance import seen_otherwise
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -58,6 +59,7 @@ def write_flight_page(
     Raises:
         OSError: if it cannot be written.
     """
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     view = ReplayView(
         X_BC=camera_mount(scenario.camera),
@@ -89,6 +91,7 @@ def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: Wor
     Raises:
         OSError: if it cannot be written.
     """
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     start = world.p_WS if scenario.start is None else scenario.start
     highest = max(start[2], goal_of(scenario, world)[2])

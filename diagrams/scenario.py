@@ -63,6 +63,9 @@ class Scenario:
     # What is flown in: a generated world, or (!SceneConfig) a reconstructed scene, or another of
     # `make_world.py` and of other packages.
     world: WorldConfig = open_field(WORLDS, ForestConfig)
+    # [-] How much the world looks other than it is, drawn from the seed: 0 not at all, 1 all it
+    # may, in paint, light, exposure, hue and sky. Its surfaces stay where they are.
+    appearance: float = 0.0
     # [m] Start p_WS in the world frame; the world's own where left out.
     start: list[float] | None = None
     # [m] Goal p_WG in the world frame; the world's own where left out.
@@ -94,6 +97,7 @@ class Scenario:
             ValueError: naming the field, its value and its limit.
         """
         _check("seed", self.seed, self.seed >= 0, "at least 0")
+        _check("appearance", self.appearance, 0 <= self.appearance <= 1, "0 to 1")
         _check("start_radius", self.start_radius, 0 <= self.start_radius <= 1, "0 to 1 m")
         _check("goal_radius", self.goal_radius, 0 < self.goal_radius < inf, "positive")
         _check("timeout", self.timeout, 0 < self.timeout <= 3600, "more than 0, at most 3600 s")

@@ -22,6 +22,7 @@ from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.real_time import run_in_real_time
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
+from splatpilot.diagrams.worlds.appearance import seen_otherwise
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.messaging.open_lcm import open_lcm
@@ -51,6 +52,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     config.validate()
     lcm = open_lcm(config.url)
     world = make_world(scenario.world, scenario.seed)
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
     start = sample_initial_state(scenario, world)
     require_writable_folder(out)
     diagram = BuildVehicleDiagram(scenario, world, lcm, config)

@@ -53,6 +53,26 @@ def test_a_policy_needs_only_its_outputs(post_world):
     assert np.linalg.norm(flight.states[-1, :3] - [3.0, 0, 2]) < 0.3
 
 
+def test_a_world_looks_otherwise_and_is_the_same(post_world):
+    """With another appearance colours are others, those of the seed, and depth and flight stay."""
+
+    def seen(**fields):
+        diagram = BuildFlightDiagram(Scenario(timeout=0.5, **fields), post_world)
+        context = diagram.CreateDefaultContext()
+        return [
+            np.array(diagram.GetOutputPort(name).Eval(context).data)
+            for name in ("color_image", "depth_image_32f")
+        ]
+
+    plain, other, again = seen(), seen(appearance=1.0), seen(appearance=1.0)
+    difference = np.abs(plain[0][..., :3].astype(int) - other[0][..., :3])
+    assert difference.mean() > 5.0
+    np.testing.assert_array_equal(other[0], again[0])
+    np.testing.assert_array_equal(plain[1], other[1])
+    flights = [flown(Scenario(timeout=0.5, appearance=x), post_world) for x in (0.0, 1.0)]
+    np.testing.assert_array_equal(flights[0].states, flights[1].states)
+
+
 def test_systems_without_the_ports_they_need_are_named(post_world):
     """A policy without outputs or with an input that nothing gives, and a plant that is none, are
     errors that name the port."""

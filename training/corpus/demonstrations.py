@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 from splatpilot.diagrams.sensors import make_camera
+from splatpilot.diagrams.worlds.appearance import draw_appearance, with_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.splats.drake_images import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.corpus.appearance import draw_appearance, with_appearance
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.perturbation import perturbed
 from splatpilot.training.corpus.sample import Samples

@@ -26,6 +26,7 @@ _MOTTLE = 0.15  # relative, of brightness over space
 _SHORTEST, _LONGEST = 0.5, 5.0  # [m], wavelengths of the mottling
 _WAVES = 5
 _SKY = 0.7  # part of another colour in the background
+_LOOKS = 7  # tells the looks of flights from what else a flight's seed draws
 
 _GREY = np.full((3, 3), 1 / 3)
 _TURN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)  # about the axis of greys
@@ -76,6 +77,13 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
         sky=rng.uniform(0, 1, 3).astype(np.float32),
         sky_part=float(strength * rng.uniform(0, _SKY)),
     )
+
+
+def seen_otherwise(world: World, strength: float, seed: int) -> World:
+    """The world in a look of that strength, 0 to 1, drawn from the seed; itself where it is 0."""
+    if strength == 0.0:
+        return world
+    return with_appearance(world, draw_appearance(np.random.default_rng([seed, _LOOKS]), strength))
 
 
 def with_appearance(world: World, look: Appearance) -> World:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatpilot.diagrams.worlds.appearance import draw_appearance, recolored, recolored_background
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.corpus.appearance import draw_appearance, recolored, recolored_background
 
 COUNT = 200
 
