@@ -15,7 +15,8 @@ HYPOTHESES = 3
 OBSERVATIONS = "rgb", "depth"
 NEAREST, FARTHEST = 0.3, 20.0  # [m] range of depth
 WAYPOINT_SCALE = 2.0  # [m] that a waypoint of 1 at the network's output means
-STATE_SIZE = 6
+STATE_SIZE = 9
+GOAL_NEAR = 5.0  # [m] from the goal, from which on its distance is told
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class StudentNetwork:
 
         Args:
             image: (3, height, width), see `encode_color` and `encode_depth`.
-            state: (6,), see `state_observation`.
+            state: (9,), see `state_observation`.
 
         Raises:
             ValueError: if the image has another shape.
@@ -140,11 +141,12 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def state_observation(X_WB: RigidTransform, v_WB: np.ndarray, p_WG: np.ndarray) -> np.ndarray:
-    """(6,): velocity [m/s] and direction to the goal, in the body frame."""
+    """(9,), in the body frame: velocity [m/s], the vector to the goal, of length 1 beyond
+    `GOAL_NEAR` and in proportion nearer, and the unit vector upwards."""
     R_WB = X_WB.rotation().matrix()
     to_goal = p_WG - X_WB.translation()
-    rows = np.stack([v_WB, to_goal / max(float(np.linalg.norm(to_goal)), 1e-6)])
-    return (rows @ R_WB).ravel()
+    towards = to_goal / max(float(np.linalg.norm(to_goal)), GOAL_NEAR)
+    return (np.stack([v_WB, towards, [0.0, 0.0, 1.0]]) @ R_WB).ravel()
 
 
 def plan(

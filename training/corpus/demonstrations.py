@@ -81,8 +81,7 @@ def see_states(
             samples.depth[row] = ranged_depth(view.depth, optics.min_depth, optics.max_depth)
             samples.X_WB[row] = *X_WP.rotation().ToQuaternion().wxyz(), *p_WP
             samples.v_B[row] = R_PW @ v_WB
-            to_goal = R_PW @ (labeller.toa.p_WG - p_WP)
-            samples.goal_B[row] = to_goal / max(np.linalg.norm(to_goal), 1e-9)
+            samples.goal_B[row] = R_PW @ (labeller.toa.p_WG - p_WP)
             samples.trajectories_B[row] = (waypoints_W - p_WP) @ R_PW.T
             row += 1
     return samples

@@ -49,7 +49,7 @@ class Samples:
     depth: np.ndarray  # (N, H, W) float16 [m], planar z; 0: too near, inf: nothing within range
     X_WB: np.ndarray  # (N, 7) float64, quaternion wxyz and position [m]
     v_B: np.ndarray  # (N, 3) float32 [m/s]
-    goal_B: np.ndarray  # (N, 3) float32, unit vector to the goal
+    goal_B: np.ndarray  # (N, 3) float32 [m], p_BG_B, from the body to the goal
     # (N, K, 10, 3) float32 [m], waypoints at 0.1 s to 1.0 s, cheapest first; NaN where there are
     # fewer than K.
     trajectories_B: np.ndarray

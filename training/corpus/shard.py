@@ -20,7 +20,7 @@ import numpy as np
 from splatpilot.systems.files import folder_written_atomically
 from splatpilot.training.corpus.sample import Samples
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 _ABOUT = "shard.json"
 _ARRAYS = "color.npy", "depth.npy", "labels.npy"

@@ -5,7 +5,9 @@ encode velocity and direction to the goal in the body frame; one linear layer ma
 hypotheses of ten waypoints at 0.1 s with a cost each. Relaxed winner-takes-all; costs of what was
 predicted, by error and by the clearance of its own way (equation 4).
 
-Chosen here, where the paper is silent: the encoder's 4x5 cells are kept apart, at 64 numbers each,
+Chosen here, where the paper is silent: the vector to the goal is of length 1 beyond 5 m and shrinks
+to nothing at the goal, as whoever knows its direction alone flies by or circles it; beside it stands
+which way is up, without which heights drift by metres. The encoder's 4x5 cells are kept apart, at 64 numbers each,
 which are as many as the average over all cells has at 1280; depth is encoded by its logarithm, as a
 grey image; the barrier is integrated over the second that is predicted.
 """
@@ -35,7 +37,8 @@ from splatpilot.training.policies.student_loss import (
     root_mean_square,
     winners,
 )
-from splatpilot.training.policies.student_network import StudentModule
+from splatpilot.training.policies.student_network import StudentModule, encode_state
+from splatpilot.training.policies.vehicles import rotation_matrix
 
 _CLOSE = 0.25
 """[m] Root mean square distance from an expert's trajectory within which one is as good."""
@@ -136,7 +139,7 @@ lower penalty, of error and clearance."""
     def _judge(self, numbers: np.ndarray, images: Tensor) -> "_Judged":
         """What the network makes of samples, against their experts and their worlds."""
         config, labels = self._config, self._data.labels(numbers)
-        state = torch.cat([labels.v_B, labels.goal_B], 1)
+        state = encode_state(rotation_matrix(labels.X_WB[:, :4]), labels.v_B, labels.goal_B)
         waypoints, costs = self.network(images, state, config.frozen)
         distances = self._data.distance_along(waypoints, labels)
         experts = labels.trajectories_B[:, : config.experts or None]

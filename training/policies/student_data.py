@@ -20,7 +20,7 @@ class Labels(NamedTuple):
 
     X_WB: Tensor  # (N, 7) quaternion wxyz and position [m]
     v_B: Tensor  # (N, 3) [m/s]
-    goal_B: Tensor  # (N, 3)
+    goal_B: Tensor  # (N, 3) [m]
     trajectories_B: Tensor  # (N, K, 10, 3) [m]
     world: Tensor  # (N,) int64, index into `StudentData.worlds`
 

@@ -10,6 +10,7 @@ from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.mobilenet import CHANNELS, adds_input, mobilenet_blocks
 from splatpilot.systems.policies.student_inference import (
     FARTHEST,
+    GOAL_NEAR,
     HYPOTHESES,
     NEAREST,
     STATE_SIZE,
@@ -65,7 +66,7 @@ class StudentModule(nn.Module):
 
         Args:
             image: (N, 3, height, width), or what the `first` modules of the encoder made of it.
-            state: (N, 6).
+            state: (N, 9), see `encode_state`.
             first: module of the encoder that takes `image`.
         """
         features = self.features[first:](image).flatten(2).mT  # (N, cells, CHANNELS)
@@ -85,6 +86,13 @@ class _Bias(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.bias[:, None, None]
+
+
+def encode_state(R_WB: Tensor, v_B: Tensor, goal_B: Tensor) -> Tensor:
+    """What the network is told (N, 9), see `student_inference`: of attitudes (N, 3, 3), velocities
+    (N, 3) [m/s] and vectors to the goal (N, 3) [m]."""
+    towards = goal_B / goal_B.norm(dim=1, keepdim=True).clamp(min=GOAL_NEAR)
+    return torch.cat([v_B, towards, R_WB[:, 2]], 1)
 
 
 def encode_color(color: Tensor) -> Tensor:

@@ -97,7 +97,7 @@ def test_other_versions_are_refused(tmp_path):
     path = write(tmp_path / "a", random_samples(1))
     about = json.loads((path / "shard.json").read_text())
     (path / "shard.json").write_text(json.dumps(about | {"format_version": 7}))
-    with pytest.raises(ValueError, match="format version 7, this program knows 1"):
+    with pytest.raises(ValueError, match="format version 7, this program knows 2"):
         Shard(path)
     (path / "shard.json").write_text(json.dumps(about)[:40])
     with pytest.raises(ValueError, match="describes no shard"):

@@ -97,7 +97,6 @@ def _seen(rows: list, shapes: list[Shape], config: CorpusConfig) -> Samples:
         samples.color[n] = 255.0 * np.stack([near, 0.0 * near, 1.0 - near], 2)
         samples.X_WB[n] = *q_WB, *p_WB
         samples.v_B[n] = v_WB @ R_WB
-        to_goal = (P_WG - p_WB) @ R_WB
-        samples.goal_B[n] = to_goal / np.linalg.norm(to_goal)
+        samples.goal_B[n] = (P_WG - p_WB) @ R_WB
         samples.trajectories_B[n] = waypoints_B
     return samples

@@ -9,10 +9,15 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.mobilenet import mobilenet_shapes
-from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.policies.student_inference import (
+    STATE_SIZE,
+    StudentNetwork,
+    StudentSpec,
+    plan,
+)
 from splatpilot.training.policies.pretrained import IN_DATA, imagenet_weights
 from splatpilot.training.policies.student_images import clean_images
-from splatpilot.training.policies.student_network import StudentModule
+from splatpilot.training.policies.student_network import StudentModule, encode_state
 
 
 def disturbed(module: StudentModule) -> StudentModule:
@@ -26,7 +31,8 @@ def disturbed(module: StudentModule) -> StudentModule:
 
 @pytest.mark.parametrize("observation", ["rgb", "depth"])
 @pytest.mark.parametrize("size", [(64, 48), (80, 70)])
-def test_what_flies_is_what_was_trained(observation, size):
+@pytest.mark.parametrize("p_WG", [[9.0, 2.0, 1.5], [1.0, -2.0, 0.5]])
+def test_what_flies_is_what_was_trained(observation, size, p_WG):
     """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
     that the module in torch makes of what a corpus would hold of them; whole cells or not."""
     torch.manual_seed(0)
@@ -39,14 +45,14 @@ def test_what_flies_is_what_was_trained(observation, size):
     depth = rng.uniform(0.2, 25.0, (size[1], size[0])).astype(np.float16).astype(np.float32)
     depth[0, 0], depth[1, 1] = 0.0, np.inf
     rotation, p_WB, v_WB = RollPitchYaw(0.3, -0.2, 2.0), rng.normal(size=3), rng.normal(size=3)
-    X_WB, p_WG = RigidTransform(rotation, p_WB), np.array([9.0, 2.0, 1.5])
-    R_BW = X_WB.rotation().matrix().T
-    to_goal = R_BW @ (p_WG - p_WB)
-    state = torch.tensor(np.concatenate([R_BW @ v_WB, to_goal / np.linalg.norm(to_goal)]))
+    X_WB, p_WG = RigidTransform(rotation, p_WB), np.array(p_WG)
+    R_WB = X_WB.rotation().matrix()
+    labels = (R_WB, R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB))
+    state = encode_state(*(torch.tensor(x).float()[None] for x in labels))
 
     image = color if observation == "rgb" else depth
     with torch.no_grad():
-        expected = module(clean_images(image[None]), state.float()[None])
+        expected = module(clean_images(image[None]), state)
     found = plan(StudentNetwork(spec, weights), 0.5, image, X_WB, v_WB, p_WG)
     np.testing.assert_allclose(found.waypoints_B, expected[0][0], atol=1e-4)
     np.testing.assert_allclose(found.costs, expected[1][0], atol=1e-4)
@@ -77,7 +83,7 @@ def test_frozen_modules_and_modules_in_parts():
     gradient, the others have."""
     module = StudentModule(StudentSpec("depth", 64, 48))
     module.freeze(14)
-    image, state = torch.randn(2, 3, 48, 64), torch.randn(2, 6)
+    image, state = torch.randn(2, 3, 48, 64), torch.randn(2, STATE_SIZE)
     whole = module(image, state)
     parts = module(module.features[:14](image), state, first=14)
     assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
