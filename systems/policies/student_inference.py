@@ -16,7 +16,7 @@ OBSERVATIONS = "rgb", "depth"
 NEAREST, FARTHEST = 0.3, 20.0  # [m] range of depth
 WAYPOINT_SCALE = 2.0  # [m] that a waypoint of 1 at the network's output means
 STATE_SIZE = 9
-GOAL_NEAR = 5.0  # [m] from the goal, from which on its distance is told
+GOAL_NEAR = 3.0  # [m] from the goal, where the expert slows and its distance is told
 
 
 @dataclass(frozen=True)

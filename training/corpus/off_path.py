@@ -1,7 +1,8 @@
 """States that no good flight comes to: anywhere in free space, half of them before a surface.
 
 An expert keeps clear of everything, so what it sees is never near and straight ahead; whoever
-learns to judge distances from its flights alone does not know what is.
+learns to judge distances from its flights alone does not know what is. Nor does it ever stand a few
+metres from its goal; whoever learns from its flights alone stops there, and stays.
 """
 
 import numpy as np
@@ -18,6 +19,7 @@ STATES_A_LOOK = 60
 _ROOM = 0.05  # [m], least clearance
 _BEFORE = 1.0  # [m], greatest clearance before a surface
 _UPRIGHT = 0.5  # [-], least horizontal part of its normal
+_ARRIVING = 4.0  # [m], greatest distance from the goal of those that are near it
 _CANDIDATES = 8  # for each state
 _TURN = 0.6  # [rad], standard deviation of the yaw about the way, or about the nearest surface
 _LEAN = 0.12  # [rad], standard deviation of roll and pitch
@@ -32,8 +34,9 @@ def draw_off_path(
     States (count, 13) from which a way leads to the goal.
 
     Half are within a metre of a surface that is not the ground's and look at it, if there are so
-    many among candidates; the others are uniform in space and look along the way. All deviate from
-    that, and fly where they look, at up to `speed` [m/s] and no faster than they can stop.
+    many among candidates; the others look along the way, half of them within 4 m of the goal and
+    half uniform in space. All deviate from that, and fly where they look, at up to `speed` [m/s]
+    and no faster than they can stop.
 
     Raises:
         InfeasibleFlightError: if no place has room.
@@ -42,11 +45,15 @@ def draw_off_path(
     cells = np.argwhere(toa.reachable & (field.distances > VEHICLE_RADIUS + _ROOM))
     if len(cells) == 0:
         raise InfeasibleFlightError("no place from which a way leads to the goal has room")
-    drawn = cells[rng.integers(len(cells), size=_CANDIDATES * count)]
-    candidates = field.lower_W + field.voxel_size * (drawn + 0.5)
+    centers = field.lower_W + field.voxel_size * (cells + 0.5)
+    close = centers[np.linalg.norm(centers - toa.p_WG, axis=1) < _ARRIVING]
+    candidates = centers[rng.integers(len(centers), size=_CANDIDATES * count)]
+    arriving = close[rng.integers(len(close), size=count // 4)] if len(close) else close
+    candidates = np.concatenate([arriving, candidates])
     seen = field.query(candidates)
     before = np.linalg.norm(seen.gradient[:, :2], axis=1) > _UPRIGHT
     before &= seen.distance < VEHICLE_RADIUS + _BEFORE
+    before[: len(arriving)] = False
     before = np.flatnonzero(before)[: count // 2]
     chosen = np.concatenate([before, np.arange(count - len(before))])
     p_WB, distance = candidates[chosen], seen.distance[chosen]

@@ -5,7 +5,7 @@ encode velocity and direction to the goal in the body frame; one linear layer ma
 hypotheses of ten waypoints at 0.1 s with a cost each. Relaxed winner-takes-all; costs of what was
 predicted, by error and by the clearance of its own way (equation 4).
 
-Chosen here, where the paper is silent: the vector to the goal is of length 1 beyond 5 m and shrinks
+Chosen here, where the paper is silent: the vector to the goal is of length 1 beyond 3 m and shrinks
 to nothing at the goal, as whoever knows its direction alone circles it; beside it stands which way
 is up, without which heights drift by metres. The encoder's 4x5 cells are kept apart, at 64 numbers
 each, which are as many as the average over all cells has at 1280; depth is encoded by its

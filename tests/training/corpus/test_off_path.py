@@ -57,6 +57,7 @@ def test_half_stand_before_a_pillar_and_none_in_one():
     to_goal = P_WG[:2] - p_WB[others, :2]
     to_goal /= np.linalg.norm(to_goal, axis=1, keepdims=True)
     assert np.median((to_goal * looking[others]).sum(1)) > 0.6
+    assert 0.5 <= (np.linalg.norm(p_WB[others] - P_WG, axis=1) < 4.0).mean() < 0.8
     assert np.ptp(p_WB[others], axis=0) == pytest.approx([11.0, 7.0, 2.2], abs=1.2)
 
 
