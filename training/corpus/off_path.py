@@ -34,9 +34,9 @@ def draw_off_path(
     States (count, 13) from which a way leads to the goal.
 
     Half are within a metre of a surface that is not the ground's and look at it, if there are so
-    many among candidates; the others look along the way, half of them within 4 m of the goal and
-    half uniform in space. All deviate from that, and fly where they look, at up to `speed` [m/s]
-    and no faster than they can stop.
+    many among candidates. Of the others half are within 4 m of the goal, as many at any distance,
+    and look anywhere; half are uniform in space and look along the way. All deviate from that, and
+    fly where they look, at up to `speed` [m/s] and no faster than they can stop.
 
     Raises:
         InfeasibleFlightError: if no place has room.
@@ -46,20 +46,23 @@ def draw_off_path(
     if len(cells) == 0:
         raise InfeasibleFlightError("no place from which a way leads to the goal has room")
     centers = field.lower_W + field.voxel_size * (cells + 0.5)
-    close = centers[np.linalg.norm(centers - toa.p_WG, axis=1) < _ARRIVING]
     candidates = centers[rng.integers(len(centers), size=_CANDIDATES * count)]
-    arriving = close[rng.integers(len(close), size=count // 4)] if len(close) else close
-    candidates = np.concatenate([arriving, candidates])
+    to_goal = np.linalg.norm(centers - toa.p_WG, axis=1)
+    share = np.where(to_goal < _ARRIVING, 1.0 / np.maximum(to_goal, field.voxel_size) ** 2, 0.0)
+    near = count // 4 if share.any() else 0
+    arriving = centers[rng.choice(len(centers), near, p=share / share.sum())] if near else []
+    candidates = np.concatenate([np.reshape(arriving, (-1, 3)), candidates])
     seen = field.query(candidates)
     before = np.linalg.norm(seen.gradient[:, :2], axis=1) > _UPRIGHT
     before &= seen.distance < VEHICLE_RADIUS + _BEFORE
-    before[: len(arriving)] = False
+    before[:near] = False
     before = np.flatnonzero(before)[: count // 2]
     chosen = np.concatenate([before, np.arange(count - len(before))])
     p_WB, distance = candidates[chosen], seen.distance[chosen]
     towards = toa.gradient(p_WB)
     towards[: len(before)] = seen.gradient[before]
     yaw = np.arctan2(-towards[:, 1], -towards[:, 0]) + _TURN * rng.normal(size=count)
+    yaw[len(before) : len(before) + near] = rng.uniform(-np.pi, np.pi, near)
     roll, pitch = _LEAN * rng.normal(size=(2, count))
     fastest = np.sqrt(2.0 * _BRAKING * np.maximum(distance - VEHICLE_RADIUS, 0.0))
     ahead = np.minimum(speed, fastest) * rng.random(count)

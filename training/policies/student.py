@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student_inference import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
@@ -64,6 +65,8 @@ lower penalty, of error and clearance."""
         self.network = StudentModule(self.spec)
         if config.pretrained:
             self.network.load_encoder(imagenet_weights(config.encoder))
+        if config.begin:
+            self._load(config.begin)
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
         self.network.to(config.device).to(memory_format=torch.channels_last)
@@ -81,6 +84,13 @@ lower penalty, of error and clearance."""
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
         data, count = self._data.held_out, config.validation_samples
         self._validation = data[np.linspace(0, len(data) - 1, min(count, len(data))).astype(int)]
+
+    def _load(self, weights: str) -> None:
+        """Has the network be that of a file of weights."""
+        checkpoint = PolicyCheckpoint.load(weights, self.policy, self.spec)
+        self.network.load_state_dict(
+            {name: torch.from_numpy(w).float() for name, w in checkpoint.weights.items()}
+        )
 
     def begin_update(self, update: int) -> None:
         pass

@@ -46,7 +46,9 @@ class StudentTraining:
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
     pretrained: bool = True
-    # File of those weights; where left empty, that of the data folder or torchvision's download.
+    # File of this policy's weights, which are trained further instead; none where left empty.
+    begin: str = ""
+    # File of ImageNet's; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""
     # [-] First modules of the encoder, of 19, that keep their weights; what they make of images is
     # computed once. These 7 see edges, at an eighth of the image's size, which depth has too; what
