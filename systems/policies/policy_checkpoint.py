@@ -138,6 +138,7 @@ def check_weights(
         if name not in weights or weights[name].shape != shape:
             found = weights[name].shape if name in weights else "missing"
             raise ValueError(f"the weights {name} are {found}, but must be of shape {shape}")
-        if weights[name].dtype.kind != "f" or not (np.abs(weights[name].astype(float)) <= _LARGEST).all():
+        values = weights[name]
+        if values.dtype.kind != "f" or not (np.abs(values.astype(float)) <= _LARGEST).all():
             raise ValueError(f"the weights {name} are not all finite numbers up to {_LARGEST:g}")
     return {name: np.asarray(weights[name], np.float32) for name in shapes}
