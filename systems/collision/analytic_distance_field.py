@@ -43,12 +43,12 @@ class AnalyticDistanceField:
         self._native = _native.ShapeField(shapes=rows, kinds=numbers)
         # Of each kind its first shape, and the shapes' parameters, stacked: arrays with a leading
         # axis (M,).
-        self._groups = []
+        self._groups, first = [], 0
         for kind in kinds:
             own = [shape.parameters() for shape in ordered if type(shape) is kind]
             parameters = tuple(np.array(values) for values in zip(*own, strict=True))
-            first = next(i for i, shape in enumerate(ordered) if type(shape) is kind)
             self._groups.append((kind, first, len(own), parameters))
+            first += len(own)
 
     def distance(self, p_WQ: ArrayLike) -> np.ndarray:
         """Signed distance at the points p_WQ (..., 3) [m]: (...,) [m], NaN outside the bounds."""

@@ -7,9 +7,10 @@ predicted, by error and by the clearance of its own way (equation 4).
 
 Chosen here, where the paper is silent: the vector to the goal is of length 1 beyond 3 m and shrinks
 to nothing at the goal, as whoever knows its direction alone circles it; beside it stands which way
-is up, without which heights drift by metres. The encoder's 4x5 cells are kept apart, at 64 numbers
-each, which are as many as the average over all cells has at 1280; depth is encoded by its
-logarithm, as a grey image; the barrier is integrated over the second that is predicted.
+is up, so that heights need not be told from the image alone. The encoder's 4x5 cells are kept
+apart, at 64 numbers each, which are as many as the average over all cells has at 1280; depth is
+encoded by its logarithm, as a grey image; the barrier is integrated over the second that is
+predicted.
 """
 
 from pathlib import Path

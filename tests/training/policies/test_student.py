@@ -113,6 +113,19 @@ def test_interrupted_training_ends_as_whole(student_corpus, tmp_path):
     assert curves[0] == curves[1]
 
 
+def test_training_goes_on_from_weights_that_are_given(trained, student_corpus, tmp_path):
+    """After one step too small to matter the weights are those of the file, not the seed's."""
+    steps = ["schedule.updates=1", "schedule.validate_every=1", "schedule.checkpoint_every=1"]
+    began = trained / "student_depth.npz"
+    config = training(
+        student_corpus, "depth", *steps, "schedule.learning_rate=1e-9", f"begin={began}"
+    )
+    run(config=config, out=tmp_path / "run", make=TRAINERS.find("student_depth").make)
+    with np.load(began) as before, np.load(tmp_path / "run" / "student_depth.npz") as after:
+        for name in set(before.files) - {"about"}:
+            np.testing.assert_allclose(after[name], before[name], atol=1e-3)
+
+
 def test_as_many_trajectories_vote_as_asked(student_corpus, tmp_path):
     """The pull of a sample is the sum over those that vote: where only the cheapest does it is less
     than half that of all three, which are much alike."""
