@@ -9,20 +9,20 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
 from splatpilot.systems.policies.mobilenet import CHANNELS, MobileNet, mobilenet_shapes
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.unobstructed_way import HORIZON, unobstructed_way
 
 RATE = 15.0  # [Hz]
 HYPOTHESES = 3
 OBSERVATIONS = "rgb", "depth"
 NEAREST, FARTHEST = 0.3, 20.0  # [m] range of depth
-WAYPOINT_SCALE = 2.0  # [m] that a waypoint of 1 at the network's output means
+WAYPOINT_SCALE = 2.0  # [m] from the unobstructed way that 1 at the network's output means
 STATE_SIZE = 9
-GOAL_NEAR = 3.0  # [m] from the goal, where the expert slows and its distance is told
 
 
 @dataclass(frozen=True)
 class StudentSpec:
-    """The architecture: MobileNetV2 for the image, layers for the state, one linear head for all
-    hypotheses."""
+    """The architecture: MobileNetV2 for the image, layers for the state, a head for all hypotheses,
+    whose waypoints are deviations from the unobstructed way."""
 
     weights_type: ClassVar[type] = np.float16
     """That files of weights have: 2.4 million take 4 MB, and waypoints change by less than a
@@ -39,6 +39,11 @@ class StudentSpec:
     """To which the encoder's channels are reduced in each of its cells, which are then kept apart:
     where something is decides where to fly."""
     state_features: int = 64
+    head_features: int = 256
+    """Of the layer between what was seen and told and the linear one that the hypotheses are of: a
+    sum of both alone cannot say what is in the way of where to go. None where 0."""
+    nominal_speed: float = 2.0
+    """[m/s] of the expert."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a field that no network can be made with."""
@@ -48,13 +53,22 @@ class StudentSpec:
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= 4096:
                 raise ValueError(f"{name} is {value!r}; it must be 1 to 4096")
-        if not isinstance(self.fov_x, int | float) or not 1.0 <= self.fov_x < 180.0:
-            raise ValueError(f"fov_x is {self.fov_x!r}; it must be 1 to 180 deg")
+        if not isinstance(self.head_features, int) or not 0 <= self.head_features <= 4096:
+            raise ValueError(f"head_features is {self.head_features!r}; it must be 0 to 4096")
+        for name, least, most in (("fov_x", 1.0, 179.0), ("nominal_speed", 0.1, 20.0)):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not least <= value <= most:
+                raise ValueError(f"{name} is {value!r}; it must be {least:g} to {most:g}")
 
     @property
     def pixels(self) -> str:
         """The name of what it sees, of a sample of a corpus: `color` or `depth`."""
         return {"rgb": "color", "depth": "depth"}[self.observation]
+
+    @property
+    def reach(self) -> float:
+        """[m] from the goal, within which its distance is told: where the expert arrives."""
+        return HORIZON * self.nominal_speed
 
     def image_features(self) -> int:
         """Numbers that the image becomes."""
@@ -64,12 +78,15 @@ class StudentSpec:
         """The name and shape of every array of weights."""
         shapes = mobilenet_shapes()
         joined = self.image_features() + self.state_features
-        for name, inputs, outputs in (
+        layers = [
             ("cell_layer", CHANNELS, self.cell_features),
             ("state_layer", STATE_SIZE, self.state_features),
             ("state_layer_2", self.state_features, self.state_features),
-            ("head", joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1)),
-        ):
+            ("head", self.head_features or joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1)),
+        ]
+        if self.head_features:
+            layers.append(("hidden_layer", joined, self.head_features))
+        for name, inputs, outputs in layers:
             shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (outputs, inputs), (outputs,)
         return shapes
 
@@ -106,9 +123,14 @@ class StudentNetwork:
         cells = _rectified(self._linear("cell_layer", features.T))
         y = _rectified(self._linear("state_layer", np.asarray(state, np.float32)))
         y = _rectified(self._linear("state_layer_2", y))
-        output = self._linear("head", np.concatenate([cells.ravel(), y])).reshape(HYPOTHESES, -1)
-        waypoints = WAYPOINT_SCALE * output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
-        return waypoints, output[:, -1]
+        joined = np.concatenate([cells.ravel(), y])
+        if spec.head_features:
+            joined = _rectified(self._linear("hidden_layer", joined))
+        output = self._linear("head", joined).reshape(HYPOTHESES, -1)
+        deviations = WAYPOINT_SCALE * output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
+        v_B, towards, up_B = np.reshape(state, (3, 3))
+        way = unobstructed_way(v_B, spec.reach * towards, up_B, spec.nominal_speed)
+        return way + deviations, output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
@@ -140,12 +162,14 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
     return np.broadcast_to(encoded, (3, *depth.shape))
 
 
-def state_observation(X_WB: RigidTransform, v_WB: np.ndarray, p_WG: np.ndarray) -> np.ndarray:
-    """(9,), in the body frame: velocity [m/s], the vector to the goal, of length 1 beyond
-    `GOAL_NEAR` and in proportion nearer, and the unit vector upwards."""
+def state_observation(
+    X_WB: RigidTransform, v_WB: np.ndarray, p_WG: np.ndarray, reach: float
+) -> np.ndarray:
+    """(9,), in the body frame: velocity [m/s], the vector to the goal, of length 1 beyond `reach`
+    [m] and in proportion nearer, and the unit vector upwards."""
     R_WB = X_WB.rotation().matrix()
     to_goal = p_WG - X_WB.translation()
-    towards = to_goal / max(float(np.linalg.norm(to_goal)), GOAL_NEAR)
+    towards = to_goal / max(float(np.linalg.norm(to_goal)), reach)
     return (np.stack([v_WB, towards, [0.0, 0.0, 1.0]]) @ R_WB).ravel()
 
 
@@ -169,5 +193,6 @@ def plan(
         ValueError: for an image of another size.
     """
     encode = encode_color if network.spec.pixels == "color" else encode_depth
-    waypoints_B, costs = network(encode(image), state_observation(X_WB, v_WB, p_WG))
+    state = state_observation(X_WB, v_WB, p_WG, network.spec.reach)
+    waypoints_B, costs = network(encode(image), state)
     return Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))

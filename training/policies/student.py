@@ -62,7 +62,14 @@ lower penalty, of error and clearance."""
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
         camera = self._data.camera
-        self.spec = StudentSpec(config.observation, camera.width, camera.height, camera.fov_x)
+        self.spec = StudentSpec(
+            config.observation,
+            camera.width,
+            camera.height,
+            camera.fov_x,
+            head_features=config.head_features,
+            nominal_speed=self._data.speed,
+        )
         self.network = StudentModule(self.spec)
         if config.pretrained:
             self.network.load_encoder(imagenet_weights(config.encoder))
@@ -150,7 +157,8 @@ lower penalty, of error and clearance."""
     def _judge(self, numbers: np.ndarray, images: Tensor) -> "_Judged":
         """What the network makes of samples, against their experts and their worlds."""
         config, labels = self._config, self._data.labels(numbers)
-        state = encode_state(rotation_matrix(labels.X_WB[:, :4]), labels.v_B, labels.goal_B)
+        R_WB = rotation_matrix(labels.X_WB[:, :4])
+        state = encode_state(R_WB, labels.v_B, labels.goal_B, self.spec.reach)
         waypoints, costs = self.network(images, state, config.frozen)
         distances = self._data.distance_along(waypoints, labels)
         experts = labels.trajectories_B[:, : config.experts or None]

@@ -41,7 +41,7 @@ class StudentTraining:
     validation_samples: int = 2000
     schedule: Schedule = field(
         default_factory=lambda: Schedule(
-            updates=4000, validate_every=1000, checkpoint_every=500, learning_rate=3e-4, decay=0.5
+            updates=4000, validate_every=1000, checkpoint_every=500, learning_rate=1e-3, decay=0.5
         )
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
@@ -50,9 +50,14 @@ class StudentTraining:
     begin: str = ""
     # File of ImageNet's; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""
-    # [-] First modules of the encoder, of 19, that keep their weights; what they make of images is
-    # computed once. These 7 see edges, at an eighth of the image's size, which depth has too; what
-    # 18 see in photographs is not what keeps clear of things.
+    # [-] Width of the layer before the linear one that the hypotheses are of; none, as published,
+    # where 0.
+    head_features: int = 256
+    # [-] First modules that keep their weights: of the 19 of the encoder, and the layer of its
+    # cells as the 20th. What they make of images is computed once. These 7 see edges, at an eighth
+    # of the image's size, which depth has too; what 18 see in photographs is not what keeps clear
+    # of things. With 20 of a student that was trained already (`begin`), the head alone learns on,
+    # a hundred times as fast: it needs many more samples than the encoder.
     frozen: int = 7
     # [-] Draws of light and noise that are kept of each image, where modules are frozen; a new one
     # for each step where none are.
@@ -96,9 +101,14 @@ class StudentTraining:
         for name in ("geometric_weight", "cost_weight"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
-        if not 0 <= self.frozen <= BLOCKS:
-            raise ValueError(f"frozen is {self.frozen}; the encoder has 0 to {BLOCKS} modules")
-        if self.frozen and not self.pretrained:
+        if not 0 <= self.frozen <= BLOCKS + 1:
+            raise ValueError(f"frozen is {self.frozen}; there are 0 to {BLOCKS + 1} modules")
+        if self.frozen > BLOCKS and not self.begin:
+            raise ValueError(
+                f"frozen is {self.frozen}, but the layer of the cells was not trained yet; set "
+                f"begin to a file of weights, or frozen to at most {BLOCKS}"
+            )
+        if self.frozen and not (self.pretrained or self.begin):
             raise ValueError(
                 f"frozen is {self.frozen}, but what was not trained yet cannot stay as it is; set "
                 "pretrained=true or frozen=0"

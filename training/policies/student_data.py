@@ -43,13 +43,19 @@ class StudentData:
         self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu", worlds: int = 0
     ) -> None:
         configs = [corpus.config for corpus in corpora]
-        self.camera = configs[0].camera
+        self.camera, self.speed = configs[0].camera, configs[0].expert.speed
+        """What the samples were seen through; the expert's nominal speed [m/s]."""
         for config in configs:
             if (config.camera, config.size) != (self.camera, configs[0].size):
                 raise ValueError(
                     f"the corpora were gathered with different cameras or numbers of trajectories, "
                     f"{configs[0].size} by {self.camera} and {config.size} by {config.camera}; "
                     "gather them alike"
+                )
+            if config.expert.speed != self.speed:
+                raise ValueError(
+                    f"the corpora's experts flew at {self.speed} and {config.expert.speed} m/s; a "
+                    "student has one nominal speed: gather them at the same"
                 )
         records = {world.name: world for corpus in reversed(corpora) for world in corpus.worlds}
         self.held_out_worlds = held_out_names(list(records), held_out)

@@ -29,7 +29,7 @@ class FrozenFeatures:
         folder: of the files.
         data: the samples.
         network: whose encoder it is.
-        frozen: how many of its first modules.
+        frozen: how many of its first modules, see `StudentModule.see`.
         draws: of each image that is trained with.
         appearance, noise: what is drawn.
 
@@ -49,11 +49,12 @@ class FrozenFeatures:
     ) -> None:
         require_writable_folder(folder)
         self._data, self.draws = data, draws
-        self._modules = network.features[:frozen]
+        self._network, self._frozen = network, frozen
         self._pixels = network.spec.pixels
         self._appearance, self._noise = appearance, noise
         settings = repr((network.spec.observation, draws, appearance, noise)).encode()
-        weights = [values.detach().cpu().numpy() for values in self._modules.parameters()]
+        modules = network.modules_to(frozen)
+        weights = [values.detach().cpu().numpy() for values in modules.parameters()]
         what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
         files = []
         for shard in tqdm(data.shards, desc="features", unit="shard", disable=None):
@@ -69,15 +70,15 @@ class FrozenFeatures:
         self._files = [np.load(file, mmap_mode="r") for file in files]
 
     def __call__(self, numbers: np.ndarray, draw: np.ndarray) -> Tensor:
-        """Features (N, C, h, w) of the samples of `numbers` (N,), of the draws `draw` (N,); samples
+        """Features (N, ...) of the samples of `numbers` (N,), of the draws `draw` (N,); samples
         of held-out worlds have the draw 0 alone."""
         rows = zip(*self._data.places(numbers), draw, strict=True)
         return torch.from_numpy(np.stack([self._files[k][d, n] for k, n, d in rows])).float()
 
     @torch.no_grad()
     def _features(self, shard: Shard, draws: int, seed: int) -> np.ndarray:
-        """(draws, n, C, h, w) float16; of clean images where draws is 0."""
-        device = next(self._modules.parameters()).device
+        """(draws, n, ...) float16; of clean images where draws is 0."""
+        device = next(self._network.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)
         pixels = shard.arrays[self._pixels]
         kept = []
@@ -88,5 +89,5 @@ class FrozenFeatures:
                     images = training_images(batch, self._appearance, self._noise, generator)
                 else:
                     images = clean_images(batch, str(device))
-                kept.append(self._modules(images).half().cpu().numpy())
+                kept.append(self._network.see(images, 0, self._frozen).half().cpu().numpy())
         return np.concatenate(kept).reshape(max(draws, 1), len(pixels), *kept[0].shape[1:])

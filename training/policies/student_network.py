@@ -7,16 +7,19 @@ from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
-from splatpilot.systems.policies.mobilenet import CHANNELS, adds_input, mobilenet_blocks
+from splatpilot.systems.policies.mobilenet import BLOCKS, CHANNELS, adds_input, mobilenet_blocks
 from splatpilot.systems.policies.student_inference import (
     FARTHEST,
-    GOAL_NEAR,
     HYPOTHESES,
     NEAREST,
     STATE_SIZE,
     WAYPOINT_SCALE,
     StudentSpec,
 )
+from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
+
+SEEING = BLOCKS + 1
+"""Modules through which an image goes: the encoder's, and the layer of its cells."""
 
 
 class StudentModule(nn.Module):
@@ -35,7 +38,10 @@ class StudentModule(nn.Module):
         self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
         self.state_layer_2 = nn.Linear(spec.state_features, spec.state_features)
         joined = spec.image_features() + spec.state_features
-        self.head = nn.Linear(joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
+        if spec.head_features:
+            self.hidden_layer = nn.Linear(joined, spec.head_features)
+        self.head = nn.Linear(spec.head_features or joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
+        self.register_buffer("_basis", torch.from_numpy(BASIS).float(), persistent=False)
 
     def _initialize_encoder(self) -> None:
         """Has numbers keep their size through the encoder, as no batch norm sees to it: a rectifier
@@ -57,24 +63,42 @@ class StudentModule(nn.Module):
                 if name in weights:
                     value.copy_(weights[name])
 
+    def modules_to(self, last: int) -> nn.ModuleList:
+        """The first modules through which images go, at most `SEEING`."""
+        return nn.ModuleList([*self.features, self.cell_layer][:last])
+
     def freeze(self, modules: int) -> None:
-        """Has the first modules of the encoder keep their weights."""
-        self.features[:modules].requires_grad_(False)
+        """Has the first modules keep their weights."""
+        self.modules_to(modules).requires_grad_(False)
+
+    def see(self, image: Tensor, first: int = 0, last: int = SEEING) -> Tensor:
+        """What modules make of images (N, 3, height, width), or of what those before the `first`
+        of them made of them; of all, the numbers (N, ...) of the cells."""
+        if first < last:
+            image = self.features[first:last](image)
+        if first < last == SEEING:
+            image = self.cell_layer(image.flatten(2).mT).relu().flatten(1)
+        return image
 
     def forward(self, image: Tensor, state: Tensor, first: int = 0) -> tuple[Tensor, Tensor]:
         """Waypoints (N, 3, 10, 3) [m] and costs (N, 3).
 
         Args:
-            image: (N, 3, height, width), or what the `first` modules of the encoder made of it.
+            image: (N, 3, height, width), or what the `first` modules made of it.
             state: (N, 9), see `encode_state`.
-            first: module of the encoder that takes `image`.
+            first: module that takes `image`.
         """
-        features = self.features[first:](image).flatten(2).mT  # (N, cells, CHANNELS)
-        cells = self.cell_layer(features).relu().flatten(1)
+        cells = self.see(image, first)
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
-        output = self.head(torch.cat([cells, y], 1)).unflatten(1, (HYPOTHESES, -1))
-        waypoints = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
-        return waypoints, output[..., -1]
+        joined = torch.cat([cells, y], 1)
+        if self.spec.head_features:
+            joined = self.hidden_layer(joined).relu()
+        output = self.head(joined).unflatten(1, (HYPOTHESES, -1))
+        deviations = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
+        v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
+        speed, basis = self.spec.nominal_speed, self.get_buffer("_basis")
+        way = unobstructed_way(v_B, self.spec.reach * towards, up_B, speed, basis)
+        return way[:, None] + deviations, output[..., -1]
 
 
 class _Bias(nn.Module):
@@ -88,10 +112,10 @@ class _Bias(nn.Module):
         return x + self.bias[:, None, None]
 
 
-def encode_state(R_WB: Tensor, v_B: Tensor, goal_B: Tensor) -> Tensor:
+def encode_state(R_WB: Tensor, v_B: Tensor, goal_B: Tensor, reach: float) -> Tensor:
     """What the network is told (N, 9), see `student_inference`: of attitudes (N, 3, 3), velocities
-    (N, 3) [m/s] and vectors to the goal (N, 3) [m]."""
-    towards = goal_B / goal_B.norm(dim=1, keepdim=True).clamp(min=GOAL_NEAR)
+    (N, 3) [m/s] and vectors to the goal (N, 3) [m], whose lengths are told within `reach` [m]."""
+    towards = goal_B / goal_B.norm(dim=1, keepdim=True).clamp(min=reach)
     return torch.cat([v_B, towards, R_WB[:, 2]], 1)
 
 

@@ -32,11 +32,12 @@ def disturbed(module: StudentModule) -> StudentModule:
 @pytest.mark.parametrize("observation", ["rgb", "depth"])
 @pytest.mark.parametrize("size", [(64, 48), (80, 70)])
 @pytest.mark.parametrize("p_WG", [[9.0, 2.0, 1.5], [1.0, -2.0, 0.5]])
-def test_what_flies_is_what_was_trained(observation, size, p_WG):
+@pytest.mark.parametrize("hidden", [0, 20])
+def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden):
     """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
     that the module in torch makes of what a corpus would hold of them; whole cells or not."""
     torch.manual_seed(0)
-    spec = StudentSpec(observation, *size)
+    spec = StudentSpec(observation, *size, head_features=hidden, nominal_speed=2.6)
     module = disturbed(StudentModule(spec))
     weights = {name: w.numpy() for name, w in module.state_dict().items()}
     assert {name: w.shape for name, w in weights.items()} == spec.weight_shapes()
@@ -48,7 +49,7 @@ def test_what_flies_is_what_was_trained(observation, size, p_WG):
     X_WB, p_WG = RigidTransform(rotation, p_WB), np.array(p_WG)
     R_WB = X_WB.rotation().matrix()
     labels = (R_WB, R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB))
-    state = encode_state(*(torch.tensor(x).float()[None] for x in labels))
+    state = encode_state(*(torch.tensor(x).float()[None] for x in labels), spec.reach)
 
     image = color if observation == "rgb" else depth
     with torch.no_grad():
@@ -85,8 +86,9 @@ def test_frozen_modules_and_modules_in_parts():
     module.freeze(14)
     image, state = torch.randn(2, 3, 48, 64), torch.randn(2, STATE_SIZE)
     whole = module(image, state)
-    parts = module(module.features[:14](image), state, first=14)
-    assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
+    for first in 0, 14, 19, 20:
+        parts = module(module.see(image, 0, first), state, first)
+        assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
     (whole[0].square().sum() + whole[1].sum()).backward()
     frozen = [p.grad is None for p in module.features[:14].parameters()]
     assert all(frozen) and all(p.grad is not None for p in module.features[14:].parameters())
