@@ -1,7 +1,8 @@
-"""Recovery: what the expert would have done just before a student came too near.
+"""Recovery: what the expert would have done just before a student came too near, or lost its way.
 
 The student has flown; nothing is flown here. The states before its near-misses are labelled anew
-and rendered offline.
+and rendered offline. Beyond the paper, so are states all along flights that did not reach their
+goal: who hovers before it, circles it or leaves the volume comes near to nothing.
 """
 
 import hashlib
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import find_peaks
 
+from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.cores import available_cores
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.provenance import revision
@@ -35,6 +37,10 @@ APART = 1.0
 """[s], between two near-misses."""
 
 
+LOST = 0.8
+"""[s], between two states of a flight that did not reach its goal."""
+
+
 @dataclass(frozen=True, eq=False)
 class StudentFlight:
     """A flight of a student through a world of a corpus, sampled evenly."""
@@ -44,6 +50,12 @@ class StudentFlight:
     times: np.ndarray  # (N,) [s]
     states: np.ndarray  # (N, 13)
     clearances: np.ndarray  # (N,) [m], distances less the vehicle's radius
+
+    @property
+    def arrived(self) -> bool:
+        """Whether it ends at its goal."""
+        away = np.linalg.norm(self.states[-1, :3] - self.p_WG)
+        return bool(away <= Scenario.goal_radius + 1e-6)
 
     def digest(self) -> str:
         """What tells it from others."""
@@ -70,9 +82,26 @@ def rows_before(times: np.ndarray, events: np.ndarray, period: float) -> np.ndar
     return np.unique(np.searchsorted(times, wanted - 1e-9))
 
 
+def rows_to_recover(flight: StudentFlight, period: float) -> np.ndarray:
+    """The samples (n,) of a flight that are labelled, none of them in contact: before near-misses,
+    and all along if it did not arrive.
+
+    Args:
+        flight: of a student.
+        period: [s], between two states before a near-miss.
+    """
+    times, clearances = flight.times, flight.clearances
+    rows = rows_before(times, near_misses(times, clearances), period)
+    if not flight.arrived:
+        lost = np.searchsorted(times, np.arange(times[0], times[-1], LOST) - 1e-9)
+        rows = np.union1d(rows, lost)
+    return rows[clearances[rows] > 0.0]
+
+
 def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | None = None) -> Corpus:
     """
-    Adds to a corpus what the expert would have done before the near-misses of flights.
+    Adds to a corpus what the expert would have done before the near-misses of flights, and along
+    those that did not arrive.
 
     The same flights add the same bytes, and those that were added already add nothing.
 
@@ -124,9 +153,7 @@ def _add_world(
         goal = flight.p_WG.tobytes()
         if goal not in labellers:
             labellers[goal] = Labeller(world.esdf, flight.p_WG, config.expert)
-        events = near_misses(flight.times, flight.clearances)
-        rows = rows_before(flight.times, events, config.expert.period)
-        states = flight.states[rows[flight.clearances[rows] > 0.0]]
+        states = flight.states[rows_to_recover(flight, config.expert.period)]
         labeller, bound = labellers[goal], source.perturbation_bound
         demonstrations = keep_clear(labeller.labels(states), labeller.field)
         rng = np.random.default_rng(int(flight.digest(), 16))
@@ -139,7 +166,8 @@ def _add_world(
                 "goal": flight.p_WG.tolist(),
                 "time_s": float(flight.times[-1]),
                 "least_clearance_m": float(np.nanmin(flight.clearances)),
-                "near_misses": len(events),
+                "arrived": flight.arrived,
+                "near_misses": len(near_misses(flight.times, flight.clearances)),
                 "states": len(demonstrations),
             }
         )

@@ -12,6 +12,7 @@ from splatpilot.training.corpus.recovery import (
     add_recovery,
     near_misses,
     rows_before,
+    rows_to_recover,
 )
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
 
@@ -47,6 +48,27 @@ def test_states_are_taken_before_them():
     np.testing.assert_allclose(TIMES[rows], expected, atol=0.02 + 1e-9)
     assert len(rows_before(TIMES, np.array([0.3]), 0.4)) == 0
     assert len(rows_before(TIMES, np.array([8.0, 8.4]), 0.4)) == 7
+
+
+def test_flights_that_do_not_arrive_are_taken_all_along():
+    """Those that arrive before their near-misses alone; those that end 0.31 m or farther away every
+    0.8 s too, but not where they touch something."""
+
+    def rows(end: float, clear: np.ndarray) -> list[float]:
+        p_WB = np.linspace([0.0, 0.0, 1.5], [end, 0.0, 1.5], len(TIMES))
+        states = np.stack([hover_state(p) for p in p_WB])
+        flight = StudentFlight("W", np.array([10.0, 0.0, 1.5]), TIMES, states, clear)
+        return TIMES[rows_to_recover(flight, 0.4)].tolist()
+
+    near = [1.5, 1.9, 2.3, 2.7, 3.1, 3.5]
+    along = np.arange(0.0, 11.9, 0.8)
+    assert rows(9.71, clearances()) == []
+    np.testing.assert_allclose(rows(9.71, clearances((4.0, 0.5))), near, atol=0.021)
+    np.testing.assert_allclose(rows(9.69, clearances()), along, atol=0.021)
+    both = np.union1d(along, near)
+    np.testing.assert_allclose(rows(3.0, clearances((4.0, 0.5))), both, atol=0.021)
+    inside = clearances() - 4.0 * (TIMES > 5.0)
+    assert max(rows(3.0, inside)) <= 5.0
 
 
 @pytest.fixture
