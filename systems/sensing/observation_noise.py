@@ -9,10 +9,12 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import cv2
 import numpy as np
 
 _LARGEST_LATENCY = 1.0  # [s]
 _LARGEST_EXPOSURE_ERROR = 6.0  # [EV]
+_LARGEST_BLUR = 50.0  # [px]
 _GAMMA = 2.2  # of colours over light
 
 
@@ -32,6 +34,10 @@ class ObservationNoise:
     color_noise: float = 0.0
     # [-] Largest change in brightness of a whole image; uniform up to it, up and down.
     brightness_jitter: float = 0.0
+    # [deg] Largest turn of an image's colours about grey; uniform up to it, both ways.
+    hue_jitter: float = 0.0
+    # [px] Blur of colour images, as of a lens out of focus: the standard deviation of a Gaussian.
+    blur: float = 0.0
     # [EV] Largest error of an image's exposure: light doubles with each; uniform up to it, up and
     # down. What becomes brighter than white is lost.
     exposure_error: float = 0.0
@@ -55,6 +61,8 @@ class ObservationNoise:
         the remedy."""
         limits = {
             "depth_additive": math.inf,
+            "hue_jitter": 180.0,
+            "blur": _LARGEST_BLUR,
             "exposure_error": _LARGEST_EXPOSURE_ERROR,
             "full_well": math.inf,
             "read_noise": math.inf,
@@ -99,7 +107,8 @@ class ObservationNoise:
     @property
     def changes_color(self) -> bool:
         """Whether colour images are touched."""
-        return max(self.color_noise, self.brightness_jitter) > 0.0 or self.changes_light
+        changes = self.color_noise, self.brightness_jitter, self.hue_jitter, self.blur
+        return max(changes) > 0.0 or self.changes_light
 
     @property
     def changes_light(self) -> bool:
@@ -153,15 +162,35 @@ def disturb_depth(
 def noisy_color(
     color: np.ndarray, noise: ObservationNoise, generator: np.random.Generator
 ) -> np.ndarray:
-    """The colour image (H, W, 3) uint8, brighter or darker as a whole, with noise at each pixel;
-    see `expose` and `disturb_color`."""
+    """The colour image (H, W, 3) uint8, of other hue, blurred, brighter or darker as a whole, with
+    noise at each pixel; see `turned_hue`, `expose` and `disturb_color`."""
     brighter = generator.uniform(-1.0, 1.0)
     grain = generator.standard_normal(color.shape, dtype=np.float32)
+    if noise.hue_jitter > 0.0:
+        turn = math.radians(noise.hue_jitter * generator.uniform(-1.0, 1.0))
+        color = turned_hue(color.astype(np.float32), math.cos(turn), math.sin(turn))
+    if noise.blur > 0.0:
+        color = cv2.GaussianBlur(color.astype(np.float32), (0, 0), noise.blur)
     if noise.changes_light:
         error = np.float32(generator.uniform(-1.0, 1.0))
         photons = generator.standard_normal(color.shape, dtype=np.float32)
         color = expose(color.astype(np.float32), noise, error, photons)
     return disturb_color(color, noise, brighter, grain)
+
+
+def turned_hue(color: Any, cos: Any, sin: Any) -> Any:
+    """
+    Colours (..., 3), 0 to 255, turned about grey: red towards green, green towards blue; clipped.
+    Arrays or tensors, of floats. Rodrigues' formula with the axis k = (1, 1, 1) / sqrt(3).
+
+        c' = clip(cos c + (1 - cos) (k · c) k + sin k x c)
+
+    Args:
+        cos, sin: of the angle, of shapes that broadcast.
+    """
+    grey = color.sum(-1)[..., None] / 3.0
+    across = (color[..., [2, 0, 1]] - color[..., [1, 2, 0]]) / math.sqrt(3.0)
+    return (cos * color + (1.0 - cos) * grey + sin * across).clip(0.0, 255.0)
 
 
 def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any:

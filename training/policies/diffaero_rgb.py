@@ -31,7 +31,12 @@ from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.network import TrainableNetwork
-from splatpilot.training.policies.observation import heading_frame, inverse_depth, noisy_color
+from splatpilot.training.policies.observation import (
+    heading_frame,
+    inverse_depth,
+    noisy_color,
+    validate_color_noise,
+)
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import Appearance, relit
 from splatpilot.training.policies.student_network import encode_color
@@ -90,7 +95,7 @@ class DiffAeroRgbTraining:
         for name in ("batch", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        self.noise.validate("noise")
+        validate_color_noise(self.noise, "noise")
         self.appearance.validate("appearance")
 
 

@@ -1,12 +1,17 @@
 """What depth policies are told, in torch; see `systems.policies.observation` for each formula."""
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from splatpilot.systems.policies.velocity_tracking import MAX_ACCELERATION, RESPONSE_TIME
-from splatpilot.systems.sensing.observation_noise import ObservationNoise, expose
+from splatpilot.systems.sensing.observation_noise import (
+    ObservationNoise,
+    expose,
+    turned_hue,
+)
 from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH
 from splatpilot.training.policies.vehicles import Vehicle
 
@@ -28,11 +33,31 @@ def training_noise() -> ObservationNoise:
 def validate_training_noise(noise: ObservationNoise, name: str) -> None:
     """Raises ValueError on noise out of range, or of colours, naming the field of `name`."""
     noise.validate(name)
-    for field in ("color_noise", "brightness_jitter", "exposure_error", "full_well"):
+    of_colors = (
+        "color_noise",
+        "brightness_jitter",
+        "hue_jitter",
+        "blur",
+        "exposure_error",
+        "full_well",
+    )
+    for field in of_colors:
         if getattr(noise, field) > 0.0:
             raise ValueError(
                 f"{name}.{field} is {getattr(noise, field)}, but training has images of depth "
                 "alone; it must be 0"
+            )
+
+
+def validate_color_noise(noise: ObservationNoise, name: str) -> None:
+    """Raises ValueError on noise out of range, or such that images of the moment that are sharp do
+    not have, naming the field of `name`."""
+    noise.validate(name)
+    for field in ("latency", "blur"):
+        if getattr(noise, field) > 0.0:
+            raise ValueError(
+                f"{name}.{field} is {getattr(noise, field)}, but training has sharp images of the "
+                "moment; it must be 0"
             )
 
 
@@ -55,9 +80,14 @@ def disturb_depth(
 
 
 def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
-    """Colours (N, H, W, 3), 0 to 255, as a worse camera measures them, each image anew."""
+    """Colours (N, H, W, 3), 0 to 255, as a worse camera measures them, each image anew; blur is
+    left out, see `validate_color_noise`."""
     brighter = torch.empty_like(color[:, 0, 0, 0]).uniform_(-1.0, 1.0, generator=generator)
     grain = torch.empty_like(color).normal_(generator=generator)
+    if noise.hue_jitter > 0.0:
+        turn = torch.empty_like(brighter).uniform_(-1.0, 1.0, generator=generator)
+        turn = math.radians(noise.hue_jitter) * turn[:, None, None, None]
+        color = turned_hue(color, turn.cos(), turn.sin())
     if noise.changes_light:
         error = torch.empty_like(brighter).uniform_(-1.0, 1.0, generator=generator)
         photons = torch.empty_like(color).normal_(generator=generator)

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from splatpilot.systems.policies.mobilenet import BLOCKS
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.training.policies.observation import validate_color_noise
 from splatpilot.training.policies.student_images import Appearance
 from splatpilot.training.policies.trainer import Schedule
 
@@ -113,12 +114,7 @@ class StudentTraining:
                 f"frozen is {self.frozen}, but what was not trained yet cannot stay as it is; set "
                 "pretrained=true or frozen=0"
             )
-        if self.noise.latency > 0.0:
-            raise ValueError(
-                f"noise.latency is {self.noise.latency} s, but a corpus has images of the moment; "
-                "it must be 0"
-            )
-        self.noise.validate("noise")
+        validate_color_noise(self.noise, "noise")
         self.appearance.validate("appearance")
 
 

@@ -1,13 +1,12 @@
 """Images for the student: encoded, and in training never twice the same."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.sensing.observation_noise import ObservationNoise, turned_hue
 from splatpilot.training.policies.observation import noisy_color, noisy_depth
 from splatpilot.training.policies.student_network import encode_color, encode_depth
 
@@ -52,13 +51,7 @@ def training_images(
 
 
 def relit(color: Tensor, gain: Tensor, hue: Tensor) -> Tensor:
-    """Colours (N, H, W, 3), 0 to 255, times `gain` (N,), turned by `hue` (N,) [deg] about grey:
-    red towards green, green towards blue; clipped."""
-    angle = hue * (math.pi / 180.0)
-    cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
-    identity = torch.eye(3, device=color.device)
-    cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
-    cross = cross.to(color.device) / math.sqrt(3.0)
-    turned = cos * identity + (1.0 - cos) / 3.0 + sin * cross  # (N, 3, 3), Rodrigues' formula
-    mixed = color.flatten(1, 2) @ (gain[:, None, None] * turned).mT
-    return mixed.reshape(color.shape).clamp(0.0, 255.0)
+    """Colours (N, H, W, 3), 0 to 255, times `gain` (N,), turned by `hue` (N,) [deg], see
+    `turned_hue`."""
+    turn = hue.deg2rad()[:, None, None, None]
+    return turned_hue(gain[:, None, None, None] * color, turn.cos(), turn.sin())

@@ -1,5 +1,7 @@
 """Noise of images."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from splatpilot.systems.sensing.observation_noise import (
     image_generator,
     noisy_color,
     noisy_depth,
+    turned_hue,
 )
 
 DEPTH = np.full((200, 200), 4.0, dtype=np.float32)
@@ -58,6 +61,29 @@ def test_color_noise_and_brightness():
     assert (
         noisy_color(bright, ObservationNoise(color_noise=1.0), image_generator(0, 0)).max() == 255
     )
+
+
+def test_hue_and_blur():
+    """Hue turns the whole image's colours by one angle within its limit, and leaves grey and
+    brightness; blur spreads a point as a Gaussian of that width, and leaves its light."""
+    red = np.full((4, 4, 3), [120, 60, 60], dtype=np.uint8)
+    third = turned_hue(red.astype(float), math.cos(2 * math.pi / 3), math.sin(2 * math.pi / 3))
+    np.testing.assert_allclose(third, np.broadcast_to([60, 120, 60], red.shape), atol=1e-9)
+    noise, turns = ObservationNoise(hue_jitter=30.0), []
+    for number in range(100):
+        seen = noisy_color(red, noise, image_generator(0, number)).astype(float)
+        assert (seen == seen[0, 0]).all() and abs(seen[0, 0].mean() - 80.0) < 1.0
+        r, g, b = seen[0, 0]
+        turns.append(math.degrees(math.atan2(math.sqrt(3.0) * (g - b), 2.0 * r - g - b)))
+    assert -31.0 < min(turns) < -27.0 and 27.0 < max(turns) < 31.0
+    grey = np.full((4, 4, 3), 100, dtype=np.uint8)
+    np.testing.assert_array_equal(noisy_color(grey, noise, image_generator(0, 1)), grey)
+    point = np.zeros((41, 41, 3), dtype=np.uint8)
+    point[20, 20] = 255
+    spread = noisy_color(point, ObservationNoise(blur=1.5), image_generator(0, 0))[..., 0]
+    at = np.arange(41) - 20.0
+    expected = 255 / (2 * math.pi * 1.5**2) * np.exp(-np.add.outer(at**2, at**2) / (2 * 1.5**2))
+    np.testing.assert_allclose(spread, expected, atol=0.7)
 
 
 def test_exposure():

@@ -23,6 +23,7 @@ from splatpilot.training.policies.observation import (
     proximity_grid,
     tracking_acceleration,
     training_noise,
+    validate_color_noise,
     validate_training_noise,
 )
 
@@ -85,12 +86,14 @@ def test_noise_that_training_cannot_have_is_named():
         validate_training_noise(ObservationNoise(brightness_jitter=0.2), "noise")
     with pytest.raises(ValueError, match=r"rollout\.noise\.latency is 2; it must be"):
         validate_training_noise(ObservationNoise(latency=2), "rollout.noise")
+    with pytest.raises(ValueError, match=r"noise\.blur is 2\.0, but training has sharp images"):
+        validate_color_noise(ObservationNoise(blur=2.0), "noise")
 
 
 def test_noise_that_does_not_exist_is_named():
     """A field that there is not, in a scenario and in training, is an error that lists those that
     there are."""
     for config, field in (Scenario(), "observation"), (DiffAeroTraining(), "rollout.noise"):
-        known = rf"there is no field {field}\.blur; the fields are .*{field}\.depth_dropout"
+        known = rf"there is no field {field}\.fog; the fields are .*{field}\.depth_dropout"
         with pytest.raises(ValueError, match=known):
-            load_config(config, overrides=[f"{field}.blur=0.1"])
+            load_config(config, overrides=[f"{field}.fog=0.1"])

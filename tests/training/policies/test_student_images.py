@@ -57,7 +57,7 @@ def test_colour_noise_of_training_is_that_of_flight():
 
 def test_exposure_of_training_is_that_of_flight():
     """The same draws expose tensors as they expose arrays, each image by its own error."""
-    noise = ObservationNoise(exposure_error=2.0, full_well=500.0, read_noise=5.0)
+    noise = ObservationNoise(exposure_error=2.0, full_well=500.0, read_noise=5.0, hue_jitter=40.0)
     rng = np.random.default_rng(0)
     color = rng.integers(0, 256, (2, 5, 6, 3)).astype(np.float32)
     error, photons = rng.uniform(-1, 1, 2), rng.normal(size=color.shape).astype(np.float32)
