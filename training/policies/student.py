@@ -94,11 +94,22 @@ lower penalty, of error and clearance."""
         self._validation = data[np.linspace(0, len(data) - 1, min(count, len(data))).astype(int)]
 
     def _load(self, weights: str) -> None:
-        """Has the network be that of a file of weights."""
-        checkpoint = PolicyCheckpoint.load(weights, self.policy, self.spec)
-        self.network.load_state_dict(
-            {name: torch.from_numpy(w).float() for name, w in checkpoint.weights.items()}
-        )
+        """Has the network begin with a file of weights: with its encoder, and with all else that
+        has the same shape."""
+        checkpoint = PolicyCheckpoint.load(weights, self.policy, StudentSpec)
+        own = self.network.state_dict()
+        fitting = {
+            name: torch.from_numpy(values).float()
+            for name, values in checkpoint.weights.items()
+            if name in own and own[name].shape == values.shape
+        }
+        missing = own.keys() - fitting.keys()
+        if any(name.startswith(("features.", "cell_layer.")) for name in missing):
+            raise ValueError(
+                f"{weights} has another encoder, {checkpoint.spec} instead of {self.spec}; give "
+                "weights of a student with the same"
+            )
+        self.network.load_state_dict(fitting, strict=False)
 
     def begin_update(self, update: int) -> None:
         pass

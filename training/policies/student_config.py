@@ -42,12 +42,13 @@ class StudentTraining:
     validation_samples: int = 2000
     schedule: Schedule = field(
         default_factory=lambda: Schedule(
-            updates=4000, validate_every=1000, checkpoint_every=500, learning_rate=1e-3, decay=0.5
+            updates=4000, validate_every=1000, checkpoint_every=500, learning_rate=5e-4, decay=0.5
         )
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
     pretrained: bool = True
-    # File of this policy's weights, which are trained further instead; none where left empty.
+    # File of this policy's weights, which are trained further instead; a head of another shape
+    # begins anew. None where left empty.
     begin: str = ""
     # File of ImageNet's; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""

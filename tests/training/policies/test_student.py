@@ -126,6 +126,23 @@ def test_training_goes_on_from_weights_that_are_given(trained, student_corpus, t
             np.testing.assert_allclose(after[name], before[name], atol=1e-3)
 
 
+def test_a_head_of_another_shape_begins_anew(trained, student_corpus, tmp_path):
+    """What the encoder and the layer of its cells learned stays, frozen, and only the head and what
+    it is told change; of another encoder weights are refused."""
+    steps = ["schedule.updates=2", "schedule.validate_every=2", "schedule.checkpoint_every=2"]
+    began = trained / "student_depth.npz"
+    another = *steps, f"begin={began}", "frozen=20", "head_features=7"
+    config = training(student_corpus, "depth", *another)
+    config.features = str(tmp_path / "features")
+    run(config=config, out=tmp_path / "run", make=TRAINERS.find("student_depth").make)
+    with np.load(began) as before, np.load(tmp_path / "run" / "student_depth.npz") as after:
+        for name in set(after.files) - {"about"}:
+            seeing = name.startswith(("features.", "cell_layer."))
+            same = before[name].shape == after[name].shape and (before[name] == after[name]).all()
+            assert same == seeing, name
+        assert after["hidden_layer.weight"].shape[0] == 7
+
+
 def test_as_many_trajectories_vote_as_asked(student_corpus, tmp_path):
     """The pull of a sample is the sum over those that vote: where only the cheapest does it is less
     than half that of all three, which are much alike."""
@@ -175,7 +192,7 @@ def test_frozen_modules_keep_the_weights_they_began_with(student_corpus, tmp_pat
         ("frozen=20", "set begin to a file of weights"),
         ("draws=0", "draws is 0; it must be at least 1"),
         ("frozen=3", "set pretrained=true or frozen=0"),
-        ("noise.latency=0.1", r"noise\.latency is 0\.1 s"),
+        ("noise.latency=0.1", r"noise\.latency is 0\.1, but"),
         ("appearance.hue=200", r"appearance\.hue is 200"),
         ("corpora=[absent]", r"absent holds no corpus"),
     ],
