@@ -16,6 +16,9 @@ from splatpilot.training.policies.student_images import Appearance, clean_images
 from splatpilot.training.policies.student_network import StudentModule
 
 _BATCH = 32
+_FIRST = 7
+"""Modules that take most of the time, and are the same for many encoders: what they make is kept
+too."""
 
 
 class FrozenFeatures:
@@ -49,6 +52,9 @@ class FrozenFeatures:
     ) -> None:
         require_writable_folder(folder)
         self._data, self.draws = data, draws
+        self._below = None
+        if frozen > _FIRST:
+            self._below = FrozenFeatures(folder, data, network, _FIRST, draws, appearance, noise)
         self._network, self._frozen = network, frozen
         self._pixels = network.spec.pixels
         self._appearance, self._noise = appearance, noise
@@ -57,7 +63,9 @@ class FrozenFeatures:
         weights = [values.detach().cpu().numpy() for values in modules.parameters()]
         what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
         files = []
-        for shard in tqdm(data.shards, desc="features", unit="shard", disable=None):
+        for number, shard in enumerate(
+            tqdm(data.shards, desc=f"features of {frozen}", unit="shard", disable=None)
+        ):
             outside = shard.world in data.held_out_worlds
             digest = what.copy()
             # It states the checksums of the images.
@@ -65,8 +73,12 @@ class FrozenFeatures:
             files.append(folder / f"{digest.hexdigest()[:32]}.npy")
             if not files[-1].exists():
                 seed = int.from_bytes(digest.digest()[:7])
+                if self._below is None:
+                    features = self._of_images(shard, 0 if outside else draws, seed)
+                else:
+                    features = self._of_features(self._below._files[number])
                 with written_atomically(files[-1]) as path:
-                    np.save(path, self._features(shard, 0 if outside else draws, seed))
+                    np.save(path, features)
         self._files = [np.load(file, mmap_mode="r") for file in files]
 
     def __call__(self, numbers: np.ndarray, draw: np.ndarray) -> Tensor:
@@ -76,7 +88,19 @@ class FrozenFeatures:
         return torch.from_numpy(np.stack([self._files[k][d, n] for k, n, d in rows])).float()
 
     @torch.no_grad()
-    def _features(self, shard: Shard, draws: int, seed: int) -> np.ndarray:
+    def _of_features(self, below: np.ndarray) -> np.ndarray:
+        """(draws, n, ...) float16 of what the first modules made of the same images."""
+        device = next(self._network.parameters()).device
+        kept = []
+        for rows in below:
+            for first in range(0, len(rows), _BATCH):
+                features = torch.from_numpy(rows[first : first + _BATCH]).float().to(device)
+                seen = self._network.see(features, _FIRST, self._frozen)
+                kept.append(seen.half().cpu().numpy())
+        return np.concatenate(kept).reshape(*below.shape[:2], *kept[0].shape[1:])
+
+    @torch.no_grad()
+    def _of_images(self, shard: Shard, draws: int, seed: int) -> np.ndarray:
         """(draws, n, ...) float16; of clean images where draws is 0."""
         device = next(self._network.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)

@@ -41,14 +41,14 @@ def test_features_are_those_of_the_modules(data, network, tmp_path):
     with torch.no_grad():
         expected = network.features[:FROZEN](clean_images(data.pixels(numbers, "depth")))
     found = kept(numbers, np.zeros(3, int))
-    torch.testing.assert_close(found, expected, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(found, expected, atol=4e-3, rtol=4e-3)
     numbers = data.training[[5, 30]]
     first, second = (kept(numbers, np.full(2, draw)) for draw in (0, 1))
     assert not torch.allclose(first[0], second[0]) and not torch.allclose(first[1], second[1])
     bare = features(tmp_path, data, network, noise=0.0)
     with torch.no_grad():
         expected = network.features[:FROZEN](clean_images(data.pixels(numbers, "depth")))
-    torch.testing.assert_close(bare(numbers, np.ones(2, int)), expected, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(bare(numbers, np.ones(2, int)), expected, atol=4e-3, rtol=4e-3)
 
 
 def test_files_are_made_once_for_all_that_they_depend_on(data, network, tmp_path):
@@ -56,7 +56,7 @@ def test_files_are_made_once_for_all_that_they_depend_on(data, network, tmp_path
     other draws or other weights make files of their own."""
     features(tmp_path, data, network)
     made = {file: (file.stat().st_mtime_ns, file.read_bytes()) for file in tmp_path.iterdir()}
-    assert len(made) == len(data.shards)
+    assert len(made) == 2 * len(data.shards)  # What the first seven modules make is kept too.
     lost = min(made)
     lost.unlink()
     features(tmp_path, data, network)
