@@ -94,7 +94,9 @@ class FrozenFeatures:
         kept = []
         for rows in below:
             for first in range(0, len(rows), _BATCH):
-                features = torch.from_numpy(rows[first : first + _BATCH]).float().to(device)
+                features = (
+                    torch.from_numpy(np.array(rows[first : first + _BATCH])).float().to(device)
+                )
                 seen = self._network.see(features, _FIRST, self._frozen)
                 kept.append(seen.half().cpu().numpy())
         return np.concatenate(kept).reshape(*below.shape[:2], *kept[0].shape[1:])
