@@ -10,17 +10,6 @@ from splatpilot.training.policies.student_images import Appearance
 from splatpilot.training.policies.trainer import Schedule
 
 
-def _noise() -> ObservationNoise:
-    """A depth camera's and a colour camera's at once: each student takes what concerns it."""
-    return ObservationNoise(
-        depth_multiplicative=0.03,
-        depth_additive=0.02,
-        depth_dropout=0.01,
-        color_noise=0.02,
-        brightness_jitter=0.2,
-    )
-
-
 @dataclass
 class StudentTraining:
     """A training run."""
@@ -79,9 +68,11 @@ class StudentTraining:
     # [-] Weight of the cost head's error beside the imitation: costs are about 1 where errors are
     # tenths of a square metre, and would rule the encoder at 1.
     cost_weight: float = 0.1
-    appearance: Appearance = field(default_factory=Appearance)
-    # What the images are disturbed by.
-    noise: ObservationNoise = field(default_factory=_noise)
+    # How far images are relit; a corpus has looks of its own.
+    appearance: Appearance = field(default_factory=lambda: Appearance(exposure=0.0, hue=0.0))
+    # What the images are disturbed by. Where modules are frozen it costs more than it gains: their
+    # features of grain and of pixels without depth are unlike those of anything else.
+    noise: ObservationNoise = field(default_factory=ObservationNoise)
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
