@@ -16,7 +16,7 @@ from splatpilot.training.policies.student_images import Appearance, clean_images
 from splatpilot.training.policies.student_network import StudentModule
 
 _BATCH = 8
-"""What the first modules make of more leaves a processor's caches: 32 take 2.7 times as long each."""
+"""More than a processor keeps in its caches takes longer: 32 images 2.7 times as long each."""
 _FIRST = 7
 """Modules that take most of the time, and are the same for many encoders: what they make is kept
 too."""
