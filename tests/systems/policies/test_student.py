@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.common.value import Value
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
@@ -95,3 +96,47 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
     np.savez(tmp_path / "odd.npz", about=json.dumps(about))
     with pytest.raises(ValueError, match=r"odd\.npz holds weights of another architecture"):
         load_network(str(tmp_path / "odd.npz"), "depth")
+
+
+def corridor(low: int, high: int, distance: float) -> np.ndarray:
+    """Planar depth (120, 160) [m] from 1.5 m above a floor, of a wall across the columns from `low`
+    to `high`; nothing else within 20 m."""
+    below = np.arange(120) + 0.5 - 60.0
+    floor = np.where(below > 0.0, 1.5 * 80.0 / np.maximum(below, 1e-3), np.inf)
+    depth = np.repeat(floor[:, None], 160, axis=1)
+    depth[:100, low:high] = np.minimum(depth[:100, low:high], distance)
+    return np.where(depth > 20.0, np.inf, depth).astype(np.float32)
+
+
+def test_weights_that_ship_fly_around_what_stands_ahead():
+    """At 2 m/s towards a goal straight ahead, the student that sees depth goes on where nothing
+    stands, passes a wall on its free side, and slows before one that leaves none."""
+    network = load_network("", "depth")
+    X_WB, v_WB, p_WG = RigidTransform([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.0]), [12.0, 0.0, 1.5]
+
+    def end(depth: np.ndarray) -> np.ndarray:
+        hypotheses = plan(network, 0.0, depth, X_WB, v_WB, np.array(p_WG))
+        return hypotheses.waypoints_B[hypotheses.best, -1]
+
+    open_way, wall = end(corridor(0, 0, 2.0)), end(corridor(0, 160, 1.2))
+    assert open_way[0] > 1.5 and abs(open_way[1]) < 0.4
+    assert wall[0] < open_way[0] - 0.5
+    assert end(corridor(0, 95, 2.0))[1] < -0.4 and end(corridor(65, 160, 2.0))[1] > 0.4
+
+
+def test_weights_that_ship_see_colours():
+    """The student that sees colours wants other things where it sees, or is told, others."""
+    network, X_WB = load_network("", "rgb"), RigidTransform([0.0, 0.0, 1.5])
+    meadow = np.full((120, 160, 3), [150, 180, 220], np.uint8)
+    meadow[60:] = 90, 110, 70
+    trunk = meadow.copy()
+    trunk[:, 60:100] = 60, 45, 30
+
+    def waypoints_B(image: np.ndarray, p_WG: list[float]) -> np.ndarray:
+        hypotheses = plan(network, 0.0, image, X_WB, np.zeros(3), np.array(p_WG))
+        return hypotheses.waypoints_B[hypotheses.best]
+
+    left, right = (waypoints_B(meadow, [2.0, y, 1.5]) for y in (2.0, -2.0))
+    assert left[-1, 1] > 0.1 and right[-1, 1] < -0.1
+    ahead = [4.0, 0.0, 1.5]
+    assert np.abs(waypoints_B(trunk, ahead) - waypoints_B(meadow, ahead)).max() > 0.05
