@@ -1,9 +1,14 @@
-"""Quintics between boundary states, fans of velocities, and choosing distinct trajectories."""
+"""Quintics between boundary states, the acceleration that they begin with, fans of velocities, and
+choosing distinct trajectories."""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
+
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+
+STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
 
 
 def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.ndarray:
@@ -25,6 +30,17 @@ def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.
     return monomials(np.asarray(times, dtype=float), derivative) @ np.linalg.inv(
         conditions.reshape(6, 6)
     )
+
+
+def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, params: QuadrotorParams) -> np.ndarray:
+    """The acceleration a_WB (3,) [m/s^2] of level flight at this attitude and velocity.
+
+    The thrust that carries the weight, c = g / (z_B · e_z), accelerates along the horizontal part
+    of the body z axis z_B, against the drag. A plan that starts with this acceleration goes on
+    smoothly from the last.
+    """
+    tilt = R_WB[:2, 2] / max(R_WB[2, 2], STEEPEST)
+    return np.append(params.gravity * tilt - params.drag * v_WB[:2], 0.0)
 
 
 def velocity_fan(

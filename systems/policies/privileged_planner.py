@@ -13,14 +13,13 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
+from splatpilot.systems.policies.motion_primitives import level_acceleration
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, QuadrotorParams
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-
-_STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
 
 
 @dataclass
@@ -40,17 +39,6 @@ class PrivilegedPlannerConfig:
                 f"1000; the default is {PrivilegedPlannerConfig.rate}."
             )
         self.lattice.validate()
-
-
-def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, params: QuadrotorParams) -> np.ndarray:
-    """The acceleration a_WB (3,) [m/s^2] of level flight at this attitude and velocity.
-
-    The thrust that carries the weight, c = g / (z_B · e_z), accelerates along the horizontal part
-    of the body z axis z_B, against the drag. A plan that starts with this acceleration goes on
-    smoothly from the last.
-    """
-    tilt = R_WB[:2, 2] / max(R_WB[2, 2], _STEEPEST)
-    return np.append(params.gravity * tilt - params.drag * v_WB[:2], 0.0)
 
 
 def plan(

@@ -24,7 +24,7 @@ from splatpilot.systems.policies.motion_primitives import (
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, slowness
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
-_LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near a goal that is not in direct reach
+LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near a goal that is not in direct reach
 
 
 @dataclass
@@ -140,7 +140,7 @@ class TrajectoryLattice:
         config = self.config
         stopping_distance = 0.5 * config.horizon * config.speed
         slowing = float(toa.value(p_WB)) / stopping_distance
-        speed = config.speed * min(max(slowing, _LEAST_SPEED_FRACTION), 1.0)
+        speed = config.speed * min(max(slowing, LEAST_SPEED_FRACTION), 1.0)
         v_L = speed * self._final_velocities_L @ rotation_to(-toa.gradient(p_WB)).T
         speeds = speed * np.array(config.speed_fractions)
         p_way, directions = toa.way(p_WB, config.horizon * speeds)

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
-from splatpilot.systems.policies.motion_primitives import quintic_basis
-from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY, QuadrotorParams
+from splatpilot.systems.policies.motion_primitives import STEEPEST, quintic_basis
+from splatpilot.systems.policies.trajectory_lattice import LEAST_SPEED_FRACTION, LatticeConfig
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
-HORIZON = 2.0  # [s], that of `LatticeConfig`
-_LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near the goal
-_STEEPEST = 0.5  # cosine of the tilt beyond which the acceleration is taken to grow no further
+HORIZON = LatticeConfig.horizon  # [s]
 
 BASIS = quintic_basis(WAYPOINT_PERIOD * np.arange(1, NUM_WAYPOINTS + 1), HORIZON)
 """(10, 6), see `quintic_basis`; of the waypoints."""
@@ -31,30 +30,24 @@ def unobstructed_way(v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any 
         speed: [m/s], nominal.
         basis: `BASIS`, as an array of the same kind.
     """
-    distance = _length(goal_B)
+    distance = ((goal_B * goal_B).sum(-1) ** 0.5)[..., None]
     direction = goal_B / distance.clip(min=1e-6)
-    slowed = speed * (2.0 * distance / (HORIZON * speed)).clip(_LEAST_SPEED_FRACTION, 1.0)
+    slowed = speed * (2.0 * distance / (HORIZON * speed)).clip(LEAST_SPEED_FRACTION, 1.0)
     reach = HORIZON * slowed
     arrives = distance <= reach
     p_end = direction * (distance * arrives + reach * ~arrives)
     v_end = direction * (slowed * ~arrives)
-    # The thrust along z_B carries the weight: what of it is level accelerates, against the drag.
-    upright = up_B[..., 2:].clip(min=_STEEPEST)
-    tilt = -up_B * up_B[..., 2:]
-    tilt[..., 2] += 1.0
-    level = v_B - up_B * (v_B * up_B).sum(-1)[..., None]
-    acceleration = GRAVITY * tilt / upright - QuadrotorParams.drag * level
-    return (
-        _column(basis, 1) * v_B[..., None, :]
-        + _column(basis, 2) * acceleration[..., None, :]
-        + _column(basis, 3) * p_end[..., None, :]
-        + _column(basis, 4) * v_end[..., None, :]
+    boundary = v_B, _level_acceleration(v_B, up_B), p_end, v_end
+    return sum(
+        basis[:, column, None] * values[..., None, :] for column, values in enumerate(boundary, 1)
     )
 
 
-def _length(vectors: Any) -> Any:
-    return ((vectors * vectors).sum(-1) ** 0.5)[..., None]
-
-
-def _column(basis: Any, number: int) -> Any:
-    return basis[:, number : number + 1]
+def _level_acceleration(v_B: Any, up_B: Any) -> Any:
+    """See `motion_primitives.level_acceleration`; in the body frame."""
+    upright = up_B[..., 2:]  # the cosine of the tilt
+    tilt = -up_B * upright
+    tilt[..., 2] += 1.0
+    level = v_B - up_B * (v_B * up_B).sum(-1)[..., None]
+    params = QuadrotorParams()
+    return params.gravity * tilt / upright.clip(min=STEEPEST) - params.drag * level

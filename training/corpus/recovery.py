@@ -82,20 +82,21 @@ def rows_before(times: np.ndarray, events: np.ndarray, period: float) -> np.ndar
     return np.unique(np.searchsorted(times, wanted - 1e-9))
 
 
-def rows_to_recover(flight: StudentFlight, period: float) -> np.ndarray:
+def rows_to_recover(flight: StudentFlight, events: np.ndarray, period: float) -> np.ndarray:
     """The samples (n,) of a flight that are labelled, none of them in contact: before near-misses,
     and all along if it did not arrive.
 
     Args:
         flight: of a student.
+        events: its near-misses (m,) [s].
         period: [s], between two states before a near-miss.
     """
-    times, clearances = flight.times, flight.clearances
-    rows = rows_before(times, near_misses(times, clearances), period)
+    times = flight.times
+    rows = rows_before(times, events, period)
     if not flight.arrived:
         lost = np.searchsorted(times, np.arange(times[0], times[-1], LOST) - 1e-9)
         rows = np.union1d(rows, lost)
-    return rows[clearances[rows] > 0.0]
+    return rows[flight.clearances[rows] > 0.0]
 
 
 def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | None = None) -> Corpus:
@@ -153,7 +154,8 @@ def _add_world(
         goal = flight.p_WG.tobytes()
         if goal not in labellers:
             labellers[goal] = Labeller(world.esdf, flight.p_WG, config.expert)
-        states = flight.states[rows_to_recover(flight, config.expert.period)]
+        events = near_misses(flight.times, flight.clearances)
+        states = flight.states[rows_to_recover(flight, events, config.expert.period)]
         labeller, bound = labellers[goal], source.perturbation_bound
         demonstrations = keep_clear(labeller.labels(states), labeller.field)
         rng = np.random.default_rng(int(flight.digest(), 16))
@@ -167,7 +169,7 @@ def _add_world(
                 "time_s": float(flight.times[-1]),
                 "least_clearance_m": float(np.nanmin(flight.clearances)),
                 "arrived": flight.arrived,
-                "near_misses": len(near_misses(flight.times, flight.clearances)),
+                "near_misses": len(events),
                 "states": len(demonstrations),
             }
         )

@@ -1,15 +1,16 @@
 """Training the student: imitation of an expert's trajectories from images of a corpus.
 
 After the paper, Sec. III-B: MobileNetV2 from ImageNet encodes the image, colours or depth; layers
-encode velocity and direction to the goal in the body frame; one linear layer makes of both three
-hypotheses of ten waypoints at 0.1 s with a cost each. Relaxed winner-takes-all; costs of what was
-predicted, by error and by the clearance of its own way (equation 4).
+encode velocity and direction to the goal in the body frame; a head makes of both three hypotheses
+of ten waypoints at 0.1 s with a cost each. Relaxed winner-takes-all; costs of what was predicted,
+by error and by the clearance of its own way (equation 4).
 
-Chosen here, where the paper is silent: the vector to the goal is of length 1 beyond 3 m and shrinks
-to nothing at the goal, as whoever knows its direction alone circles it; beside it stands which way
-is up, so that heights need not be told from the image alone. The encoder's 4x5 cells are kept
-apart, at 64 numbers each, which are as many as the average over all cells has at 1280; depth is
-encoded by its logarithm, as a grey image; the barrier is integrated over the second that is
+Chosen here, where the paper is silent: waypoints are deviations from the unobstructed way, so that
+the network need not learn to arrive; the vector to the goal is of length 1 beyond the expert's
+reach of two seconds and shrinks to nothing at the goal; beside it stands which way is up. The head
+has a hidden layer, unlike the paper's, unless `head_features` is 0. The encoder's 4x5 cells are
+kept apart, at 64 numbers each, which are as many as the average over all cells has at 1280; depth
+is encoded by its logarithm, as a grey image; the barrier is integrated over the second that is
 predicted.
 """
 
@@ -71,10 +72,10 @@ lower penalty, of error and clearance."""
             nominal_speed=self._data.speed,
         )
         self.network = StudentModule(self.spec)
-        if config.pretrained:
-            self.network.load_encoder(imagenet_weights(config.encoder))
         if config.begin:
             self._load(config.begin)
+        elif config.pretrained:
+            self.network.load_encoder(imagenet_weights(config.encoder))
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
         self.network.to(config.device).to(memory_format=torch.channels_last)

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from splatpilot.systems.policies.mobilenet import BLOCKS
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.policies.observation import validate_color_noise
 from splatpilot.training.policies.student_images import Appearance
+from splatpilot.training.policies.student_network import IMAGE_MODULES
 from splatpilot.training.policies.trainer import Schedule
 
 
@@ -94,12 +94,12 @@ class StudentTraining:
         for name in ("geometric_weight", "cost_weight"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
-        if not 0 <= self.frozen <= BLOCKS + 1:
-            raise ValueError(f"frozen is {self.frozen}; there are 0 to {BLOCKS + 1} modules")
-        if self.frozen > BLOCKS and not self.begin:
+        if not 0 <= self.frozen <= IMAGE_MODULES:
+            raise ValueError(f"frozen is {self.frozen}; there are 0 to {IMAGE_MODULES} modules")
+        if self.frozen == IMAGE_MODULES and not self.begin:
             raise ValueError(
                 f"frozen is {self.frozen}, but the layer of the cells was not trained yet; set "
-                f"begin to a file of weights, or frozen to at most {BLOCKS}"
+                f"begin to a file of weights, or frozen to at most {IMAGE_MODULES - 1}"
             )
         if self.frozen and not (self.pretrained or self.begin):
             raise ValueError(

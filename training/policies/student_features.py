@@ -1,5 +1,6 @@
 """What frozen modules of the encoder make of images: computed once, and kept in files."""
 
+from collections.abc import Iterable, Iterator
 from hashlib import blake2b
 from pathlib import Path
 
@@ -33,7 +34,7 @@ class FrozenFeatures:
         folder: of the files.
         data: the samples.
         network: whose encoder it is.
-        frozen: how many of its first modules, see `StudentModule.see`.
+        frozen: how many of its first modules, of `IMAGE_MODULES`.
         draws: of each image that is trained with.
         appearance, noise: what is drawn.
 
@@ -53,14 +54,14 @@ class FrozenFeatures:
     ) -> None:
         require_writable_folder(folder)
         self._data, self.draws = data, draws
-        self._below = None
+        below = None
         if frozen > _FIRST:
-            self._below = FrozenFeatures(folder, data, network, _FIRST, draws, appearance, noise)
+            below = FrozenFeatures(folder, data, network, _FIRST, draws, appearance, noise)
         self._network, self._frozen = network, frozen
         self._pixels = network.spec.pixels
         self._appearance, self._noise = appearance, noise
         settings = repr((network.spec.observation, draws, appearance, noise)).encode()
-        modules = network.modules_to(frozen)
+        modules = network.image_modules(frozen)
         weights = [values.detach().cpu().numpy() for values in modules.parameters()]
         what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
         files = []
@@ -74,12 +75,13 @@ class FrozenFeatures:
             files.append(folder / f"{digest.hexdigest()[:32]}.npy")
             if not files[-1].exists():
                 seed = int.from_bytes(digest.digest()[:7])
-                if self._below is None:
-                    features = self._of_images(shard, 0 if outside else draws, seed)
+                if below is None:
+                    batches = self._images(shard, 0 if outside else draws, seed)
                 else:
-                    features = self._of_features(self._below._files[number])
+                    batches = _in_batches(below._files[number])
+                features = self._features(batches, _FIRST if below else 0)
                 with written_atomically(files[-1]) as path:
-                    np.save(path, features)
+                    np.save(path, features.reshape(-1, len(shard), *features.shape[1:]))
         self._files = [np.load(file, mmap_mode="r") for file in files]
 
     def __call__(self, numbers: np.ndarray, draw: np.ndarray) -> Tensor:
@@ -89,32 +91,31 @@ class FrozenFeatures:
         return torch.from_numpy(np.stack([self._files[k][d, n] for k, n, d in rows])).float()
 
     @torch.no_grad()
-    def _of_features(self, below: np.ndarray) -> np.ndarray:
-        """(draws, n, ...) float16 of what the first modules made of the same images."""
+    def _features(self, batches: Iterable[Tensor], first: int) -> np.ndarray:
+        """(draws n, ...) float16 of what the modules before `first` made of n images."""
         device = next(self._network.parameters()).device
         kept = []
-        for rows in below:
-            for first in range(0, len(rows), _BATCH):
-                features = (
-                    torch.from_numpy(np.array(rows[first : first + _BATCH])).float().to(device)
-                )
-                seen = self._network.see(features, _FIRST, self._frozen)
-                kept.append(seen.half().cpu().numpy())
-        return np.concatenate(kept).reshape(*below.shape[:2], *kept[0].shape[1:])
+        for batch in batches:
+            encoded = self._network.encode_image(batch.float().to(device), first, self._frozen)
+            kept.append(encoded.half().cpu().numpy())
+        return np.concatenate(kept)
 
-    @torch.no_grad()
-    def _of_images(self, shard: Shard, draws: int, seed: int) -> np.ndarray:
-        """(draws, n, ...) float16; of clean images where draws is 0."""
+    def _images(self, shard: Shard, draws: int, seed: int) -> Iterator[Tensor]:
+        """The images of a shard as often as is asked, each time anew; as they are where 0."""
         device = next(self._network.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)
         pixels = shard.arrays[self._pixels]
-        kept = []
         for _ in range(max(draws, 1)):
             for first in range(0, len(pixels), _BATCH):
                 batch = np.array(pixels[first : first + _BATCH])
                 if draws:
-                    images = training_images(batch, self._appearance, self._noise, generator)
+                    yield training_images(batch, self._appearance, self._noise, generator)
                 else:
-                    images = clean_images(batch, str(device))
-                kept.append(self._network.see(images, 0, self._frozen).half().cpu().numpy())
-        return np.concatenate(kept).reshape(max(draws, 1), len(pixels), *kept[0].shape[1:])
+                    yield clean_images(batch, str(device))
+
+
+def _in_batches(features: np.ndarray) -> Iterator[Tensor]:
+    """Features (draws, n, ...) in the order of `FrozenFeatures._images`."""
+    for draw in features:
+        for first in range(0, len(draw), _BATCH):
+            yield torch.from_numpy(np.array(draw[first : first + _BATCH]))

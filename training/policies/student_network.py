@@ -18,8 +18,8 @@ from splatpilot.systems.policies.student_inference import (
 )
 from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
 
-SEEING = BLOCKS + 1
-"""Modules through which an image goes: the encoder's, and the layer of its cells."""
+IMAGE_MODULES = BLOCKS + 1
+"""Modules that an image goes through: the encoder's, and the layer of its cells."""
 
 
 class StudentModule(nn.Module):
@@ -28,6 +28,8 @@ class StudentModule(nn.Module):
     The encoder is torchvision's, with a bias in the place of each batch norm: what is trained is
     what flies, and no sample depends on the others of its batch.
     """
+
+    _basis: Tensor
 
     def __init__(self, spec: StudentSpec) -> None:
         super().__init__()
@@ -63,20 +65,20 @@ class StudentModule(nn.Module):
                 if name in weights:
                     value.copy_(weights[name])
 
-    def modules_to(self, last: int) -> nn.ModuleList:
-        """The first modules through which images go, at most `SEEING`."""
-        return nn.ModuleList([*self.features, self.cell_layer][:last])
+    def image_modules(self, count: int) -> nn.ModuleList:
+        """The first of the `IMAGE_MODULES`."""
+        return nn.ModuleList([*self.features, self.cell_layer][:count])
 
-    def freeze(self, modules: int) -> None:
-        """Has the first modules keep their weights."""
-        self.modules_to(modules).requires_grad_(False)
+    def freeze(self, count: int) -> None:
+        """Has the first of the `IMAGE_MODULES` keep their weights."""
+        self.image_modules(count).requires_grad_(False)
 
-    def see(self, image: Tensor, first: int = 0, last: int = SEEING) -> Tensor:
-        """What modules make of images (N, 3, height, width), or of what those before the `first`
-        of them made of them; of all, the numbers (N, ...) of the cells."""
+    def encode_image(self, image: Tensor, first: int = 0, last: int = IMAGE_MODULES) -> Tensor:
+        """What the `IMAGE_MODULES` from `first` to before `last` make of images (N, 3, height,
+        width), or of what those before `first` made of them."""
         if first < last:
             image = self.features[first:last](image)
-        if first < last == SEEING:
+        if first < last == IMAGE_MODULES:
             image = self.cell_layer(image.flatten(2).mT).relu().flatten(1)
         return image
 
@@ -84,11 +86,11 @@ class StudentModule(nn.Module):
         """Waypoints (N, 3, 10, 3) [m] and costs (N, 3).
 
         Args:
-            image: (N, 3, height, width), or what the `first` modules made of it.
+            image: (N, 3, height, width), or what the `first` of the `IMAGE_MODULES` made of it.
             state: (N, 9), see `encode_state`.
             first: module that takes `image`.
         """
-        cells = self.see(image, first)
+        cells = self.encode_image(image, first)
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
         joined = torch.cat([cells, y], 1)
         if self.spec.head_features:
@@ -96,8 +98,8 @@ class StudentModule(nn.Module):
         output = self.head(joined).unflatten(1, (HYPOTHESES, -1))
         deviations = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
-        speed, basis = self.spec.nominal_speed, self.get_buffer("_basis")
-        way = unobstructed_way(v_B, self.spec.reach * towards, up_B, speed, basis)
+        goal_B = self.spec.reach * towards
+        way = unobstructed_way(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
         return way[:, None] + deviations, output[..., -1]
 
 

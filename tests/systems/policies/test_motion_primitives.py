@@ -1,12 +1,15 @@
 import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
+from pydrake.math import RollPitchYaw
 
 from splatpilot.systems.policies.motion_primitives import (
+    level_acceleration,
     quintic_basis,
     rotation_to,
     select_distinct,
 )
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 
 @pytest.mark.parametrize("derivative", [0, 1, 2])
@@ -50,3 +53,13 @@ def test_selection_falls_back_to_the_most_distant():
     np.testing.assert_array_equal(select_distinct(positions, costs, 5, 0.35), [0, 1, 2, 4, 3])
     alike = np.zeros((3, 4, 3))
     np.testing.assert_array_equal(select_distinct(alike, costs[:3], 3, 0.35), [0, 1, 2])
+
+
+def test_level_acceleration():
+    """Tilt accelerates by g tan(tilt) along the tilt; in steady flight the drag takes it away."""
+    params = QuadrotorParams(drag=0.4, gravity=3.7)
+    R_WB = RollPitchYaw(0.0, 0.3, 1.0).ToRotationMatrix().matrix()
+    expected = 3.7 * np.tan(0.3) * np.array([np.cos(1.0), np.sin(1.0), 0.0])
+    np.testing.assert_allclose(level_acceleration(R_WB, np.zeros(3), params), expected, atol=1e-12)
+    v_WB = np.array([*expected[:2] / 0.4, -3.0])
+    np.testing.assert_allclose(level_acceleration(R_WB, v_WB, params), 0.0, atol=1e-12)

@@ -17,7 +17,6 @@ from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
 from splatpilot.systems.policies.privileged_planner import (
     PrivilegedPlanner,
     PrivilegedPlannerConfig,
-    level_acceleration,
     plan,
 )
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
@@ -204,15 +203,6 @@ def test_any_state_gets_finite_plans(pillar_plan, p, v, rpy):
 def pillar_plan(pillar):
     toa, lattice = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0])), TrajectoryLattice()
     return lambda state: plan(0.0, state, pillar, toa, lattice)
-
-
-def test_level_acceleration():
-    """Tilt accelerates by g tan(tilt) along the tilt; in steady flight the drag takes it away."""
-    R_WB = RollPitchYaw(0.0, 0.3, 1.0).ToRotationMatrix().matrix()
-    expected = 3.7 * np.tan(0.3) * np.array([np.cos(1.0), np.sin(1.0), 0.0])
-    np.testing.assert_allclose(level_acceleration(R_WB, np.zeros(3), PARAMS), expected, atol=1e-12)
-    v_WB = np.array([*expected[:2] / 0.4, -3.0])
-    np.testing.assert_allclose(level_acceleration(R_WB, v_WB, PARAMS), 0.0, atol=1e-12)
 
 
 def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):

@@ -5,9 +5,9 @@ import pytest
 import torch
 from pydrake.math import RollPitchYaw
 
-from splatpilot.systems.policies.privileged_planner import level_acceleration
+from splatpilot.systems.policies.motion_primitives import level_acceleration
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.policies.unobstructed_way import BASIS, HORIZON, unobstructed_way
+from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 
@@ -35,7 +35,6 @@ def test_is_the_lattices_own(distance):
     """Among the lattice's trajectories is this one, at any distance from the goal."""
     rng = np.random.default_rng(0)
     lattice = TrajectoryLattice(LatticeConfig(speed=2.6))
-    assert lattice.config.horizon == HORIZON
     R_WB = RollPitchYaw(0.2, -0.3, 1.0).ToRotationMatrix().matrix()
     p_WB, v_WB = rng.normal(size=3), rng.normal(size=3)
     direction = np.array([2.0, -1.0, 0.4]) / np.linalg.norm([2.0, -1.0, 0.4])

@@ -58,7 +58,7 @@ def test_flights_that_do_not_arrive_are_taken_all_along():
         p_WB = np.linspace([0.0, 0.0, 1.5], [end, 0.0, 1.5], len(TIMES))
         states = np.stack([hover_state(p) for p in p_WB])
         flight = StudentFlight("W", np.array([10.0, 0.0, 1.5]), TIMES, states, clear)
-        return TIMES[rows_to_recover(flight, 0.4)].tolist()
+        return TIMES[rows_to_recover(flight, near_misses(TIMES, clear), 0.4)].tolist()
 
     near = [1.5, 1.9, 2.3, 2.7, 3.1, 3.5]
     along = np.arange(0.0, 11.9, 0.8)

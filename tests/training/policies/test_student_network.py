@@ -87,7 +87,7 @@ def test_frozen_modules_and_modules_in_parts():
     image, state = torch.randn(2, 3, 48, 64), torch.randn(2, STATE_SIZE)
     whole = module(image, state)
     for first in 0, 14, 19, 20:
-        parts = module(module.see(image, 0, first), state, first)
+        parts = module(module.encode_image(image, 0, first), state, first)
         assert torch.equal(whole[0], parts[0]) and torch.equal(whole[1], parts[1])
     (whole[0].square().sum() + whole[1].sum()).backward()
     frozen = [p.grad is None for p in module.features[:14].parameters()]
