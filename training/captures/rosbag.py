@@ -11,7 +11,6 @@ that.
 
 import hashlib
 import json
-import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from tqdm import tqdm
 
@@ -30,6 +28,13 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
 from splatpilot.training.captures.photographs import cache_folder
 from splatpilot.training.captures.poses import pose_from_quaternion
+from splatpilot.training.captures.ros_images import (
+    COLORS,
+    DEPTH_UNIT,
+    DEPTHS,
+    write_color,
+    write_depth,
+)
 from splatpilot.training.captures.transform_tree import TransformTree
 from splatpilot.training.captures.tum import open_sequence
 
@@ -43,11 +48,6 @@ _POSES = {
     "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
 }
-_COLORS = {"rgb8": -1, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB}
-_COLORS |= {"bgra8": cv2.COLOR_BGRA2RGB, "mono8": cv2.COLOR_GRAY2RGB}
-_DEPTHS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
-_UNIT = 1000.0
-"""Units a metre of the depth that is written."""
 _CAMERA = "camera.json"
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
@@ -98,7 +98,7 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
         own = make(K, camera["width"], camera["height"], camera["distortion"])
         return own.scale_to(width, height)
 
-    return open_sequence(folder, "ROS bag", config, lens, _UNIT)
+    return open_sequence(folder, "ROS bag", config, lens, DEPTH_UNIT)
 
 
 @contextmanager
@@ -133,8 +133,8 @@ class _Bag:
     def write(self, folder: Path) -> None:
         """Writes images, lists of times and poses, and the calibration."""
         tree, frame = self._transforms(), self._first(self._color).header.frame_id.lstrip("/")
-        colors, poses = self._images(folder, "rgb", self._color, _write_color), []
-        self._images(folder, "depth", self._depth, _write_depth)
+        colors, poses = self._images(folder, "rgb", self._color, write_color), []
+        self._images(folder, "depth", self._depth, write_depth)
         if self._types[self._pose] == _TF:
             found = ((time, tree.pose(frame, time)) for time in colors)
             poses = [(time, X_WC) for time, X_WC in found if X_WC is not None]
@@ -187,9 +187,9 @@ class _Bag:
             return ""
         if hasattr(message, "format"):
             return "depth" if "compressedDepth" in message.format else "colour"
-        if message.encoding in _DEPTHS:
+        if message.encoding in DEPTHS:
             return "depth"
-        return "colour" if message.encoding in _COLORS else ""
+        return "colour" if message.encoding in COLORS else ""
 
     def _messages(self, *topics: str) -> Iterator[Any]:
         connections = [c for c in self._reader.connections if c.topic in topics]
@@ -268,49 +268,3 @@ def _pose(message: Any, source: str) -> RigidTransform:
     p = getattr(message, "position", None) or message.translation
     q = getattr(message, "orientation", None) or message.rotation
     return pose_from_quaternion(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]), source)
-
-
-def _write_color(message: Any, file: Path) -> Path:
-    if hasattr(message, "format"):
-        file = file.parent / f"{file.name}.{'png' if 'png' in message.format else 'jpg'}"
-        file.write_bytes(bytes(message.data))
-        return file
-    pixels = _pixels(message, np.uint8)
-    if (code := _COLORS[message.encoding]) >= 0:
-        pixels = cv2.cvtColor(pixels, code)
-    return _write_png(file, pixels[..., ::-1])
-
-
-def _write_depth(message: Any, file: Path) -> Path:
-    if hasattr(message, "format"):
-        # A header of an enumeration and two floats, then a PNG; of floats 1 / depth is stored.
-        _, a, b = struct.unpack("<iff", bytes(message.data[:12]))
-        stored = cv2.imdecode(np.asarray(message.data[12:], np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None:
-            raise ValueError("no PNG")
-        depth = stored
-        if "32FC1" in message.format:
-            inverse = stored.astype(np.float32) - np.float32(b)
-            depth = np.where(stored > 0, np.float32(a) / np.maximum(inverse, 1e-6), 0)
-    else:
-        depth = _pixels(message, _DEPTHS[message.encoding])[..., 0]
-    if depth.dtype != np.uint16:
-        known = np.isfinite(depth) & (depth > 0) & (depth < 65.5)
-        depth = np.where(known, np.round(_UNIT * np.where(known, depth, 0)), 0).astype(np.uint16)
-    return _write_png(file, depth)
-
-
-def _pixels(message: Any, dtype: type) -> NDArray:
-    """(H, W, C), of rows that may be padded."""
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    item = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
-    channels = rows.shape[1] // message.width // item.itemsize
-    rows = np.ascontiguousarray(rows[:, : message.width * channels * item.itemsize])
-    return rows.view(item).reshape(message.height, message.width, channels).astype(dtype)
-
-
-def _write_png(file: Path, pixels: NDArray) -> Path:
-    file = file.parent / f"{file.name}.png"
-    if not cv2.imwrite(str(file), np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"{file}: cannot be written; is the disk full?")
-    return file
