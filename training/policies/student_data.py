@@ -29,7 +29,7 @@ class StudentData:
     """Corpora as one, their worlds known by name, some of them held out.
 
     Args:
-        corpora: may share worlds.
+        corpora: may share worlds, and shards, which count once.
         held_out: part of the worlds whose samples are not trained with. Which they are their names
             decide, so that samples gathered in them later stay on the same side.
         device: where labels live; images stay on disk.
@@ -68,8 +68,15 @@ class StudentData:
         self.worlds = sorted([*self.held_out_worlds, *others[: worlds or None]])
         """Names."""
         chosen = set(self.worlds)
-        shards = [shard for corpus in corpora for shard in corpus.shards if len(shard)]
-        self.shards = [shard for shard in shards if shard.world in chosen]
+        # What two corpora link to, as those of two students' recovery do, counts once: by its
+        # world's folder and all that it states, checksums of every file among it.
+        shards = {
+            (shard.path.name, (shard.path / "shard.json").read_bytes()): shard
+            for corpus in corpora
+            for shard in corpus.shards
+            if len(shard)
+        }
+        self.shards = [shard for shard in shards.values() if shard.world in chosen]
         """Blocks of samples, which are numbered through them."""
         counts = [len(shard) for shard in self.shards]
         self.first = np.cumsum([0, *counts])

@@ -14,19 +14,19 @@ from splatpilot.training.policies.student_data import StudentData
 
 @pytest.fixture(scope="module")
 def two(student_corpus, tmp_path_factory) -> list[Corpus]:
-    """The corpus, and one of the same worlds that lacks the samples of the first."""
+    """The corpus of 72 samples, and a copy that lacks the 24 of one of the three worlds."""
     part = tmp_path_factory.mktemp("part") / "corpus"
     shutil.copytree(student_corpus, part)
-    shutil.rmtree(part / "shards" / "expert-pillars-0")
+    shutil.rmtree(part / "shards" / "expert-pillars-1")
     return [Corpus(student_corpus), Corpus(part)]
 
 
 def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
     """A third of the worlds is held out with all samples of theirs; more samples of the same worlds
-    change no world's side."""
-    alone, joined = StudentData(two[:1], 0.34), StudentData(two, 0.34)
+    change no world's side, and what both corpora have counts once."""
+    alone, joined = StudentData(two[1:], 0.34), StudentData(two[::-1], 0.34)
     assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
-    for data, count in ((alone, 72), (joined, 120)):
+    for data, count in ((alone, 48), (joined, 72)):
         assert sorted([*data.training, *data.held_out]) == list(range(count))
         outside = {data.worlds[w] for w in data.labels(data.held_out).world}
         inside = {data.worlds[w] for w in data.labels(data.training).world}
@@ -50,12 +50,13 @@ def test_fewer_worlds_are_a_part_of_more(two):
 
 def test_samples_keep_their_order_and_world(two):
     """Numbers from both corpora in any order give what each corpus says of them."""
-    data = StudentData(two, 0.34)
-    numbers = np.array([100, 3, 71, 72, 5, 119])
+    data = StudentData(two[::-1], 0.34)
+    numbers = np.array([60, 3, 47, 48, 5, 71])
     depth, color = data.pixels(numbers, "depth"), data.pixels(numbers, "color")
     labels = data.labels(numbers)
+    first = len(two[0].shards[0])
     for row, number in enumerate(numbers):
-        corpus, within = (two[0], number) if number < 72 else (two[1], number - 72)
+        corpus, within = (two[1], number) if number < 48 else (two[0], first + number - 48)
         one = corpus.samples(np.array([within]))
         np.testing.assert_array_equal(depth[row], one.depth[0])
         np.testing.assert_array_equal(color[row], one.color[0])
@@ -68,7 +69,7 @@ def test_distances_along_trajectories_are_those_of_the_world(two):
     """At the waypoints of the experts, brought into the world by the sample's pose, the distance is
     the one of the recorded field, which counts unknown space as occupied."""
     data = StudentData(two, 0.34)
-    labels = data.labels(np.arange(0, 120, 7))
+    labels = data.labels(np.arange(0, 72, 5))
     found = data.distance_along(labels.trajectories_B, labels)
     fields = {world.name: world.esdf().conservative() for world in two[0].worlds}
     for n, world in enumerate(labels.world):
