@@ -1,11 +1,12 @@
 """What decides how well a student imitates: trainings that differ in some fields.
 
-    python benchmarks/imitation.py OUT student_rgb --measure CORPUS --set 'corpora=[CORPUS]' \\
+    python benchmarks/imitation.py OUT student_rgb --measure CORPUS \\
+        --line 'drawn looks' 'corpora=[CORPUS]' --line 'one look' 'corpora=[PLAIN]' \\
         --case 8 worlds=8 --case 32 worlds=32 --case 128 worlds=128 --seeds 0 1 2
 
-Each case is trained once for each seed, in a folder of OUT; the same command goes on where it was
-interrupted, and with more cases or seeds it adds to them. What is printed is measured on the worlds
-that the corpus of --measure holds out, whatever a case was trained on, of the same worlds: the mean
+Each case of each line is trained once for each seed, in a folder of OUT; the same command goes on
+where it was interrupted, and with more of any it adds to them. What is printed is measured on the
+worlds that the corpus of --measure holds out, whatever was trained on, of the same worlds: the mean
 over seeds and its 95 % interval by Student's t. Where all cases are numbers they are also drawn, in
 OUT/curve.png.
 """
@@ -48,13 +49,16 @@ def half_interval(values: np.ndarray) -> np.ndarray:
     return t.ppf(0.975, n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
 
 
-def draw(cases: list[float], means: np.ndarray, halves: np.ndarray, path: Path) -> None:
-    """Success over the cases, with intervals."""
+def draw(cases: list[float], lines: dict[str, np.ndarray], path: Path) -> None:
+    """Success over the cases, with intervals, of lines (seeds, cases)."""
     figure, axes = plt.subplots(figsize=(5.0, 3.2), layout="constrained")
-    axes.errorbar(cases, 100.0 * means, 100.0 * halves, marker="o", capsize=3.0)
+    for name, successes in lines.items():
+        mean, half = successes.mean(axis=0), half_interval(successes)
+        axes.errorbar(cases, 100.0 * mean, 100.0 * half, marker="o", capsize=3.0, label=name)
     axes.set(xscale="log", xlabel="case", ylabel="success on held-out worlds [%]")
     axes.set_xticks(cases, [f"{case:g}" for case in cases])
     axes.minorticks_off()
+    axes.legend()
     figure.savefig(path, dpi=150)
 
 
@@ -69,31 +73,37 @@ def main() -> None:
     parser.add_argument(
         "--case", action="append", nargs="+", required=True, metavar="NAME FIELD=VALUE"
     )
+    parser.add_argument(
+        "--line", action="append", nargs="+", default=[], metavar="NAME FIELD=VALUE"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     args = parser.parse_args()
-    rows = {}
-    for name, *overrides in args.case:
-        rows[name] = np.array(
-            [
-                measured(
-                    args.policy,
-                    [*args.set, *overrides, f"seed={seed}"],
-                    args.measure,
-                    args.out / name / f"seed_{seed}",
-                )
-                for seed in args.seeds
-            ]
-        )
-    print("| case | " + " | ".join(MEASURES) + " |")
-    for name, values in rows.items():
-        shown = zip(values.mean(axis=0), half_interval(values), strict=True)
-        print(
-            f"| {name} | " + " | ".join(f"{mean:.3f} ± {half:.3f}" for mean, half in shown) + " |"
-        )
-    if all(name.replace(".", "", 1).isdigit() for name in rows):
-        successes = np.stack([values[:, 0] for values in rows.values()], axis=1)
-        cases = [float(name) for name in rows]
-        draw(cases, successes.mean(axis=0), half_interval(successes), args.out / "curve.png")
+    print("| line | case | " + " | ".join(MEASURES) + " |")
+    lines = {}
+    for line, *common in args.line or [["all"]]:
+        successes = []
+        for case, *own in args.case:
+            settings = [*args.set, *common, *own]
+            folder = args.out / line.replace(" ", "_") / case
+            values = np.array(
+                [
+                    measured(
+                        args.policy,
+                        [*settings, f"seed={seed}"],
+                        args.measure,
+                        folder / f"seed_{seed}",
+                    )
+                    for seed in args.seeds
+                ]
+            )
+            shown = zip(values.mean(axis=0), half_interval(values), strict=True)
+            cells = [line, case, *(f"{mean:.3f} ± {half:.3f}" for mean, half in shown)]
+            print("| " + " | ".join(cells) + " |", flush=True)
+            successes.append(values[:, 0])
+        lines[line] = np.stack(successes, axis=1)
+    cases = [case for case, *_ in args.case]
+    if all(case.replace(".", "", 1).isdigit() for case in cases):
+        draw([float(case) for case in cases], lines, args.out / "curve.png")
 
 
 if __name__ == "__main__":
