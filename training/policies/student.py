@@ -91,6 +91,7 @@ lower penalty, of error and clearance."""
                 config.noise,
             )
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
+        self._rank, self._processes = 0, 1
         data, count = self._data.held_out, config.validation_samples
         self._validation = data[np.linspace(0, len(data) - 1, min(count, len(data))).astype(int)]
 
@@ -112,15 +113,26 @@ lower penalty, of error and clearance."""
             )
         self.network.load_state_dict(fitting, strict=False)
 
+    def take_part(self, rank: int, count: int) -> None:
+        """See `Trainer`.
+
+        Raises:
+            ValueError: unless the batch has `count` equal parts.
+        """
+        batch = self._config.batch
+        if batch % count:
+            raise ValueError(
+                f"batch is {batch}, of which {count} processes cannot have equal parts; choose a "
+                f"multiple of {count}"
+            )
+        self._rank, self._processes = rank, count
+
     def begin_update(self, update: int) -> None:
         pass
 
     def losses(self) -> dict[str, Tensor]:
-        config, training = self._config, self._data.training
-        drawn = torch.randint(
-            len(training), (config.batch,), generator=self._generator, device=config.device
-        )
-        numbers = training[drawn.cpu().numpy()]
+        training = self._data.training
+        numbers = training[self._drawn(len(training))]
         return self._judge(numbers, self._drawn_images(numbers)).terms
 
     @torch.no_grad()
@@ -149,15 +161,23 @@ lower penalty, of error and clearance."""
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._generator.set_state(state["generator"])
 
+    def _drawn(self, count: int) -> np.ndarray:
+        """A number from 0 to before `count` for each sample of this process's part of a batch."""
+        config = self._config
+        size, device = (config.batch,), config.device
+        drawn = torch.randint(count, size, generator=self._generator, device=device)
+        return drawn.cpu().numpy()[self._rank :: self._processes]
+
     def _drawn_images(self, numbers: np.ndarray) -> Tensor:
         """Images of samples to train with, or what frozen modules made of them."""
-        config, generator = self._config, self._generator
+        config = self._config
         if self._features is None:
             pixels = self._data.pixels(numbers, self.spec.pixels)
-            return training_images(pixels, config.appearance, config.noise, generator)
-        size = (len(numbers),)
-        draw = torch.randint(config.draws, size, generator=generator, device=config.device)
-        return self._features(numbers, draw.cpu().numpy()).to(config.device)
+            # Of its own: what it draws depends on how many images this process has.
+            seed = int(torch.randint(2**62, (1,), generator=self._generator, device=config.device))
+            disturbing = torch.Generator(config.device).manual_seed(seed + self._rank)
+            return training_images(pixels, config.appearance, config.noise, disturbing)
+        return self._features(numbers, self._drawn(config.draws)).to(config.device)
 
     def _clean_images(self, numbers: np.ndarray) -> Tensor:
         """Images of held-out samples, or what frozen modules made of them."""

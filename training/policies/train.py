@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from splatpilot.systems.output_folders import holds_folder
+from splatpilot.systems.output_folders import held_folder
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.device import require_device
 from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
+from splatpilot.training.policies.torchrun import Processes, torchrun_processes
 from splatpilot.training.policies.trainer import FLIGHTS, Trainer, TrainingConfig
 from splatpilot.training.tensor_files import save_tensors
 
@@ -33,14 +35,14 @@ class NotFiniteError(ValueError):
     """A term of the loss, or the gradient, became infinite or not a number."""
 
 
-@holds_folder("out")
 @one_torch_thread()
 def run[Config: TrainingConfig](
     *, config: Config, out: Path, make: Callable[[Config], Trainer], bar_line: int = 0
 ) -> dict[str, Any]:
     """
     Trains a policy on one thread, from where an interrupted run of the same configuration in `out`
-    stopped.
+    stopped. Of several processes that torchrun started the first writes; each learns from a part of
+    every batch, so that they learn what one would, up to rounding and noise.
 
     Leaves in `out`: `POLICY.npz`, the weights that did best on held-out worlds, for
     `PolicyCheckpoint`; `config.yaml`; `curves.csv`, the terms of the loss and the success over the
@@ -58,17 +60,36 @@ def run[Config: TrainingConfig](
 
     Raises:
         ValueError: on a config out of range; if `out` holds a run of another configuration or a
-            damaged checkpoint; if a term of the loss is not finite, naming it: the best weights so
+            damaged checkpoint; if torchrun started several and the trainer's batches have no parts;
+            if a term of the loss is not finite, naming it: the best weights so
             far stay in `out`.
         OSError: if `out` cannot be written.
     """
     config.validate()
     require_device(config.device)
+    with torchrun_processes(config.device) as processes:
+        with held_folder(out) if processes.first else nullcontext():
+            return _run(config, out, make, bar_line, processes)
+
+
+def _run[Config: TrainingConfig](
+    config: Config,
+    out: Path,
+    make: Callable[[Config], Trainer],
+    bar_line: int,
+    processes: Processes,
+) -> dict[str, Any]:
+    """See `run`."""
+    if not processes.first:
+        processes.wait()  # until what all of them read is written
     folder = RunFolder.claim(out, config)
     schedule = config.schedule
     started = time.process_time()
     torch.manual_seed(config.seed)
     trainer = make(config)
+    if processes.first:
+        processes.wait()
+    processes.share_batches(trainer)
     network = trainer.network
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
@@ -96,13 +117,14 @@ def run[Config: TrainingConfig](
         total=schedule.updates, initial=progress.update, unit="update", disable=None,
         desc=f"{trainer.policy}, seed {config.seed}", position=bar_line,
     )  # fmt: skip
-    with event_log(str(out) if schedule.tensorboard else "") as log, bar:
+    logs = schedule.tensorboard and processes.first
+    with event_log(str(out) if logs else "") as log, bar:
         while progress.update < schedule.updates:
             for group in optimizer.param_groups:
                 group["lr"] = schedule.learning_rate * schedule.factor(progress.update)
             trainer.begin_update(progress.update)
             try:
-                terms = step_optimizer(trainer.losses, network, optimizer, schedule.clip)
+                terms = step_optimizer(trainer.losses, network, optimizer, schedule.clip, processes)
             except NotFiniteError as error:
                 raise ValueError(
                     f"training stopped at update {progress.update}: {error}; the best weights so "
@@ -115,7 +137,7 @@ def run[Config: TrainingConfig](
                 means[name] = value if name not in means else 0.98 * means[name] + 0.02 * value
             bar.set_postfix(_shown(progress), refresh=False)
             keep, measure = schedule.due(progress.update)
-            if keep or measure:
+            if processes.first and (keep or measure):
                 measured = trainer.evaluate() if measure else {}
                 row = {"update": float(progress.update), **means, **measured}
                 progress.curves.append(row)
@@ -124,6 +146,7 @@ def run[Config: TrainingConfig](
                     progress.best = {"update": progress.update, **measured}
                     folder.write_weights(trainer.policy, trainer.spec, network, progress.best)
                 save()
+    progress.best = processes.of_first(progress.best)
     summary = {
         "policy": trainer.policy,
         "seed": config.seed,
@@ -131,6 +154,8 @@ def run[Config: TrainingConfig](
         "cpu_minutes": round(progress.cpu_seconds / 60.0, 2),
         "best": progress.best,
     }
+    if not processes.first:
+        return summary
     folder.write_summary(summary, getattr(trainer, "measures", FLIGHTS))
     print(
         f"{trainer.policy}: success {progress.best['success']:.0%} on held-out worlds after "
@@ -154,9 +179,10 @@ def step_optimizer(
     network: torch.nn.Module,
     optimizer: torch.optim.Optimizer,
     clip: float,
+    processes: Processes = Processes(),  # noqa: B008 (it is frozen)
 ) -> dict[str, float]:
     """One step down the sum of the terms that `losses` returns; their values and that of the sum,
-    `loss`. What has no gradient is no part of it.
+    `loss`. What has no gradient is no part of it. Terms and gradients are the means over processes.
 
     Raises:
         NotFiniteError: naming the term, or the gradient; the weights are then as before.
@@ -168,11 +194,14 @@ def step_optimizer(
     optimizer.zero_grad(set_to_none=True)
     loss = torch.stack([term for term in terms.values() if term.requires_grad]).sum()
     loss.backward()
+    terms = {name: term.detach().clone() for name, term in (terms | {"loss": loss}).items()}
+    gradients = [weight.grad for weight in network.parameters() if weight.grad is not None]
+    processes.average([*gradients, *terms.values()])
     norm = torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     if not torch.isfinite(norm):
         raise NotFiniteError(f"the gradient of the loss became {norm.item()}")
     optimizer.step()
-    return {name: float(term.detach()) for name, term in (terms | {"loss": loss}).items()}
+    return {name: float(term) for name, term in terms.items()}
 
 
 def _resume(path: Path, trainer: Trainer, optimizer: torch.optim.Optimizer) -> _Progress:

@@ -74,7 +74,8 @@ the success in worlds of its kind."""
 
 class Trainer(Protocol):
     """What trains one policy, whatever it learns from. It may have `measures`, a text for the model
-    card on what `evaluate` measures, see `FLIGHTS`."""
+    card on what `evaluate` measures, see `FLIGHTS`; and `take_part(rank, count)`, after which
+    `losses` are of one of `count` equal parts of every batch, so that processes learn together."""
 
     policy: str
     """Name of the policy, and of its file of weights."""
