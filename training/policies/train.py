@@ -61,8 +61,7 @@ def run[Config: TrainingConfig](
     Raises:
         ValueError: on a config out of range; if `out` holds a run of another configuration or a
             damaged checkpoint; if torchrun started several and the trainer's batches have no parts;
-            if a term of the loss is not finite, naming it: the best weights so
-            far stay in `out`.
+            if a term of the loss is not finite, naming it: the best weights so far stay in `out`.
         OSError: if `out` cannot be written.
     """
     config.validate()
@@ -114,7 +113,8 @@ def _run[Config: TrainingConfig](
         folder.write_curves(progress.curves)
 
     bar = tqdm(
-        total=schedule.updates, initial=progress.update, unit="update", disable=None,
+        total=schedule.updates, initial=progress.update, unit="update",
+        disable=None if processes.first else True,
         desc=f"{trainer.policy}, seed {config.seed}", position=bar_line,
     )  # fmt: skip
     logs = schedule.tensorboard and processes.first
