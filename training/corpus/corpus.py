@@ -90,3 +90,19 @@ class Corpus:
 def entries(folder: Path) -> list[Path]:
     """The folders in a folder by name, without those that are only being written."""
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+
+
+def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
+    """The shards of each corpus that none before it has: those of two students' recovery link to
+    what both began with. The same are two with one name and all that they state, checksums of every
+    file among it."""
+    seen: set[tuple[str, bytes]] = set()
+    kept: list[list[Shard]] = []
+    for corpus in corpora:
+        kept.append([])
+        for shard in corpus.shards:
+            what = shard.path.name, (shard.path / "shard.json").read_bytes()
+            if what not in seen:
+                seen.add(what)
+                kept[-1].append(shard)
+    return kept

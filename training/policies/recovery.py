@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -28,9 +29,10 @@ from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.corpus import Corpus, distinct_shards
 from splatpilot.training.corpus.recovery import StudentFlight, add_recovery
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
+from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.corpus.world_record import WorldRecord
 from splatpilot.training.policies import train
 from splatpilot.training.policies.student_data import held_out_names
@@ -113,9 +115,9 @@ def run[Config: CorpusTraining](
     names = sorted({world.name for corpus in corpora for world in corpus.worlds})
     held_out = held_out_names(names, config.held_out)
     outcomes: Counter[str] = Counter()
-    for folder, corpus in zip(folders, corpora, strict=True):
+    for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
         flown, ended = _fly_worlds(
-            corpus, held_out, weights, out / "flights" / folder.name, flights, jobs
+            corpus, shards, held_out, weights, out / "flights" / folder.name, flights, jobs
         )
         outcomes += ended
         add_recovery(folder, flown, jobs)
@@ -147,12 +149,19 @@ def _link_corpus(source: Path, folder: Path) -> None:
 
 
 def _fly_worlds(
-    corpus: Corpus, held_out: Sequence[str], weights: Path, folder: Path, flights: int, jobs: int
+    corpus: Corpus,
+    shards: Sequence[Shard],
+    held_out: Sequence[str],
+    weights: Path,
+    folder: Path,
+    flights: int,
+    jobs: int,
 ) -> tuple[list[StudentFlight], Counter[str]]:
-    """The student's flights in the worlds of a corpus that are not held out, and how they ended."""
+    """The student's flights, the ways that `shards` of a corpus show, in its worlds that are not
+    held out, and how they ended."""
     folder.mkdir(parents=True, exist_ok=True)
     tasks: dict[str, list[Task]] = {world.name: [] for world in corpus.worlds}
-    for shard in corpus.shards:
+    for shard in shards:
         if shard.source == EXPERT and shard.world not in held_out:
             tasks[shard.world] += [
                 Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
@@ -216,7 +225,7 @@ def _fly_world(
 
 def _ledger(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]:
     """How many flights ended how, near-misses that they had, and samples by where they are from."""
-    shards = [shard for corpus in corpora for shard in corpus.shards]
+    shards = list(chain.from_iterable(distinct_shards(corpora)))
     recovered = [shard for shard in shards if shard.source == RECOVERY]
     return {
         "flights": dict(sorted(outcomes.items())),

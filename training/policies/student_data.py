@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.corpus import Corpus, distinct_shards
 from splatpilot.training.policies.ray_casting import EsdfGeometry
 from splatpilot.training.policies.vehicles import rotation_matrix
 
@@ -68,15 +69,8 @@ class StudentData:
         self.worlds = sorted([*self.held_out_worlds, *others[: worlds or None]])
         """Names."""
         chosen = set(self.worlds)
-        # What two corpora link to, as those of two students' recovery do, counts once: by its
-        # world's folder and all that it states, checksums of every file among it.
-        shards = {
-            (shard.path.name, (shard.path / "shard.json").read_bytes()): shard
-            for corpus in corpora
-            for shard in corpus.shards
-            if len(shard)
-        }
-        self.shards = [shard for shard in shards.values() if shard.world in chosen]
+        shards = chain.from_iterable(distinct_shards(corpora))
+        self.shards = [shard for shard in shards if len(shard) and shard.world in chosen]
         """Blocks of samples, which are numbered through them."""
         counts = [len(shard) for shard in self.shards]
         self.first = np.cumsum([0, *counts])

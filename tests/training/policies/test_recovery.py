@@ -77,6 +77,12 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert len(set(samples.world[samples.source == RECOVERY])) == 1
     assert len(list((whole / "flights" / "0").iterdir())) == 1
     assert json.loads((whole / "recovery.json").read_text()) == ledger
+    both = f"corpora=[{whole / 'corpora' / '0'}, {expert}]"  # what they share is flown once
+    config = load_config(StudentDepthTraining(), overrides=[both, *TINY])
+    more = recovery.run(
+        config=config, make=StudentTrainer, out=tmp_path / "more", flights=1, jobs=1
+    )
+    assert sum(more["flights"].values()) == 1 and more["expert_samples"] == len(Corpus(expert))
 
     for step in ("_fly_world", "_ledger"):
         with monkeypatch.context() as patch:
