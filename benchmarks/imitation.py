@@ -49,13 +49,13 @@ def half_interval(values: np.ndarray) -> np.ndarray:
     return t.ppf(0.975, n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
 
 
-def draw(cases: list[float], lines: dict[str, np.ndarray], path: Path) -> None:
-    """Success over the cases, with intervals, of lines (seeds, cases)."""
+def draw(field: str, cases: list[float], lines: dict[str, np.ndarray], path: Path) -> None:
+    """Success over the cases of a field, with intervals, of lines (seeds, cases)."""
     figure, axes = plt.subplots(figsize=(5.0, 3.2), layout="constrained")
     for name, successes in lines.items():
         mean, half = successes.mean(axis=0), half_interval(successes)
         axes.errorbar(cases, 100.0 * mean, 100.0 * half, marker="o", capsize=3.0, label=name)
-    axes.set(xscale="log", xlabel="case", ylabel="success on held-out worlds [%]")
+    axes.set(xscale="log", xlabel=field, ylabel="success on held-out worlds [%]")
     axes.set_xticks(cases, [f"{case:g}" for case in cases])
     axes.minorticks_off()
     axes.legend()
@@ -103,7 +103,8 @@ def main() -> None:
         lines[line] = np.stack(successes, axis=1)
     cases = [case for case, *_ in args.case]
     if all(case.replace(".", "", 1).isdigit() for case in cases):
-        draw([float(case) for case in cases], lines, args.out / "curve.png")
+        field = args.case[0][1].partition("=")[0]
+        draw(field, [float(case) for case in cases], lines, args.out / "curve.png")
 
 
 if __name__ == "__main__":
