@@ -125,18 +125,20 @@ def test_weights_that_ship_fly_around_what_stands_ahead():
 
 
 def test_weights_that_ship_see_colours():
-    """The student that sees colours wants other things where it sees, or is told, others."""
+    """The student that sees colours, in flight, wants other things where it sees, or is told,
+    others."""
     network, X_WB = load_network("", "rgb"), RigidTransform([0.0, 0.0, 1.5])
+    v_WB = np.array([1.5, 0.0, 0.0])
     meadow = np.full((120, 160, 3), [150, 180, 220], np.uint8)
     meadow[60:] = 90, 110, 70
     trunk = meadow.copy()
     trunk[:, 60:100] = 60, 45, 30
 
     def waypoints_B(image: np.ndarray, p_WG: list[float]) -> np.ndarray:
-        hypotheses = plan(network, 0.0, image, X_WB, np.zeros(3), np.array(p_WG))
+        hypotheses = plan(network, 0.0, image, X_WB, v_WB, np.array(p_WG))
         return hypotheses.waypoints_B[hypotheses.best]
 
     left, right = (waypoints_B(meadow, [2.0, y, 1.5]) for y in (2.0, -2.0))
-    assert left[-1, 1] > 0.1 and right[-1, 1] < -0.1
+    assert left[-1, 1] > 0.3 and right[-1, 1] < -0.3
     ahead = [4.0, 0.0, 1.5]
     assert np.abs(waypoints_B(trunk, ahead) - waypoints_B(meadow, ahead)).max() > 0.05
