@@ -2,12 +2,9 @@
 #pragma once
 
 #include "footprints.hpp"
-#include "mathematics.hpp"
-#include "types.hpp"
+#include "tile_blocks.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
-
-constexpr int kStageWords = kStageSize / 64;
 
 // Running sums of the 16 pixels of a block. Transmittance never grows, so a pixel whose next value
 // would not exceed the limit is finished for good: that one comparison takes the place of a mask
@@ -18,70 +15,6 @@ struct BlockState {
   // that fell to one half, if it did.
   F16 sharp_transmittance, median_w;
 };
-
-struct alignas(64) StagedTile {
-  StagedSplat splats[kStageSize];
-  StagedPlane planes[kStageSize];
-  uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
-};
-
-// From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
-// transposed 16 splats at a time: one shifted into the sign shows in the lane bits. `blocks` has
-// room for a multiple of 64.
-SP_INLINE void transpose_blocks(int32_t* blocks, int count,
-                                uint64_t touching[kBlocksPerTile][kStageWords]) {
-  for (int i = count; i < (count + 63) / 64 * 64; ++i) blocks[i] = 0;
-  for (int word = 0; word < (count + 63) / 64; ++word) {
-    for (int b = 0; b < kBlocksPerTile; ++b) touching[b][word] = 0;
-    for (int part = 0; part < 4; ++part) {
-      const I16 pack = load(blocks + 64 * word + kLanes * part);
-      for (int b = 0; b < kBlocksPerTile; ++b) {
-        const uint64_t bits = sign_bits(shift_left(pack, 31 - b));
-        touching[b][word] |= bits << (kLanes * part);
-      }
-    }
-  }
-}
-
-// With `planes`, of these too.
-SP_INLINE void stage(const RasterInput& in, bool planes, size_t begin, int count, float left,
-                     float top, StagedTile& staged) {
-  alignas(64) int32_t blocks[kStageSize];
-  for (int i = 0; i < count; ++i) {
-    const Pair* pair = in.pairs + begin + i;
-    if (i + kPrefetchAhead < count) {
-      __builtin_prefetch(in.splats + pair[kPrefetchAhead].splat);
-      if (planes) __builtin_prefetch(in.planes + pair[kPrefetchAhead].splat);
-    }
-    const Splat& splat = in.splats[pair->splat];
-    staged.splats[i] = in_tile(splat, left, top);
-    if (planes) {
-      staged.planes[i] = in_tile(in.planes[pair->splat], splat, left, top);
-    }
-    blocks[i] = static_cast<int32_t>(pair->blocks);
-  }
-  transpose_blocks(blocks, count, staged.touching);
-}
-
-// Pixel centres of the 16 lanes of a block, from its corner.
-struct LaneCentres {
-  F16 x, y;
-};
-
-SP_INLINE LaneCentres lane_centres() {
-  alignas(64) float x[kLanes], y[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
-    y[lane] = static_cast<float>(lane / kBlockSize) + 0.5f;
-  }
-  return {load(x), load(y)};
-}
-
-// The same of block b of a tile, from the tile's corner.
-SP_INLINE LaneCentres block_centres(const LaneCentres& centres, int b) {
-  return {centres.x + F16(static_cast<float>(kBlockSize * (b % 4))),
-          centres.y + F16(static_cast<float>(kBlockSize * (b / 4)))};
-}
 
 // Composites the staged splats of one block; returns whether any pixel is still open. A pixel whose
 // colour is finished is open while its median depth is sought.
@@ -153,22 +86,6 @@ SP_INLINE void finish_block(const Image& image, const BlockState& state, BlockPi
   }
 }
 
-// Calls visit(lane, pixel) for the pixels of a block that are on the image.
-template <typename Visit>
-SP_INLINE void for_each_pixel(int width, int height, int left, int top, const Visit& visit) {
-  const int columns = width - left < kBlockSize ? width - left : kBlockSize;
-  const int rows = height - top < kBlockSize ? height - top : kBlockSize;
-  size_t pixel = static_cast<size_t>(top) * static_cast<size_t>(width) + static_cast<size_t>(left);
-  for (int row = 0; row < rows; ++row, pixel += static_cast<size_t>(width)) {
-    const int lane = kBlockSize * row;
-    if (columns == kBlockSize) {  // of a length that the compiler knows
-      for (int i = 0; i < kBlockSize; ++i) visit(lane + i, pixel + static_cast<size_t>(i));
-    } else {
-      for (int i = 0; i < columns; ++i) visit(lane + i, pixel + static_cast<size_t>(i));
-    }
-  }
-}
-
 template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE void write_block(const Image& image, const BlockState& state, int width, int height,
                            int left, int top) {
@@ -184,16 +101,6 @@ SP_INLINE void write_block(const Image& image, const BlockState& state, int widt
     }
     if constexpr (kDepth || kMedian) image.depth[pixel * image.depth_stride] = pixels.depth[lane];
   });
-}
-
-// 1 for pixels of block b of the tile that lie inside the image, else 0.
-SP_INLINE F16 ones_inside(int width, int height, const LaneCentres& centres, int left, int top,
-                          int b) {
-  const int columns = width - left - kBlockSize * (b % 4);
-  const int rows = height - top - kBlockSize * (b / 4);
-  return zero_unless(
-      (centres.x < F16(static_cast<float>(columns))) & (centres.y < F16(static_cast<float>(rows))),
-      F16(1.0f));
 }
 
 template <bool kColor, bool kDepth, bool kMedian>

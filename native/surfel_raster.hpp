@@ -2,8 +2,8 @@
 #pragma once
 
 #include "mathematics.hpp"
-#include "raster.hpp"
 #include "surfel_types.hpp"
+#include "tile_blocks.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 

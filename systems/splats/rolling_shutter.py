@@ -1,16 +1,20 @@
 """Rolling shutters: each row of an image is seen from where the camera was when it was read.
 
 Rows are read one after the other at even times, the first at the pose X_WC0 and the last at X_WC1,
-those between at `pose_between`. Rows between which an image
-hardly moves are rendered together, as a band, from the pose of their middle.
+those between at `pose_between`. Rows between which an image hardly moves are rendered together, as
+a band, from the pose of their middle.
 """
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
+
+from splatpilot.systems.pose_between import pose_between
 
 _STEP = 0.5
 """[px] that an image may move between two bands, so that no row is off by more than half of it."""
@@ -37,8 +41,31 @@ def row_bands(
     return list(pairwise(edges))
 
 
-def band_intrinsics(K: NDArray[np.float64], first: int) -> NDArray[np.float64]:
-    """The intrinsics (3, 3) [px] of an image's rows from `first` on as an image of their own."""
-    cropped = K.copy()
-    cropped[1, 2] -= first
-    return cropped
+class Band(NamedTuple):
+    """Rows of an image that are rendered from one pose, as an image of their own."""
+
+    K: NDArray[np.float64]
+    """Its intrinsics (3, 3) [px]."""
+    height: int
+    """[px]"""
+    X_WC: RigidTransform
+    """Where its middle row is read."""
+    s: float
+    """When: 0 as the first row of all is, 1 as the last."""
+
+
+def camera_bands(
+    K: NDArray[np.float64],
+    height: int,
+    X_WC0: RigidTransform,
+    X_WC1: RigidTransform,
+    fewest: int = 1,
+) -> Iterator[Band]:
+    """The bands of an image of intrinsics K (3, 3) [px] from its first row to its last; else as
+    `row_bands`."""
+    focal = float(max(K[0, 0], K[1, 1]))
+    for first, last in row_bands(X_WC0, X_WC1, focal, height, fewest):
+        s = 0.5 * (first + last) / height
+        cropped = K.copy()
+        cropped[1, 2] -= first
+        yield Band(cropped, last - first, pose_between(X_WC0, X_WC1, s), s)

@@ -16,7 +16,6 @@ from pydrake.systems.sensors import (
 )
 
 from splatpilot.systems.ports import input_port, output_port
-from splatpilot.systems.pose_between import pose_between
 from splatpilot.systems.splats.background import BLACK, Background
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.distortion import Distortion
@@ -32,7 +31,7 @@ from splatpilot.systems.splats.moving_gaussians import (
     MovingGaussians,
     PlacedGaussians,
 )
-from splatpilot.systems.splats.rolling_shutter import band_intrinsics, row_bands
+from splatpilot.systems.splats.rolling_shutter import camera_bands
 from splatpilot.systems.weakly import weakly
 
 _BANDS = 8
@@ -233,13 +232,10 @@ class SplatCamera(LeafSystem):
         if X_WB_start is None:
             yield _Rows((K, width, height, X_WC1), self._among(time))
             return
-        X_WC0 = X_WB_start @ self._X_BC
-        focal, fewest = float(max(K[0, 0], K[1, 1])), 1 if self._moving is None else _BANDS
-        for first, last in row_bands(X_WC0, X_WC1, focal, height, fewest):
-            s = 0.5 * (first + last) / height
-            X_WC = pose_between(X_WC0, X_WC1, s)
-            camera = (band_intrinsics(K, first), width, last - first, X_WC)
-            yield _Rows(camera, self._among(time - (1.0 - s) * self._readout))
+        X_WC0, fewest = X_WB_start @ self._X_BC, 1 if self._moving is None else _BANDS
+        for band in camera_bands(K, height, X_WC0, X_WC1, fewest):
+            camera = (band.K, width, band.height, band.X_WC)
+            yield _Rows(camera, self._among(time - (1.0 - band.s) * self._readout))
 
     def _among(self, time: float) -> PlacedGaussians:
         return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
