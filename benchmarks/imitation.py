@@ -2,7 +2,7 @@
 
     python benchmarks/imitation.py OUT student_rgb --measure CORPUS \\
         --line 'drawn looks' 'corpora=[CORPUS]' --line 'one look' 'corpora=[PLAIN]' \\
-        --case 8 worlds=8 --case 32 worlds=32 --case 128 worlds=128 --seeds 0 1 2
+        --case 8 worlds=8 --case 32 worlds=32 --case 128 worlds=128 --seeds 0 1 2 --xlabel worlds
 
 Each case of each line is trained once for each seed, in a folder of OUT; the same command goes on
 where it was interrupted, and with more of any it adds to them. What is printed is measured on the
@@ -49,13 +49,13 @@ def half_interval(values: np.ndarray) -> np.ndarray:
     return t.ppf(0.975, n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
 
 
-def draw(field: str, cases: list[float], lines: dict[str, np.ndarray], path: Path) -> None:
-    """Success over the cases of a field, with intervals, of lines (seeds, cases)."""
+def draw(cases: list[float], lines: dict[str, np.ndarray], xlabel: str, path: Path) -> None:
+    """Success over the cases, with intervals, of lines (seeds, cases)."""
     figure, axes = plt.subplots(figsize=(5.0, 3.2), layout="constrained")
     for name, successes in lines.items():
         mean, half = successes.mean(axis=0), half_interval(successes)
         axes.errorbar(cases, 100.0 * mean, 100.0 * half, marker="o", capsize=3.0, label=name)
-    axes.set(xscale="log", xlabel=field, ylabel="success on held-out worlds [%]")
+    axes.set(xscale="log", xlabel=xlabel, ylabel="success on held-out worlds [%]")
     axes.set_xticks(cases, [f"{case:g}" for case in cases])
     axes.minorticks_off()
     axes.legend()
@@ -76,6 +76,7 @@ def main() -> None:
     parser.add_argument(
         "--line", action="append", nargs="+", default=[], metavar="NAME FIELD=VALUE"
     )
+    parser.add_argument("--xlabel", default="case", help="what the cases' numbers are")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     args = parser.parse_args()
     print("| line | case | " + " | ".join(MEASURES) + " |")
@@ -103,8 +104,7 @@ def main() -> None:
         lines[line] = np.stack(successes, axis=1)
     cases = [case for case, *_ in args.case]
     if all(case.replace(".", "", 1).isdigit() for case in cases):
-        field = args.case[0][1].partition("=")[0]
-        draw(field, [float(case) for case in cases], lines, args.out / "curve.png")
+        draw([float(case) for case in cases], lines, args.xlabel, args.out / "curve.png")
 
 
 if __name__ == "__main__":

@@ -44,7 +44,9 @@ def _recover(options: argparse.Namespace) -> None:
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies import recovery
     from splatpilot.training.policies.registry import TRAINERS
+    from splatpilot.training.policies.torchrun import require_one_process
 
+    require_one_process("recover")
     config = load_config(trainer_defaults(options), options.config, options.overrides)
     jobs = available_cores() if options.jobs is None else options.jobs
     make = TRAINERS.find(options.policy).make

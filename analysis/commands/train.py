@@ -85,6 +85,7 @@ def _train(options: argparse.Namespace) -> None:
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies.registry import TRAINERS
     from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
+    from splatpilot.training.policies.torchrun import require_one_process
 
     runs = []
     for policy in options.policies:
@@ -97,6 +98,10 @@ def _train(options: argparse.Namespace) -> None:
             if seed is not None:
                 out = out / f"seed_{seed}"
             runs.append(TrainingRun(policy, config, out))
+    if len(runs) > 1:
+        require_one_process("several trainings")
+    if scenarios:
+        require_one_process("--fly")
     summaries = run_side_by_side(runs, options.jobs or available_cores())
     if scenarios:
         weights = [

@@ -116,9 +116,8 @@ def run[Config: CorpusTraining](
     held_out = held_out_names(names, config.held_out)
     outcomes: Counter[str] = Counter()
     for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
-        flown, ended = _fly_worlds(
-            corpus, shards, held_out, weights, out / "flights" / folder.name, flights, jobs
-        )
+        tasks = _tasks([shard for shard in shards if shard.world not in held_out], flights)
+        flown, ended = _fly_worlds(corpus, tasks, weights, out / "flights" / folder.name, jobs)
         outcomes += ended
         add_recovery(folder, flown, jobs)
     both = replace(config, corpora=[str(folder) for folder in folders])
@@ -148,30 +147,28 @@ def _link_corpus(source: Path, folder: Path) -> None:
                 shutil.copyfile(path, target)
 
 
-def _fly_worlds(
-    corpus: Corpus,
-    shards: Sequence[Shard],
-    held_out: Sequence[str],
-    weights: Path,
-    folder: Path,
-    flights: int,
-    jobs: int,
-) -> tuple[list[StudentFlight], Counter[str]]:
-    """The student's flights, the ways that `shards` of a corpus show, in its worlds that are not
-    held out, and how they ended."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tasks: dict[str, list[Task]] = {world.name: [] for world in corpus.worlds}
+def _tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
+    """By world the ways of the expert's first `flights`, of those that shards are from."""
+    tasks: dict[str, list[Task]] = {}
     for shard in shards:
-        if shard.source == EXPERT and shard.world not in held_out:
-            tasks[shard.world] += [
+        if shard.source == EXPERT:
+            tasks.setdefault(shard.world, []).extend(
                 Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
                 for flight in shard.flights
                 if flight["states"]
-            ]
+            )
+    return {world: ways[:flights] for world, ways in tasks.items() if ways}
+
+
+def _fly_worlds(
+    corpus: Corpus, tasks: dict[str, list[Task]], weights: Path, folder: Path, jobs: int
+) -> tuple[list[StudentFlight], Counter[str]]:
+    """The student's flights in worlds of a corpus, and how they ended."""
+    folder.mkdir(parents=True, exist_ok=True)
     work = [
-        (record, tasks[record.name][:flights], folder / f"{record.name}.npz")
+        (record, tasks[record.name], folder / f"{record.name}.npz")
         for record in corpus.worlds
-        if tasks[record.name]
+        if record.name in tasks
     ]
     missing = [piece for piece in work if not piece[2].exists()]
     fly_world = partial(_fly_world, weights, corpus.config.camera)
@@ -185,10 +182,7 @@ def _fly_worlds(
         with np.load(file) as arrays:
             outcomes.update(str(outcome) for outcome in arrays["outcomes"])
             for n in range(len(arrays["outcomes"])):
-                parts = {
-                    name: arrays[f"{name}_{n}"]
-                    for name in ("p_WG", "times", "states", "clearances")
-                }
+                parts = {name: arrays[f"{name}_{n}"] for name in _ARRAYS}
                 flown.append(StudentFlight(record.name, **parts))
     return flown, outcomes
 

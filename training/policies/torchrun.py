@@ -92,3 +92,16 @@ def torchrun_processes(device: str) -> Iterator[Processes]:
         yield Processes(distributed.get_rank(), distributed.get_world_size())
     finally:
         distributed.destroy_process_group()
+
+
+def require_one_process(what: str) -> None:
+    """
+    Raises:
+        ValueError: where torchrun started several, naming `what` they cannot do together.
+    """
+    count = int(os.environ["WORLD_SIZE"]) if distributed.is_torchelastic_launched() else 1
+    if count > 1:
+        raise ValueError(
+            f"torchrun started {count} processes, which train one policy of one seed together; run "
+            f"{what} without torchrun"
+        )

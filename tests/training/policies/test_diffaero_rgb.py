@@ -21,9 +21,9 @@ from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.training.policies.diffaero_rgb import (
     DiffAeroRgbTrainer,
     DiffAeroRgbTraining,
-    MonocularModule,
     mirrored,
 )
+from splatpilot.training.policies.diffaero_rgb_network import MonocularModule
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.train import run
 

@@ -1,6 +1,7 @@
 """The student's two stages, as one command."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -77,12 +78,6 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert len(set(samples.world[samples.source == RECOVERY])) == 1
     assert len(list((whole / "flights" / "0").iterdir())) == 1
     assert json.loads((whole / "recovery.json").read_text()) == ledger
-    both = f"corpora=[{whole / 'corpora' / '0'}, {expert}]"  # what they share is flown once
-    config = load_config(StudentDepthTraining(), overrides=[both, *TINY])
-    more = recovery.run(
-        config=config, make=StudentTrainer, out=tmp_path / "more", flights=1, jobs=1
-    )
-    assert sum(more["flights"].values()) == 1 and more["expert_samples"] == len(Corpus(expert))
 
     for step in ("_fly_world", "_ledger"):
         with monkeypatch.context() as patch:
@@ -96,6 +91,18 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert both_stages(expert, parts)["flights"] == ledger["flights"]
     expected, found = weights(whole), weights(parts)
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
+
+
+def test_what_corpora_share_is_flown_once(expert, tmp_path):
+    """Of a corpus and another that holds the same samples the student flies each way once, and the
+    ledger counts each sample once."""
+    shutil.copytree(expert, tmp_path / "copy")
+    both = f"corpora=[{expert}, {tmp_path / 'copy'}]"
+    config = load_config(StudentDepthTraining(), overrides=[both, *TINY])
+    out = tmp_path / "out"
+    ledger = recovery.run(config=config, make=StudentTrainer, out=out, flights=1, jobs=1)
+    assert sum(ledger["flights"].values()) == 1
+    assert ledger["expert_samples"] == len(Corpus(expert))
 
 
 def test_what_sees_in_colours_recovers_too(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatpilot.analysis.cli import main
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student_inference import StudentSpec
@@ -76,3 +77,21 @@ def test_what_cannot_be_shared_is_refused(monkeypatch):
         torchrun_processes("cuda:1"),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [
+        ("train diffaero depthnav", "several trainings"),
+        ("train student_rgb --fly P01", "--fly"),
+        ("recover student_rgb", "recover"),
+    ],
+)
+def test_commands_for_one_process_are_refused(command, what, monkeypatch, tmp_path, capsys):
+    """What several processes would do several times, in each other's way, says so before it
+    begins."""
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "test")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert main([*command.split(), "--out", str(tmp_path / "out")]) == 1
+    assert f"run {what} without torchrun" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
