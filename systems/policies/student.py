@@ -8,6 +8,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.policies.depth_policy_config import require_speed
 from splatpilot.systems.policies.hypotheses import no_plan
 from splatpilot.systems.policies.student_inference import HYPOTHESES, RATE, load_network, plan
 from splatpilot.systems.ports import input_port, output_port
@@ -18,13 +19,15 @@ from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 @dataclass
 class StudentConfig:
-    """The student's weights, and the camera that it sees through. How fast it flies it learned
-    from its expert: nothing asks it for a speed."""
+    """The student's weights, what it is asked for, and the camera that it sees through."""
 
     observation: ClassVar[str]
     """What it sees: rgb or depth."""
     rate: ClassVar[float] = RATE
 
+    # [m/s] Speed that it is asked to fly at; it is surest at that of its expert or less, which the
+    # model card of its weights says.
+    speed: float = 2.0
     # File of weights, as `splatpilot train` writes them; those that ship where left empty.
     weights: str = ""
     # With the size and field of view that it was trained with.
@@ -32,6 +35,7 @@ class StudentConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        require_speed(self)
         self.camera.validate()
 
 
@@ -85,7 +89,7 @@ class Student(LeafSystem):
     def __init__(self, config: StudentConfig) -> None:
         super().__init__()
         config.validate()
-        self._network = load_network(config.weights, config.observation)
+        self._network = load_network(config.weights, config.observation, config.speed)
         spec, camera = self._network.spec, config.camera
         for name in ("width", "height", "fov_x"):
             given, trained = getattr(camera, name), getattr(spec, name)

@@ -1,6 +1,6 @@
 """What the student sees, what network it has and what its output means."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -42,8 +42,8 @@ class StudentSpec:
     head_features: int = 256
     """Of the layer between what was seen and told and the linear one that the hypotheses are of: a
     sum of both alone cannot say what is in the way of where to go. None where 0."""
-    nominal_speed: float = 2.0
-    """[m/s] of the expert."""
+    speed: float = 2.0
+    """[m/s] of the expert, or that which is asked for instead: of the unobstructed way."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a field that no network can be made with."""
@@ -55,7 +55,7 @@ class StudentSpec:
                 raise ValueError(f"{name} is {value!r}; it must be 1 to 4096")
         if not isinstance(self.head_features, int) or not 0 <= self.head_features <= 4096:
             raise ValueError(f"head_features is {self.head_features!r}; it must be 0 to 4096")
-        for name, least, most in (("fov_x", 1.0, 179.0), ("nominal_speed", 0.1, 20.0)):
+        for name, least, most in (("fov_x", 1.0, 179.0), ("speed", 0.1, 20.0)):
             value = getattr(self, name)
             if not isinstance(value, int | float) or not least <= value <= most:
                 raise ValueError(f"{name} is {value!r}; it must be {least:g} to {most:g}")
@@ -68,7 +68,7 @@ class StudentSpec:
     @property
     def reach(self) -> float:
         """[m] from the goal, within which its distance is told: where the expert arrives."""
-        return HORIZON * self.nominal_speed
+        return HORIZON * self.speed
 
     def image_features(self) -> int:
         """Numbers that the image becomes."""
@@ -129,7 +129,7 @@ class StudentNetwork:
         output = self._linear("head", joined).reshape(HYPOTHESES, -1)
         deviations = WAYPOINT_SCALE * output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
         v_B, towards, up_B = np.reshape(state, (3, 3))
-        way = unobstructed_way(v_B, spec.reach * towards, up_B, spec.nominal_speed)
+        way = unobstructed_way(v_B, spec.reach * towards, up_B, spec.speed)
         return way + deviations, output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
@@ -140,10 +140,15 @@ def _rectified(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, np.float32(0.0))
 
 
-def load_network(path: str, observation: str) -> StudentNetwork:
-    """The network from a file of weights; see `PolicyCheckpoint.load`."""
+def load_network(path: str, observation: str, speed: float) -> StudentNetwork:
+    """The network from a file of weights, for a nominal speed [m/s]; see `PolicyCheckpoint.load`.
+
+    The unobstructed way is flown at that speed, and the distance to the goal told within its reach;
+    deviations are what they were of the expert's.
+    """
     checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
-    return checkpoint.build(StudentNetwork)
+    asked = replace(checkpoint, spec=replace(checkpoint.spec, speed=speed))
+    return asked.build(StudentNetwork)
 
 
 def encode_color(color: np.ndarray) -> np.ndarray:

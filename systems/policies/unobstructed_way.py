@@ -15,6 +15,10 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 HORIZON = LatticeConfig.horizon  # [s]
 
+_WITHIN = 0.999
+"""[-] Part of the reach that a goal is nearer than to be arrived at. Goals beyond it are told as
+exactly there: rounding must not decide between stopping and flying on."""
+
 BASIS = quintic_basis(WAYPOINT_PERIOD * np.arange(1, NUM_WAYPOINTS + 1), HORIZON)
 """(10, 6), see `quintic_basis`; of the waypoints."""
 
@@ -25,7 +29,7 @@ def unobstructed_way(v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any 
 
     Args:
         v_B: (..., 3) [m/s], velocity.
-        goal_B: (..., 3) [m], the vector to the goal; all are alike beyond `HORIZON` x `speed`.
+        goal_B: (..., 3) [m], the vector to the goal; all are alike from `HORIZON` x `speed` on.
         up_B: (..., 3), the unit vector upwards.
         speed: [m/s], nominal.
         basis: `BASIS`, as an array of the same kind.
@@ -34,7 +38,7 @@ def unobstructed_way(v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any 
     direction = goal_B / distance.clip(min=1e-6)
     slowed = speed * (2.0 * distance / (HORIZON * speed)).clip(LEAST_SPEED_FRACTION, 1.0)
     reach = HORIZON * slowed
-    arrives = distance <= reach
+    arrives = distance < _WITHIN * reach
     p_end = direction * (distance * arrives + reach * ~arrives)
     v_end = direction * (slowed * ~arrives)
     boundary = v_B, _level_acceleration(v_B, up_B), p_end, v_end

@@ -1,23 +1,35 @@
 """Every policy flies, and is found by its name."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
+from pydrake.systems.primitives import ConstantVectorSource
 
+from splatpilot.diagrams import policies
 from splatpilot.diagrams.flight import Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import (
     BENCHMARK_POLICIES,
     POLICIES,
+    PolicyKind,
     at_speed,
     name_of,
     policy_named,
+    register_policy,
     speed_of,
 )
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.policies.depthnav import DepthNavConfig
 from splatpilot.systems.policies.depthnav_inference import DEPTHNAV_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.registry import Registry
+
+
+@dataclass
+class _OneSpeedConfig:
+    """Of a policy whose speed nobody sets."""
 
 
 @pytest.mark.parametrize(
@@ -81,14 +93,18 @@ def test_file_of_weights_is_a_policy(tmp_path):
 
 @pytest.mark.parametrize("name", POLICIES.registered())
 def test_speed_is_set_where_the_configuration_keeps_it(name):
-    """Every policy that can be asked for a speed says the one that it was asked for, and nothing
-    else of it changes; the others, which fly as they have learned, refuse."""
+    """Every policy says the speed that it was asked for, and nothing else of it changes."""
     config = policy_named(name)
     assert name_of(config) == name
-    if speed_of(config) is None:
-        with pytest.raises(ValueError, match=rf"{name} flies as fast as it has learned"):
-            at_speed(config, 3.0)
-        return
     faster = at_speed(config, 3.0)
     assert (speed_of(config), speed_of(faster)) == (2.0, 3.0)
     assert at_speed(faster, 2.0) == config
+
+
+def test_policy_that_knows_one_speed_refuses_others(monkeypatch):
+    """Of what has no speed in its configuration nobody knows one, and none can be set."""
+    monkeypatch.setattr(policies, "POLICIES", Registry("policy", "none", PolicyKind))
+    register_policy(_OneSpeedConfig, lambda config, world, vehicle: ConstantVectorSource([0.0]))
+    assert speed_of(_OneSpeedConfig()) is None
+    with pytest.raises(ValueError, match="_onespeed flies as fast as it has learned"):
+        at_speed(_OneSpeedConfig(), 3.0)

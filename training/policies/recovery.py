@@ -28,7 +28,7 @@ from splatpilot.systems.files import folder_written_atomically, written_atomical
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.processes import map_processes
-from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards
 from splatpilot.training.corpus.recovery import StudentFlight, add_recovery
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
@@ -171,7 +171,7 @@ def _fly_worlds(
         if record.name in tasks
     ]
     missing = [piece for piece in work if not piece[2].exists()]
-    fly_world = partial(_fly_world, weights, corpus.config.camera)
+    fly_world = partial(_fly_world, weights, corpus.config)
     with tqdm(
         total=len(work), initial=len(work) - len(missing), desc="flights", unit="world"
     ) as bar:
@@ -188,11 +188,12 @@ def _fly_worlds(
 
 
 def _fly_world(
-    weights: Path, camera: OnboardCamera, work: tuple[WorldRecord, list[Task], Path]
+    weights: Path, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]
 ) -> None:
-    """Flies the tasks of one world and writes the flights to a file."""
+    """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
     record, tasks, file = work
-    policy, world = replace(policy_named(str(weights)), camera=camera), record.make()
+    policy, world = policy_named(str(weights), config.expert.speed), record.make()
+    policy = replace(policy, camera=config.camera)
     arrays: dict[str, Any] = {}
     outcomes = []
     for task in tasks:

@@ -69,7 +69,7 @@ lower penalty, of error and clearance."""
             camera.height,
             camera.fov_x,
             head_features=config.head_features,
-            nominal_speed=self._data.speed,
+            speed=self._data.speed,
         )
         self.network = StudentModule(self.spec)
         if config.begin:

@@ -99,7 +99,7 @@ class StudentModule(nn.Module):
         deviations = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * towards
-        way = unobstructed_way(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
+        way = unobstructed_way(v_B, goal_B, up_B, self.spec.speed, self._basis)
         return way[:, None] + deviations, output[..., -1]
 
 

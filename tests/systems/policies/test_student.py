@@ -1,6 +1,7 @@
 """The student as a Drake system."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from splatpilot.systems.policies.student import (
     StudentRgbConfig,
 )
 from splatpilot.systems.policies.student_inference import StudentSpec, load_network, plan
+from splatpilot.systems.policies.unobstructed_way import unobstructed_way
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
@@ -74,7 +76,7 @@ def test_plans_at_its_rate(name, files):
     vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
     found = Hypotheses.from_vector(vector, 3)
     assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
-    network = load_network(files[name], name)
+    network = load_network(files[name], name, config.speed)
     X_WB = pose_from_state(state)
     expected = plan(network, 0.0, seen, X_WB, state[3:6], P_WG)
     np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
@@ -95,7 +97,28 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
     about = {"format": 1, "policy": "student_depth", "spec": {"depth": 3}, "provenance": {}}
     np.savez(tmp_path / "odd.npz", about=json.dumps(about))
     with pytest.raises(ValueError, match=r"odd\.npz holds weights of another architecture"):
-        load_network(str(tmp_path / "odd.npz"), "depth")
+        load_network(str(tmp_path / "odd.npz"), "depth", 2.0)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_flies_as_fast_as_it_is_asked_to(name, files):
+    """From hover, far from the goal, hypotheses differ as the unobstructed ways do."""
+    image = np.zeros((48, 64, 3), np.uint8) if name == "rgb" else np.full((48, 64), 5.0, np.float32)
+    X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.zeros(3)
+
+    def waypoints_B(speed: float, p_WG: np.ndarray) -> np.ndarray:
+        network = load_network(files[name], name, speed)
+        return plan(network, 0.0, image, X_WB, v_WB, p_WG).waypoints_B
+
+    ways = [
+        unobstructed_way(v_WB, X_WB.inverse() @ P_WG, np.array([0.0, 0.0, 1.0]), speed)
+        for speed in (2.0, 3.0)
+    ]
+    assert ways[1][-1, 0] > 1.3 * ways[0][-1, 0]
+    faster = waypoints_B(3.0, P_WG) - waypoints_B(2.0, P_WG)
+    np.testing.assert_allclose(faster, np.broadcast_to(ways[1] - ways[0], faster.shape), atol=1e-5)
+    with pytest.raises(ValueError, match=r"speed is 0.0 m/s but must be 0\.1 to 10"):
+        Student(replace(config_of(name, files), speed=0.0))
 
 
 def corridor(low: int, high: int, distance: float) -> np.ndarray:
@@ -111,7 +134,7 @@ def corridor(low: int, high: int, distance: float) -> np.ndarray:
 def test_weights_that_ship_fly_around_what_stands_ahead():
     """At 2 m/s towards a goal straight ahead, the student that sees depth goes on where nothing
     stands, passes a wall on its free side, and slows before one that leaves none."""
-    network = load_network("", "depth")
+    network = load_network("", "depth", 2.6)
     X_WB, v_WB, p_WG = RigidTransform([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.0]), [12.0, 0.0, 1.5]
 
     def end(depth: np.ndarray) -> np.ndarray:
@@ -127,7 +150,7 @@ def test_weights_that_ship_fly_around_what_stands_ahead():
 def test_weights_that_ship_see_colours():
     """The student that sees colours, in flight, wants other things where it sees, or is told,
     others."""
-    network, X_WB = load_network("", "rgb"), RigidTransform([0.0, 0.0, 1.5])
+    network, X_WB = load_network("", "rgb", 2.6), RigidTransform([0.0, 0.0, 1.5])
     v_WB = np.array([1.5, 0.0, 0.0])
     meadow = np.full((120, 160, 3), [150, 180, 220], np.uint8)
     meadow[60:] = 90, 110, 70

@@ -45,6 +45,21 @@ def test_is_the_lattices_own(distance):
     np.testing.assert_allclose(found @ R_WB.T + p_WB, ways_W, atol=1e-9)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_goals_told_as_at_the_reach_are_flown_on_to(dtype):
+    """In any direction, a goal at the reach of two seconds, however that is rounded, is flown to as
+    one beyond; one a hundredth nearer is arrived at, 0.8 m ahead after a second."""
+    directions = torch.from_numpy(np.random.default_rng(2).normal(size=(1000, 3))).to(dtype)
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    up_B, basis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype), torch.from_numpy(BASIS).to(dtype)
+    at, beyond, within = (
+        unobstructed_way(2.6 * directions, distance * directions, up_B, 2.6, basis)
+        for distance in (5.2, 20.0, 5.15)
+    )
+    assert (at - beyond).abs().max() < 1e-5
+    assert (within - beyond)[:, -1].norm(dim=1).min() > 0.5
+
+
 def test_tensors_and_arrays_alike():
     """Of many states at once, in torch as in numpy; to a goal at hand it does not move."""
     rng = np.random.default_rng(1)

@@ -37,7 +37,7 @@ def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden):
     """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
     that the module in torch makes of what a corpus would hold of them; whole cells or not."""
     torch.manual_seed(0)
-    spec = StudentSpec(observation, *size, head_features=hidden, nominal_speed=2.6)
+    spec = StudentSpec(observation, *size, head_features=hidden, speed=2.6)
     module = disturbed(StudentModule(spec))
     weights = {name: w.numpy() for name, w in module.state_dict().items()}
     assert {name: w.shape for name, w in weights.items()} == spec.weight_shapes()
