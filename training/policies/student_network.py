@@ -13,8 +13,8 @@ from splatpilot.systems.policies.student_inference import (
     HYPOTHESES,
     NEAREST,
     STATE_SIZE,
-    WAYPOINT_SCALE,
     StudentSpec,
+    waypoint_scale,
 )
 from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
 
@@ -96,11 +96,12 @@ class StudentModule(nn.Module):
         if self.spec.head_features:
             joined = self.hidden_layer(joined).relu()
         output = self.head(joined).unflatten(1, (HYPOTHESES, -1))
-        deviations = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
+        deviations = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * towards
         way = unobstructed_way(v_B, goal_B, up_B, self.spec.speed, self._basis)
-        return way[:, None] + deviations, output[..., -1]
+        scale = waypoint_scale(goal_B)[:, None, None, None]
+        return way[:, None] + scale * deviations, output[..., -1]
 
 
 class _Bias(nn.Module):

@@ -19,7 +19,12 @@ from splatpilot.systems.policies.student import (
     StudentDepthConfig,
     StudentRgbConfig,
 )
-from splatpilot.systems.policies.student_inference import StudentSpec, load_network, plan
+from splatpilot.systems.policies.student_inference import (
+    StudentNetwork,
+    StudentSpec,
+    load_network,
+    plan,
+)
 from splatpilot.systems.policies.unobstructed_way import unobstructed_way
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
@@ -119,6 +124,21 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
     np.testing.assert_allclose(faster, np.broadcast_to(ways[1] - ways[0], faster.shape), atol=1e-5)
     with pytest.raises(ValueError, match=r"speed is 0.0 m/s but must be 0\.1 to 10"):
         Student(replace(config_of(name, files), speed=0.0))
+
+
+@pytest.mark.parametrize(("distance", "scale"), [(0.0, 0.0), (0.5, 0.5), (1.0, 2.0), (9.0, 2.0)])
+def test_deviations_fade_at_the_goal(distance, scale):
+    """Of a network that always says 0.1, whose hypotheses are a fifth of a metre beside the
+    unobstructed way, and on it where they arrive."""
+    spec = StudentSpec("depth", 64, 48, speed=2.6)
+    weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
+    weights["head.bias"][:] = 0.1
+    X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.array([0.5, 0.0, 0.0])
+    goal_B = np.array([0.6, 0.8, 0.0]) * distance
+    depth, p_WG = np.full((48, 64), 5.0, np.float32), X_WB @ goal_B
+    found = plan(StudentNetwork(spec, weights), 0.0, depth, X_WB, v_WB, p_WG).waypoints_B
+    way = unobstructed_way(v_WB, goal_B, np.array([0.0, 0.0, 1.0]), 2.6)
+    np.testing.assert_allclose(found - way, np.full((3, 10, 3), 0.1 * scale), atol=1e-5)
 
 
 def corridor(low: int, high: int, distance: float) -> np.ndarray:

@@ -31,7 +31,7 @@ def disturbed(module: StudentModule) -> StudentModule:
 
 @pytest.mark.parametrize("observation", ["rgb", "depth"])
 @pytest.mark.parametrize("size", [(64, 48), (80, 70)])
-@pytest.mark.parametrize("p_WG", [[9.0, 2.0, 1.5], [1.0, -2.0, 0.5]])
+@pytest.mark.parametrize("p_WG", [[9.0, 2.0, 1.5], [1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
 @pytest.mark.parametrize("hidden", [0, 20])
 def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden):
     """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
