@@ -1,6 +1,7 @@
 """What the student sees, what network it has and what its output means."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -44,7 +45,7 @@ class StudentSpec:
     """Of the layer between what was seen and told and the linear one that the hypotheses are of: a
     sum of both alone cannot say what is in the way of where to go. None where 0."""
     speed: float = 2.0
-    """[m/s] of the expert, or that which is asked for instead: of the unobstructed way."""
+    """[m/s] Nominal, of the expert."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a field that no network can be made with."""
@@ -95,12 +96,28 @@ class StudentSpec:
 class StudentNetwork:
     """The network with its weights, in OpenCV and numpy.
 
+    Asked for another speed than its expert's it does as it would at that, in proportion: it is told
+    as much more of its velocity, and its deviations, from the way that is flown at the speed asked
+    for, are as much less.
+
+    Args:
+        spec: the architecture.
+        weights: by the names of `StudentSpec.weight_shapes`.
+        speed: [m/s], nominal, that it is asked for; its expert's if None.
+
     Raises:
         ValueError: if weights are missing, of another shape or not finite.
     """
 
-    def __init__(self, spec: StudentSpec, weights: dict[str, np.ndarray]) -> None:
+    def __init__(
+        self, spec: StudentSpec, weights: dict[str, np.ndarray], speed: float | None = None
+    ) -> None:
         self.spec = spec
+        self._speed = spec.speed if speed is None else speed
+        self.reach = HORIZON * self._speed
+        """[m] from the goal, within which its distance is told."""
+        self.pace = self._speed / spec.speed
+        """[-] The speed asked for, over the expert's."""
         self._weights = check_weights(weights, spec.weight_shapes())
         self._encoder = MobileNet(spec.height, spec.width, self._weights)
 
@@ -129,10 +146,10 @@ class StudentNetwork:
             joined = _rectified(self._linear("hidden_layer", joined))
         output = self._linear("head", joined).reshape(HYPOTHESES, -1)
         v_B, towards, up_B = np.reshape(state, (3, 3))
-        goal_B = spec.reach * towards
-        way = unobstructed_way(v_B, goal_B, up_B, spec.speed)
+        goal_B = self.reach * towards
+        way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed)
         deviations = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
-        return way + waypoint_scale(goal_B) * deviations, output[:, -1]
+        return way + self.pace * waypoint_scale(goal_B) * deviations, output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
@@ -153,14 +170,9 @@ def waypoint_scale(goal_B: Any) -> Any:
 
 
 def load_network(path: str, observation: str, speed: float) -> StudentNetwork:
-    """The network from a file of weights, for a nominal speed [m/s]; see `PolicyCheckpoint.load`.
-
-    The unobstructed way is flown at that speed, and the distance to the goal told within its reach;
-    deviations are what they were of the expert's.
-    """
+    """The network from a file of weights, see `PolicyCheckpoint.load`, asked for a speed [m/s]."""
     checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
-    asked = replace(checkpoint, spec=replace(checkpoint.spec, speed=speed))
-    return asked.build(StudentNetwork)
+    return checkpoint.build(partial(StudentNetwork, speed=speed))
 
 
 def encode_color(color: np.ndarray) -> np.ndarray:
@@ -210,6 +222,6 @@ def plan(
         ValueError: for an image of another size.
     """
     encode = encode_color if network.spec.pixels == "color" else encode_depth
-    state = state_observation(X_WB, v_WB, p_WG, network.spec.reach)
+    state = state_observation(X_WB, v_WB / network.pace, p_WG, network.reach)
     waypoints_B, costs = network(encode(image), state)
     return Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))
