@@ -44,8 +44,12 @@ class StudentSpec:
     head_features: int = 256
     """Of the layer between what was seen and told and the linear one that the hypotheses are of: a
     sum of both alone cannot say what is in the way of where to go. None where 0."""
-    speed: float = 2.0
-    """[m/s] Nominal, of the expert."""
+    nominal_speed: float = 2.0
+    """[m/s] of the expert."""
+    flies_on: float = 0.234
+    """Part of the speed that the unobstructed way has left where it leads on to goals out of reach:
+    all of it in what is trained. Files that do not say learned with all or none, as rounding had
+    it, and this is the mean of their samples."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a field that no network can be made with."""
@@ -57,7 +61,7 @@ class StudentSpec:
                 raise ValueError(f"{name} is {value!r}; it must be 1 to 4096")
         if not isinstance(self.head_features, int) or not 0 <= self.head_features <= 4096:
             raise ValueError(f"head_features is {self.head_features!r}; it must be 0 to 4096")
-        for name, least, most in (("fov_x", 1.0, 179.0), ("speed", 0.1, 20.0)):
+        for name, least, most in (("fov_x", 1.0, 179.0), ("nominal_speed", 0.1, 20.0)):
             value = getattr(self, name)
             if not isinstance(value, int | float) or not least <= value <= most:
                 raise ValueError(f"{name} is {value!r}; it must be {least:g} to {most:g}")
@@ -70,7 +74,7 @@ class StudentSpec:
     @property
     def reach(self) -> float:
         """[m] from the goal, within which its distance is told: where the expert arrives."""
-        return HORIZON * self.speed
+        return HORIZON * self.nominal_speed
 
     def image_features(self) -> int:
         """Numbers that the image becomes."""
@@ -113,10 +117,10 @@ class StudentNetwork:
         self, spec: StudentSpec, weights: dict[str, np.ndarray], speed: float | None = None
     ) -> None:
         self.spec = spec
-        self._speed = spec.speed if speed is None else speed
+        self._speed = spec.nominal_speed if speed is None else speed
         self.reach = HORIZON * self._speed
         """[m] from the goal, within which its distance is told."""
-        self.pace = self._speed / spec.speed
+        self.pace = self._speed / spec.nominal_speed
         """[-] The speed asked for, over the expert's."""
         self._weights = check_weights(weights, spec.weight_shapes())
         self._encoder = MobileNet(spec.height, spec.width, self._weights)
@@ -147,7 +151,7 @@ class StudentNetwork:
         output = self._linear("head", joined).reshape(HYPOTHESES, -1)
         v_B, towards, up_B = np.reshape(state, (3, 3))
         goal_B = self.reach * towards
-        way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed)
+        way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed, flies_on=spec.flies_on)
         deviations = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
         return way + self.pace * waypoint_scale(goal_B) * deviations, output[:, -1]
 

@@ -69,7 +69,8 @@ lower penalty, of error and clearance."""
             camera.height,
             camera.fov_x,
             head_features=config.head_features,
-            speed=self._data.speed,
+            nominal_speed=self._data.speed,
+            flies_on=1.0,
         )
         self.network = StudentModule(self.spec)
         if config.begin:

@@ -99,7 +99,9 @@ class StudentModule(nn.Module):
         deviations = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * towards
-        way = unobstructed_way(v_B, goal_B, up_B, self.spec.speed, self._basis)
+        way = unobstructed_way(
+            v_B, goal_B, up_B, self.spec.nominal_speed, self._basis, self.spec.flies_on
+        )
         scale = waypoint_scale(goal_B)[:, None, None, None]
         return way[:, None] + scale * deviations, output[..., -1]
 
