@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
 from splatpilot.systems.policies.mobilenet import CHANNELS, MobileNet, mobilenet_shapes
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
-from splatpilot.systems.policies.unobstructed_way import HORIZON, unobstructed_way
+from splatpilot.systems.policies.unobstructed_way import HORIZON, MARGIN, unobstructed_way
 
 RATE = 15.0  # [Hz]
 HYPOTHESES = 3
@@ -46,10 +46,10 @@ class StudentSpec:
     sum of both alone cannot say what is in the way of where to go. None where 0."""
     nominal_speed: float = 2.0
     """[m/s] of the expert."""
-    flies_on: float = 0.234
-    """Part of the speed that the unobstructed way has left where it leads on to goals out of reach:
-    all of it in what is trained. Files that do not say learned with all or none, as rounding had
-    it, and this is the mean of their samples."""
+    ways: int = 1
+    """Version of what deviations are from and how far they reach: 2 in what is trained. Files that
+    do not say learned with the first, by which rounding decides whether the unobstructed way to a
+    goal out of reach stops there, and deviations do not fade at the goal."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a field that no network can be made with."""
@@ -61,6 +61,8 @@ class StudentSpec:
                 raise ValueError(f"{name} is {value!r}; it must be 1 to 4096")
         if not isinstance(self.head_features, int) or not 0 <= self.head_features <= 4096:
             raise ValueError(f"head_features is {self.head_features!r}; it must be 0 to 4096")
+        if self.ways not in (1, 2):
+            raise ValueError(f"ways is {self.ways!r}; it must be 1 or 2")
         for name, least, most in (("fov_x", 1.0, 179.0), ("nominal_speed", 0.1, 20.0)):
             value = getattr(self, name)
             if not isinstance(value, int | float) or not least <= value <= most:
@@ -70,6 +72,21 @@ class StudentSpec:
     def pixels(self) -> str:
         """The name of what it sees, of a sample of a corpus: `color` or `depth`."""
         return {"rgb": "color", "depth": "depth"}[self.observation]
+
+    @property
+    def margin(self) -> float:
+        """Of the unobstructed way, see `MARGIN`."""
+        return MARGIN if self.ways > 1 else 0.0
+
+    def waypoint_scale(self, goal_B: Any) -> Any:
+        """[m] (...) from the unobstructed way that 1 at the network's output means, where the
+        vector to the goal is goal_B (..., 3) [m]; of arrays and tensors.
+
+        The way creeps up to a goal at hand: from rest 0.4 m before it, it leads 2 cm ahead in the
+        controller's lookahead. A network that is off by as much hovers there for good.
+        """
+        near = ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
+        return WAYPOINT_SCALE * (near if self.ways > 1 else near**0)
 
     @property
     def reach(self) -> float:
@@ -151,9 +168,9 @@ class StudentNetwork:
         output = self._linear("head", joined).reshape(HYPOTHESES, -1)
         v_B, towards, up_B = np.reshape(state, (3, 3))
         goal_B = self.reach * towards
-        way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed, flies_on=spec.flies_on)
+        way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed, margin=spec.margin)
         deviations = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
-        return way + self.pace * waypoint_scale(goal_B) * deviations, output[:, -1]
+        return way + self.pace * spec.waypoint_scale(goal_B) * deviations, output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
@@ -161,16 +178,6 @@ class StudentNetwork:
 
 def _rectified(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, np.float32(0.0))
-
-
-def waypoint_scale(goal_B: Any) -> Any:
-    """[m] (...) from the unobstructed way that 1 at the network's output means, where the vector to
-    the goal is goal_B (..., 3) [m]; of arrays and tensors.
-
-    The way creeps up to a goal at hand: from rest 0.4 m before it, it leads 2 cm ahead in the
-    controller's lookahead. A network that is off by as much hovers there for good.
-    """
-    return WAYPOINT_SCALE * ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
 
 
 def load_network(path: str, observation: str, speed: float) -> StudentNetwork:

@@ -15,16 +15,16 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
 HORIZON = LatticeConfig.horizon  # [s]
 
-_ROUNDING = 1e-3
-"""[-] Part of the reach by which a goal may miss it. Goals beyond it are told as exactly there:
-rounding must not decide between stopping and flying on."""
+MARGIN = 1e-3
+"""[-] Part of the reach by which a goal is nearer that is arrived at. Goals beyond are told as
+exactly there: rounding must not decide between stopping and flying on."""
 
 BASIS = quintic_basis(WAYPOINT_PERIOD * np.arange(1, NUM_WAYPOINTS + 1), HORIZON)
 """(10, 6), see `quintic_basis`; of the waypoints."""
 
 
 def unobstructed_way(
-    v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any = BASIS, flies_on: float = 1.0
+    v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any = BASIS, margin: float = MARGIN
 ) -> Any:
     """Waypoints (..., 10, 3) [m] in the body frame B, by arithmetic that arrays of numpy and
     tensors of torch have in common.
@@ -35,16 +35,15 @@ def unobstructed_way(
         up_B: (..., 3), the unit vector upwards.
         speed: [m/s], nominal.
         basis: `BASIS`, as an array of the same kind.
-        flies_on: part of the speed that is left at the end of the horizon, unless the goal is
-            arrived at; the planner's is 1.
+        margin: see `MARGIN`.
     """
     distance = ((goal_B * goal_B).sum(-1) ** 0.5)[..., None]
     direction = goal_B / distance.clip(min=1e-6)
     slowed = speed * (2.0 * distance / (HORIZON * speed)).clip(LEAST_SPEED_FRACTION, 1.0)
     reach = HORIZON * slowed
-    arrives = distance < (1.0 - _ROUNDING) * reach
+    arrives = distance <= (1.0 - margin) * reach
     p_end = direction * (distance * arrives + reach * ~arrives)
-    v_end = direction * (flies_on * slowed * ~arrives)
+    v_end = direction * (slowed * ~arrives)
     boundary = v_B, _level_acceleration(v_B, up_B), p_end, v_end
     return sum(
         basis[:, column, None] * values[..., None, :] for column, values in enumerate(boundary, 1)

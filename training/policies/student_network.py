@@ -14,7 +14,6 @@ from splatpilot.systems.policies.student_inference import (
     NEAREST,
     STATE_SIZE,
     StudentSpec,
-    waypoint_scale,
 )
 from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
 
@@ -100,9 +99,9 @@ class StudentModule(nn.Module):
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * towards
         way = unobstructed_way(
-            v_B, goal_B, up_B, self.spec.nominal_speed, self._basis, self.spec.flies_on
+            v_B, goal_B, up_B, self.spec.nominal_speed, self._basis, self.spec.margin
         )
-        scale = waypoint_scale(goal_B)[:, None, None, None]
+        scale = self.spec.waypoint_scale(goal_B)[:, None, None, None]
         return way[:, None] + scale * deviations, output[..., -1]
 
 

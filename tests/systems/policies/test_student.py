@@ -127,7 +127,7 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
 def test_deviations_fade_at_the_goal(distance, scale):
     """Of a network that always says 0.1, whose hypotheses are a fifth of a metre beside the
     unobstructed way, and on it where they arrive."""
-    spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, flies_on=1.0)
+    spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, ways=2)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
     weights["head.bias"][:] = 0.1
     X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.array([0.5, 0.0, 0.0])

@@ -48,8 +48,7 @@ def test_is_the_lattices_own(distance):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_goals_told_as_at_the_reach_are_flown_on_to(dtype):
     """In any direction, a goal at the reach of two seconds, however that is rounded, is flown to as
-    one beyond, or, if so asked, arrived at, as one a hundredth nearer is: over half a metre ahead
-    after a second."""
+    one beyond; one a hundredth nearer is arrived at, over half a metre ahead after a second."""
     directions = torch.from_numpy(np.random.default_rng(2).normal(size=(1000, 3))).to(dtype)
     directions = directions / directions.norm(dim=1, keepdim=True)
     up_B, basis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype), torch.from_numpy(BASIS).to(dtype)
@@ -58,8 +57,6 @@ def test_goals_told_as_at_the_reach_are_flown_on_to(dtype):
         for distance in (5.2, 20.0, 5.15)
     )
     assert (at - beyond).abs().max() < 1e-5
-    stops = unobstructed_way(2.6 * directions, 5.2 * directions, up_B, 2.6, basis, flies_on=0.0)
-    assert (stops - within).norm(dim=2).max() < 0.1
     assert (within - beyond)[:, -1].norm(dim=1).min() > 0.5
 
 
