@@ -83,13 +83,6 @@ def test_speed_is_asked_of_every_policy_alike(policy, field, tmp_path):
     assert (flown.speed if field == "policy.speed" else flown.lattice.speed) == 1.5
 
 
-def test_who_cannot_be_asked_for_a_speed_says_so(tmp_path, capsys):
-    """A student flies as it has learned to."""
-    words = ["--policy", "student_depth", "--speed", "3", "--out", str(tmp_path / "f")]
-    assert main(["fly", *words]) == 1
-    assert "student_depth flies as fast as it has learned" in capsys.readouterr().err
-
-
 def test_policies_are_given_as_in_the_benchmark(tmp_path):
     """Fields of a policy may stand behind its name."""
     out = tmp_path / "flight"
