@@ -25,8 +25,7 @@ class StudentConfig:
     """What it sees: rgb or depth."""
     rate: ClassVar[float] = RATE
 
-    # [m/s] Speed that it is asked to fly at; it is surest at that of its expert or less, which the
-    # model card of its weights says.
+    # [m/s] Speed that it is asked to fly at; the model card of its weights says its expert's.
     speed: float = 2.0
     # File of weights, as `splatpilot train` writes them; those that ship where left empty.
     weights: str = ""

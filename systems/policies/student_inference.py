@@ -46,10 +46,10 @@ class StudentSpec:
     sum of both alone cannot say what is in the way of where to go. None where 0."""
     nominal_speed: float = 2.0
     """[m/s] of the expert."""
-    ways: int = 1
-    """Version of what deviations are from and how far they reach: 2 in what is trained. Files that
-    do not say learned with the first, by which rounding decides whether the unobstructed way to a
-    goal out of reach stops there, and deviations do not fade at the goal."""
+    way_version: int = 1
+    """2 in what is trained. Files that do not say learned with the first, by which rounding decides
+    whether the unobstructed way to a goal out of reach stops there, and deviations do not fade at
+    the goal."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for a field that no network can be made with."""
@@ -61,8 +61,8 @@ class StudentSpec:
                 raise ValueError(f"{name} is {value!r}; it must be 1 to 4096")
         if not isinstance(self.head_features, int) or not 0 <= self.head_features <= 4096:
             raise ValueError(f"head_features is {self.head_features!r}; it must be 0 to 4096")
-        if self.ways not in (1, 2):
-            raise ValueError(f"ways is {self.ways!r}; it must be 1 or 2")
+        if self.way_version not in (1, 2):
+            raise ValueError(f"way_version is {self.way_version!r}; it must be 1 or 2")
         for name, least, most in (("fov_x", 1.0, 179.0), ("nominal_speed", 0.1, 20.0)):
             value = getattr(self, name)
             if not isinstance(value, int | float) or not least <= value <= most:
@@ -76,17 +76,23 @@ class StudentSpec:
     @property
     def margin(self) -> float:
         """Of the unobstructed way, see `MARGIN`."""
-        return MARGIN if self.ways > 1 else 0.0
+        return MARGIN if self.way_version > 1 else 0.0
 
-    def waypoint_scale(self, goal_B: Any) -> Any:
-        """[m] (...) from the unobstructed way that 1 at the network's output means, where the
-        vector to the goal is goal_B (..., 3) [m]; of arrays and tensors.
+    def deviations(self, output: Any, goal_B: Any) -> Any:
+        """From the unobstructed way, (..., M, T, 3) [m], in arrays and tensors.
 
         The way creeps up to a goal at hand: from rest 0.4 m before it, it leads 2 cm ahead in the
-        controller's lookahead. A network that is off by as much hovers there for good.
+        controller's lookahead. A network that is off by as much hovers there for good, so within
+        `AT_HAND` of the goal they fade with the square of the distance.
+
+        Args:
+            output: (..., M, T, 3), the network's.
+            goal_B: (..., 3) [m], the vector to the goal.
         """
-        near = ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
-        return WAYPOINT_SCALE * (near if self.ways > 1 else near**0)
+        if self.way_version == 1:
+            return WAYPOINT_SCALE * output
+        fading = ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
+        return WAYPOINT_SCALE * fading[..., None, None, None] * output
 
     @property
     def reach(self) -> float:
@@ -117,9 +123,9 @@ class StudentSpec:
 class StudentNetwork:
     """The network with its weights, in OpenCV and numpy.
 
-    Asked for another speed than its expert's it does as it would at that, in proportion: it is told
-    as much more of its velocity, and its deviations, from the way that is flown at the speed asked
-    for, are as much less.
+    Asked for another speed than its expert's it does in proportion what it would do at that: where
+    half as fast, it is told twice its velocity, and deviates half as far from the way, which is
+    flown at the speed asked for.
 
     Args:
         spec: the architecture.
@@ -135,19 +141,25 @@ class StudentNetwork:
     ) -> None:
         self.spec = spec
         self._speed = spec.nominal_speed if speed is None else speed
-        self.reach = HORIZON * self._speed
-        """[m] from the goal, within which its distance is told."""
-        self.pace = self._speed / spec.nominal_speed
-        """[-] The speed asked for, over the expert's."""
         self._weights = check_weights(weights, spec.weight_shapes())
         self._encoder = MobileNet(spec.height, spec.width, self._weights)
+
+    @property
+    def reach(self) -> float:
+        """[m] from the goal, within which its distance is told."""
+        return HORIZON * self._speed
+
+    @property
+    def pace(self) -> float:
+        """[-] The speed asked for, over the expert's."""
+        return self._speed / self.spec.nominal_speed
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Waypoints (3, 10, 3) [m] in the body frame and costs (3,).
 
         Args:
             image: (3, height, width), see `encode_color` and `encode_depth`.
-            state: (9,), see `state_observation`.
+            state: (9,), see `state_observation`; with the velocity over `pace`.
 
         Raises:
             ValueError: if the image has another shape.
@@ -169,8 +181,8 @@ class StudentNetwork:
         v_B, towards, up_B = np.reshape(state, (3, 3))
         goal_B = self.reach * towards
         way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed, margin=spec.margin)
-        deviations = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
-        return way + self.pace * spec.waypoint_scale(goal_B) * deviations, output[:, -1]
+        waypoints = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
+        return way + self.pace * spec.deviations(waypoints, goal_B), output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]

@@ -70,7 +70,7 @@ lower penalty, of error and clearance."""
             camera.fov_x,
             head_features=config.head_features,
             nominal_speed=self._data.speed,
-            ways=2,
+            way_version=2,
         )
         self.network = StudentModule(self.spec)
         if config.begin:

@@ -95,14 +95,13 @@ class StudentModule(nn.Module):
         if self.spec.head_features:
             joined = self.hidden_layer(joined).relu()
         output = self.head(joined).unflatten(1, (HYPOTHESES, -1))
-        deviations = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
+        waypoints = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * towards
         way = unobstructed_way(
             v_B, goal_B, up_B, self.spec.nominal_speed, self._basis, self.spec.margin
         )
-        scale = self.spec.waypoint_scale(goal_B)[:, None, None, None]
-        return way[:, None] + scale * deviations, output[..., -1]
+        return way[:, None] + self.spec.deviations(waypoints, goal_B), output[..., -1]
 
 
 class _Bias(nn.Module):

@@ -123,11 +123,14 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
         Student(replace(config_of(name, files), speed=0.0))
 
 
-@pytest.mark.parametrize(("distance", "scale"), [(0.0, 0.0), (0.5, 0.5), (1.0, 2.0), (9.0, 2.0)])
-def test_deviations_fade_at_the_goal(distance, scale):
+@pytest.mark.parametrize(
+    ("version", "distance", "scale"),
+    [(2, 0.0, 0.0), (2, 0.5, 0.5), (2, 1.0, 2.0), (2, 5.0, 2.0), (1, 0.0, 2.0), (1, 5.0, 2.0)],
+)
+def test_deviations_fade_at_the_goal(version, distance, scale):
     """Of a network that always says 0.1, whose hypotheses are a fifth of a metre beside the
-    unobstructed way, and on it where they arrive."""
-    spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, ways=2)
+    unobstructed way, and on it where they arrive; unless it learned when they did not fade."""
+    spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, way_version=version)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
     weights["head.bias"][:] = 0.1
     X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.array([0.5, 0.0, 0.0])

@@ -37,7 +37,7 @@ def gather(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
     grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
     config = CorpusConfig(
         worlds=LibraryConfig(kinds=[str(grove)]),
-        expert=ExpertConfig(period=0.5),
+        expert=ExpertConfig(period=0.5, speed=1.5),
         flights=1,
         camera=camera,
     )
@@ -105,8 +105,16 @@ def test_what_corpora_share_is_flown_once(expert, tmp_path):
     assert ledger["expert_samples"] == len(Corpus(expert))
 
 
-def test_what_sees_in_colours_recovers_too(tmp_path):
-    """DiffAero in colours flies by what it judges, and both its stages see images of its corpus."""
+def test_what_sees_in_colours_recovers_too(tmp_path, monkeypatch):
+    """DiffAero in colours flies by what it judges, as fast as the expert did, and both its stages
+    see images of its corpus."""
+    speeds, fly = [], recovery.fly
+
+    def watched(diagram, scenario, world):
+        speeds.append(scenario.policy.speed)
+        return fly(diagram, scenario, world)
+
+    monkeypatch.setattr(recovery, "fly", watched)
     gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
     overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
@@ -114,6 +122,7 @@ def test_what_sees_in_colours_recovers_too(tmp_path):
     out = tmp_path / "out"
     ledger = recovery.run(config=config, make=DiffAeroRgbTrainer, out=out, flights=1, jobs=1)
     assert sum(ledger["flights"].values()) == 1 and ledger["recovery_samples"] > 0
+    assert speeds == [1.5]
     assert policy_of(out / "stage_2" / "diffaero_rgb.npz") == "diffaero_rgb"
 
 

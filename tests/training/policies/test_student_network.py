@@ -32,12 +32,14 @@ def disturbed(module: StudentModule) -> StudentModule:
 @pytest.mark.parametrize("observation", ["rgb", "depth"])
 @pytest.mark.parametrize("size", [(64, 48), (80, 70)])
 @pytest.mark.parametrize("p_WG", [[4.0, 2.0, 1.5], [1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
-@pytest.mark.parametrize(("hidden", "ways"), [(0, 2), (20, 1), (20, 2)])
-def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden, ways):
+@pytest.mark.parametrize(("hidden", "way_version"), [(0, 2), (20, 1), (20, 2)])
+def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden, way_version):
     """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
     that the module in torch makes of what a corpus would hold of them; whole cells or not."""
     torch.manual_seed(0)
-    spec = StudentSpec(observation, *size, head_features=hidden, nominal_speed=2.6, ways=ways)
+    spec = StudentSpec(
+        observation, *size, head_features=hidden, nominal_speed=2.6, way_version=way_version
+    )
     module = disturbed(StudentModule(spec))
     weights = {name: w.numpy() for name, w in module.state_dict().items()}
     assert {name: w.shape for name, w in weights.items()} == spec.weight_shapes()

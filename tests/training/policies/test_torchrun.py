@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student_inference import StudentSpec
 from splatpilot.training.policies.registry import TRAINERS
-from splatpilot.training.policies.torchrun import Processes, torchrun_processes
+from splatpilot.training.policies.torchrun import (
+    Processes,
+    require_one_process,
+    torchrun_processes,
+)
 from splatpilot.training.policies.train import run
 
 PROGRAM = "from splatpilot.analysis.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
@@ -79,19 +82,12 @@ def test_what_cannot_be_shared_is_refused(monkeypatch):
         pass
 
 
-@pytest.mark.parametrize(
-    ("command", "what"),
-    [
-        ("train diffaero depthnav", "several trainings"),
-        ("train student_rgb --fly P01", "--fly"),
-        ("recover student_rgb", "recover"),
-    ],
-)
-def test_commands_for_one_process_are_refused(command, what, monkeypatch, tmp_path, capsys):
-    """What several processes would do several times, in each other's way, says so before it
-    begins."""
+def test_what_is_for_one_process_is_refused_to_several(monkeypatch):
+    """One process may, of torchrun's too; several are told how to."""
+    require_one_process("recover")
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "test")
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    require_one_process("recover")
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert main([*command.split(), "--out", str(tmp_path / "out")]) == 1
-    assert f"run {what} without torchrun" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    with pytest.raises(ValueError, match=r"started 2 processes, .*; run recover without torchrun"):
+        require_one_process("recover")
