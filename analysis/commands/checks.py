@@ -27,6 +27,8 @@ POLICIES = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
+    "pilot_rgb",
+    "pilot_depth",
 )
 """The names of our own policies."""
 
@@ -38,6 +40,8 @@ TRAINERS = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
+    "pilot_rgb",
+    "pilot_depth",
 )
 """The names of our own trainers."""
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, policy_of
 from splatpilot.systems.policies.student_inference import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
@@ -37,6 +37,7 @@ from splatpilot.training.policies.student_loss import (
     hypothesis_errors,
     hypothesis_penalties,
     imitation_terms,
+    missing_clearances,
     root_mean_square,
     winners,
 )
@@ -59,7 +60,7 @@ lower penalty, of error and clearance."""
 
     def __init__(self, config: StudentTraining) -> None:
         self._config = config
-        self.policy = f"student_{config.observation}"
+        self.policy = config.policy
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
         camera = self._data.camera
@@ -99,7 +100,7 @@ lower penalty, of error and clearance."""
     def _load(self, weights: str) -> None:
         """Has the network begin with a file of weights: with its encoder, and with all else that
         has the same shape."""
-        checkpoint = PolicyCheckpoint.load(weights, self.policy, StudentSpec)
+        checkpoint = PolicyCheckpoint.load(weights, self._seeing_alike(weights), StudentSpec)
         own = self.network.state_dict()
         fitting = {
             name: torch.from_numpy(values).float()
@@ -113,6 +114,11 @@ lower penalty, of error and clearance."""
                 "weights of a student with the same"
             )
         self.network.load_state_dict(fitting, strict=False)
+
+    def _seeing_alike(self, weights: str) -> str:
+        """The policy of a file of weights if it sees what this one sees, and else this one."""
+        policy, seen = policy_of(weights), self._config.observation
+        return policy if policy in (f"student_{seen}", f"pilot_{seen}") else self.policy
 
     def take_part(self, rank: int, count: int) -> None:
         """See `Trainer`.
@@ -196,7 +202,7 @@ lower penalty, of error and clearance."""
         distances = self._data.distance_along(waypoints, labels)
         experts = labels.trajectories_B[:, : config.experts or None]
         errors = hypothesis_errors(experts, waypoints)
-        barriers = barrier_along(distances)
+        barriers = barrier_along(distances.detach())
         penalties = hypothesis_penalties(errors.detach(), barriers, config.geometric_weight)
         won, unvoted = imitation_terms(errors, config.epsilon)
         votes = winners(errors.detach()).sum((0, 1))
@@ -207,6 +213,12 @@ lower penalty, of error and clearance."""
             "cost": config.cost_weight * cost_error(costs, cost_targets(penalties)),
             **{f"votes_{m}": share for m, share in enumerate(shares)},
         }
+        if config.clearance_weight:
+            best = labels.trajectories_B[:, :1]
+            kept = self._data.distance_along(best.nan_to_num(), labels)[:, 0]
+            kept = torch.where(best.isfinite().flatten(1).all(1)[:, None], kept, -torch.inf)
+            missing = missing_clearances(distances, kept, config.enough)
+            terms["clearance"] = config.clearance_weight * missing.mean()
         return _Judged(terms, costs, errors, distances, penalties)
 
 

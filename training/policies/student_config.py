@@ -14,6 +14,8 @@ from splatpilot.training.policies.trainer import Schedule
 class StudentTraining:
     """A training run."""
 
+    policy: ClassVar[str]
+    """Its name."""
     observation: ClassVar[str]
     """What the student sees: rgb or depth."""
 
@@ -36,8 +38,8 @@ class StudentTraining:
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
     pretrained: bool = True
-    # File of this policy's weights, which are trained further instead; a head of another shape
-    # begins anew. None where left empty.
+    # File of weights of a student that sees the same, which are trained further instead; a head of
+    # another shape begins anew. None where left empty.
     begin: str = ""
     # File of ImageNet's; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""
@@ -70,6 +72,11 @@ class StudentTraining:
     # [-] Weight of the cost head's error beside the imitation: costs are about 1 where errors are
     # tenths of a square metre, and would rule the encoder at 1.
     cost_weight: float = 0.1
+    # [-] Weight of the clearance that hypotheses lack of their expert's, squared as errors are;
+    # none, as published, where 0. To errors a decimetre towards a wall is as bad as one along it.
+    clearance_weight: float = 0.0
+    # [m] From surfaces to the vehicle's centre, more than which nobody need keep.
+    enough: float = 0.8
     # How far images are relit; a corpus has looks of its own.
     appearance: Appearance = field(default_factory=lambda: Appearance(exposure=0.0, hue=0.0))
     # What the images are disturbed by. Where modules are frozen it costs more than it gains: their
@@ -93,7 +100,7 @@ class StudentTraining:
         for name in ("batch", "draws", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("geometric_weight", "cost_weight"):
+        for name in ("geometric_weight", "cost_weight", "clearance_weight", "enough"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
         if not 0 <= self.frozen <= IMAGE_MODULES:
@@ -116,6 +123,7 @@ class StudentTraining:
 class StudentRgbTraining(StudentTraining):
     """Of a student that sees colours."""
 
+    policy = "student_rgb"
     observation = "rgb"
 
 
@@ -123,4 +131,28 @@ class StudentRgbTraining(StudentTraining):
 class StudentDepthTraining(StudentTraining):
     """Of a student that sees depth."""
 
+    policy = "student_depth"
+    observation = "depth"
+
+
+@dataclass
+class PilotTraining(StudentTraining):
+    """Of a student that learns to keep as clear as its expert, which the paper's does not."""
+
+    clearance_weight: float = 5.0
+
+
+@dataclass
+class PilotRgbTraining(PilotTraining):
+    """Of a pilot that sees colours."""
+
+    policy = "pilot_rgb"
+    observation = "rgb"
+
+
+@dataclass
+class PilotDepthTraining(PilotTraining):
+    """Of a pilot that sees depth."""
+
+    policy = "pilot_depth"
     observation = "depth"

@@ -119,12 +119,15 @@ class StudentData:
         return shard, numbers - self.first[shard]
 
     def distance_along(self, waypoints_B: Tensor, labels: Labels) -> Tensor:
-        """Signed distance (N, M, T) [m] at waypoints (N, M, T, 3) [m] from samples' poses."""
+        """Signed distance (N, M, T) [m] at waypoints (N, M, T, 3) [m] from samples' poses,
+        differentiable by the waypoints."""
         N, M, T, _ = waypoints_B.shape
         R_WB, p_WB = rotation_matrix(labels.X_WB[:, :4]), labels.X_WB[:, None, 4:]
-        p_WQ = waypoints_B.detach().flatten(1, 2) @ R_WB.mT + p_WB
+        p_WQ = (waypoints_B.flatten(1, 2) @ R_WB.mT + p_WB).flatten(0, 1)
         world = labels.world.repeat_interleave(M * T)
-        return self._fields.interpolate(p_WQ.flatten(0, 1), world)[0].reshape(N, M, T)
+        distances, gradients = self._fields.interpolate(p_WQ.detach(), world)
+        along = (gradients * (p_WQ - p_WQ.detach())).sum(1)
+        return (distances + along).reshape(N, M, T)
 
     @cached_property
     def _fields(self) -> EsdfGeometry:

@@ -126,6 +126,20 @@ def test_training_goes_on_from_weights_that_are_given(trained, student_corpus, t
             np.testing.assert_allclose(after[name], before[name], atol=1e-3)
 
 
+def test_pilots_learn_to_keep_clear(trained, student_corpus, tmp_path):
+    """What it lacks of its expert's clearance shrinks, from a student's weights on; its file is a
+    pilot's."""
+    config = training(student_corpus, "depth", f"begin={trained / 'student_depth.npz'}")
+    pilot = TRAINERS.find("pilot_depth")
+    config = pilot.config(**vars(config) | {"clearance_weight": 50.0})
+    run(config=config, out=tmp_path, make=pilot.make)
+    rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
+    lacking = [float(row["clearance"]) for row in rows]
+    assert lacking[-1] < 0.7 * lacking[0]
+    weights = str(tmp_path / "pilot_depth.npz")
+    assert policy_named(weights).policy == "pilot_depth"
+
+
 def test_a_head_of_another_shape_begins_anew(trained, student_corpus, tmp_path):
     """What the encoder and the layer of its cells learned stays, frozen, and only the head and what
     it is told change; of another encoder weights are refused."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from splatpilot.systems.configuration import dump_config
 from splatpilot.training.corpus.config import CorpusConfig
@@ -79,6 +80,23 @@ def test_distances_along_trajectories_are_those_of_the_world(two):
         points_W = p_WB + points_B + q_WB[0] * twice + np.cross(q_WB[1:], twice)
         expected = fields[data.worlds[world]].distance(points_W)
         np.testing.assert_allclose(found[n], expected, atol=2e-4)
+
+
+def test_distances_change_as_waypoints_do(two):
+    """A millimetre along the gradient, and back, makes the difference that it says, in all but the
+    few that cross from one voxel to the next."""
+    data = StudentData(two, 0.34)
+    labels = data.labels(np.arange(0, 72, 5))
+    waypoints = labels.trajectories_B.nan_to_num().requires_grad_()
+    data.distance_along(waypoints, labels).sum().backward()
+    gradient = waypoints.grad
+    assert gradient is not None and gradient.norm(dim=-1).median() > 0.5
+    with torch.no_grad():
+        ahead, behind = (
+            data.distance_along(waypoints + step * gradient, labels) for step in (1e-3, -1e-3)
+        )
+    expected = 2e-3 * gradient.square().sum(-1)
+    assert ((ahead - behind - expected).abs() < 2e-5).float().mean() > 0.9
 
 
 def test_corpora_that_do_not_fit_are_refused(two, tmp_path):

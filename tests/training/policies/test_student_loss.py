@@ -12,6 +12,7 @@ from splatpilot.training.policies.student_loss import (
     hypothesis_errors,
     hypothesis_penalties,
     imitation_terms,
+    missing_clearances,
     root_mean_square,
     winners,
 )
@@ -81,6 +82,17 @@ def test_costs_are_of_error_and_of_the_clearance_of_the_own_way():
     assert perfect.tolist() == [[0.0, 0.0, 0.0]]
 
 
+def test_what_lacks_of_the_expert_s_clearance_counts_up_to_what_is_enough():
+    """Of an expert 0.5 m from surfaces, and of one that is far from them where 0.8 m are enough: a
+    hypothesis at 0.3 m lacks 0.2 and 0.5 m all along; one farther off than its expert nothing, and
+    none of an expert that there is not."""
+    distances = torch.tensor([0.3, 0.9], dtype=torch.float64)[:, None].expand(3, 2, 10)
+    kept = torch.tensor([0.5, 3.0, -math.inf], dtype=torch.float64)[:, None].expand(3, 10)
+    found = missing_clearances(distances, kept, 0.8)
+    assert found[:, 0].tolist() == pytest.approx([10 / 3 * 0.2**2, 10 / 3 * 0.5**2, 0.0])
+    assert found[:, 1].tolist() == [0.0, 0.0, 0.0]
+
+
 def test_gradients_are_those_of_finite_differences():
     """Of each term, by waypoints and by costs, in double precision; also with an expert missing."""
     experts, waypoints = random(0, 3, 3, 10, 3), random(1, 3, 3, 10, 3).requires_grad_()
@@ -94,6 +106,8 @@ def test_gradients_are_those_of_finite_differences():
     unvoted = lambda w: imitation_terms(hypothesis_errors(experts, w), 0.05)[1]  # noqa: E731
     assert unvoted(aside) > 0.0 and check(unvoted, aside)
     assert check(barrier_along, distances)
+    kept = 1.0 + 0.3 * random(5, 3, 10)
+    assert check(lambda d: missing_clearances(d, kept, 1.1), distances)
     assert check(
         lambda w, d: hypothesis_penalties(hypothesis_errors(experts, w), barrier_along(d), 2.0),
         (waypoints, distances),
