@@ -21,13 +21,7 @@ from splatpilot.systems.policies.privileged_planner import (
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.reactive_planner import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
-from splatpilot.systems.policies.student import (
-    PilotDepthConfig,
-    PilotRgbConfig,
-    Student,
-    StudentDepthConfig,
-    StudentRgbConfig,
-)
+from splatpilot.systems.policies.student import Student, StudentDepthConfig, StudentRgbConfig
 from splatpilot.systems.registry import Registry
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
@@ -131,8 +125,8 @@ register_policy(
     DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
-for _config in (StudentRgbConfig, StudentDepthConfig, PilotRgbConfig, PilotDepthConfig):
-    register_policy(_config, lambda config, world, vehicle: Student(config), name=_config.policy)
+for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
+    register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
 
 
 def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:

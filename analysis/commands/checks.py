@@ -27,8 +27,6 @@ POLICIES = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
-    "pilot_rgb",
-    "pilot_depth",
 )
 """The names of our own policies."""
 
@@ -40,8 +38,6 @@ TRAINERS = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
-    "pilot_rgb",
-    "pilot_depth",
 )
 """The names of our own trainers."""
 

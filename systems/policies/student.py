@@ -21,8 +21,6 @@ from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 class StudentConfig:
     """The student's weights, what it is asked for, and the camera that it sees through."""
 
-    policy: ClassVar[str]
-    """Its name, and its weights'."""
     observation: ClassVar[str]
     """What it sees: rgb or depth."""
     rate: ClassVar[float] = RATE
@@ -44,7 +42,6 @@ class StudentConfig:
 class StudentRgbConfig(StudentConfig):
     """A student that sees colours."""
 
-    policy = "student_rgb"
     observation = "rgb"
 
 
@@ -52,23 +49,6 @@ class StudentRgbConfig(StudentConfig):
 class StudentDepthConfig(StudentConfig):
     """A student that sees depth."""
 
-    policy = "student_depth"
-    observation = "depth"
-
-
-@dataclass
-class PilotRgbConfig(StudentConfig):
-    """A student that sees colours, and learned to keep as clear as its expert."""
-
-    policy = "pilot_rgb"
-    observation = "rgb"
-
-
-@dataclass
-class PilotDepthConfig(StudentConfig):
-    """A student that sees depth, and learned to keep as clear as its expert."""
-
-    policy = "pilot_depth"
     observation = "depth"
 
 
@@ -108,7 +88,7 @@ class Student(LeafSystem):
     def __init__(self, config: StudentConfig) -> None:
         super().__init__()
         config.validate()
-        self._network = load_network(config.weights, config.policy, config.speed)
+        self._network = load_network(config.weights, config.observation, config.speed)
         spec, camera = self._network.spec, config.camera
         for name in ("width", "height", "fov_x"):
             given, trained = getattr(camera, name), getattr(spec, name)

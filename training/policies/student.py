@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, policy_of
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student_inference import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
@@ -60,7 +60,7 @@ lower penalty, of error and clearance."""
 
     def __init__(self, config: StudentTraining) -> None:
         self._config = config
-        self.policy = config.policy
+        self.policy = f"student_{config.observation}"
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
         camera = self._data.camera
@@ -100,7 +100,7 @@ lower penalty, of error and clearance."""
     def _load(self, weights: str) -> None:
         """Has the network begin with a file of weights: with its encoder, and with all else that
         has the same shape."""
-        checkpoint = PolicyCheckpoint.load(weights, self._seeing_alike(weights), StudentSpec)
+        checkpoint = PolicyCheckpoint.load(weights, self.policy, StudentSpec)
         own = self.network.state_dict()
         fitting = {
             name: torch.from_numpy(values).float()
@@ -114,11 +114,6 @@ lower penalty, of error and clearance."""
                 "weights of a student with the same"
             )
         self.network.load_state_dict(fitting, strict=False)
-
-    def _seeing_alike(self, weights: str) -> str:
-        """The policy of a file of weights if it sees what this one sees, and else this one."""
-        policy, seen = policy_of(weights), self._config.observation
-        return policy if policy in (f"student_{seen}", f"pilot_{seen}") else self.policy
 
     def take_part(self, rank: int, count: int) -> None:
         """See `Trainer`.

@@ -81,7 +81,7 @@ def test_plans_at_its_rate(name, files):
     vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
     found = Hypotheses.from_vector(vector, 3)
     assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
-    network = load_network(files[name], config.policy, config.speed)
+    network = load_network(files[name], name, config.speed)
     X_WB = pose_from_state(state)
     expected = plan(network, 0.0, seen, X_WB, state[3:6], P_WG)
     np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
@@ -102,7 +102,7 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
     about = {"format": 1, "policy": "student_depth", "spec": {"depth": 3}, "provenance": {}}
     np.savez(tmp_path / "odd.npz", about=json.dumps(about))
     with pytest.raises(ValueError, match=r"odd\.npz holds weights of another architecture"):
-        load_network(str(tmp_path / "odd.npz"), "student_depth", 2.0)
+        load_network(str(tmp_path / "odd.npz"), "depth", 2.0)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -114,9 +114,7 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
 
     def hypotheses(speed: float) -> Hypotheses:
         asked = speed / StudentSpec.nominal_speed * v_WB
-        return plan(
-            load_network(files[name], f"student_{name}", speed), 0.0, image, X_WB, asked, P_WG
-        )
+        return plan(load_network(files[name], name, speed), 0.0, image, X_WB, asked, P_WG)
 
     expected, found = hypotheses(2.0), hypotheses(1.0)
     np.testing.assert_allclose(2.0 * found.waypoints_B, expected.waypoints_B, atol=1e-5)
@@ -156,7 +154,7 @@ def corridor(low: int, high: int, distance: float) -> np.ndarray:
 def test_weights_that_ship_fly_around_what_stands_ahead():
     """At 2 m/s towards a goal straight ahead, the student that sees depth goes on where nothing
     stands, passes a wall on its free side, and slows before one that leaves none."""
-    network = load_network("", "student_depth", 2.6)
+    network = load_network("", "depth", 2.6)
     X_WB, v_WB, p_WG = RigidTransform([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.0]), [12.0, 0.0, 1.5]
 
     def end(depth: np.ndarray) -> np.ndarray:
@@ -172,7 +170,7 @@ def test_weights_that_ship_fly_around_what_stands_ahead():
 def test_weights_that_ship_see_colours():
     """The student that sees colours, in flight, wants other things where it sees, or is told,
     others."""
-    network, X_WB = load_network("", "student_rgb", 2.6), RigidTransform([0.0, 0.0, 1.5])
+    network, X_WB = load_network("", "rgb", 2.6), RigidTransform([0.0, 0.0, 1.5])
     v_WB = np.array([1.5, 0.0, 0.0])
     meadow = np.full((120, 160, 3), [150, 180, 220], np.uint8)
     meadow[60:] = 90, 110, 70

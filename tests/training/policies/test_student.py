@@ -59,7 +59,7 @@ def test_student_learns_what_it_is_shown(trained):
     votes = [[row[f"votes_{m}"] for m in range(3)] for row in curve]
     np.testing.assert_allclose(np.sum(votes, axis=1), 1.0, atol=1e-5)
     assert min(votes[-1]) > 0.05
-    terms = sum(curve[-1][name] for name in ("winners", "unvoted", "cost"))
+    terms = sum(curve[-1][name] for name in ("winners", "unvoted", "cost", "clearance"))
     assert curve[-1]["loss"] == pytest.approx(terms, rel=1e-5)
     best = max(row["success"] for row in curve if "success" in row)
     assert f"| success | {best:.2f} |" in (trained / "student_depth.md").read_text()
@@ -126,18 +126,14 @@ def test_training_goes_on_from_weights_that_are_given(trained, student_corpus, t
             np.testing.assert_allclose(after[name], before[name], atol=1e-3)
 
 
-def test_pilots_learn_to_keep_clear(trained, student_corpus, tmp_path):
-    """What it lacks of its expert's clearance shrinks, from a student's weights on; its file is a
-    pilot's."""
-    config = training(student_corpus, "depth", f"begin={trained / 'student_depth.npz'}")
-    pilot = TRAINERS.find("pilot_depth")
-    config = pilot.config(**vars(config) | {"clearance_weight": 50.0})
-    run(config=config, out=tmp_path, make=pilot.make)
+def test_students_learn_to_keep_clear(trained, student_corpus, tmp_path):
+    """What one lacks of its expert's clearance shrinks, from its weights on."""
+    began = trained / "student_depth.npz"
+    config = training(student_corpus, "depth", f"begin={began}", "clearance_weight=50.0")
+    run(config=config, out=tmp_path, make=TRAINERS.find("student_depth").make)
     rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
     lacking = [float(row["clearance"]) for row in rows]
     assert lacking[-1] < 0.7 * lacking[0]
-    weights = str(tmp_path / "pilot_depth.npz")
-    assert policy_named(weights).policy == "pilot_depth"
 
 
 def test_a_head_of_another_shape_begins_anew(trained, student_corpus, tmp_path):
