@@ -11,7 +11,8 @@ reach of two seconds and shrinks to nothing at the goal; beside it stands which 
 has a hidden layer, unlike the paper's, unless `head_features` is 0. The encoder's 4x5 cells are
 kept apart, at 64 numbers each, which are as many as the average over all cells has at 1280; depth
 is encoded by its logarithm, as a grey image; the barrier is integrated over the second that is
-predicted.
+predicted. A student that sees depth also learns to keep as clear as its expert, unless
+`clearance_weight` is 0.
 """
 
 from pathlib import Path
@@ -210,9 +211,9 @@ lower penalty, of error and clearance."""
         }
         if config.clearance_weight:
             best = labels.trajectories_B[:, :1]
-            kept = self._data.distance_along(best.nan_to_num(), labels)[:, 0]
-            kept = torch.where(best.isfinite().flatten(1).all(1)[:, None], kept, -torch.inf)
-            missing = missing_clearances(distances, kept, config.enough)
+            kept = self._data.distance_along(best.nan_to_num(), labels)
+            kept = torch.where(best.isfinite().all(3), kept, -torch.inf)[:, 0]
+            missing = missing_clearances(distances, kept, config.clearance_cap)
             terms["clearance"] = config.clearance_weight * missing.mean()
         return _Judged(terms, costs, errors, distances, penalties)
 

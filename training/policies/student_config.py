@@ -73,8 +73,8 @@ class StudentTraining:
     # [-] Weight of the clearance that hypotheses lack of their expert's, squared as errors are;
     # none, as published, where 0. To errors a decimetre towards a wall is as bad as one along it.
     clearance_weight: float = 0.0
-    # [m] From surfaces to the vehicle's centre, more than which nobody need keep.
-    enough: float = 0.8
+    # [m] From surfaces to the vehicle's centre; of an expert that is farther off, as much is asked.
+    clearance_cap: float = 0.8
     # How far images are relit; a corpus has looks of its own.
     appearance: Appearance = field(default_factory=lambda: Appearance(exposure=0.0, hue=0.0))
     # What the images are disturbed by. Where modules are frozen it costs more than it gains: their
@@ -98,7 +98,7 @@ class StudentTraining:
         for name in ("batch", "draws", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("geometric_weight", "cost_weight", "clearance_weight", "enough"):
+        for name in ("geometric_weight", "cost_weight", "clearance_weight", "clearance_cap"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
         if not 0 <= self.frozen <= IMAGE_MODULES:
@@ -130,4 +130,5 @@ class StudentDepthTraining(StudentTraining):
 
     observation = "depth"
 
+    # By colours it was tried, and gained nothing.
     clearance_weight: float = 5.0

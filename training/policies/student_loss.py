@@ -60,16 +60,16 @@ def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     return won, share * (unvoted * finite[:, 0]).sum(1).mean()
 
 
-def missing_clearances(distances: Tensor, experts: Tensor, enough: float) -> Tensor:
-    """C_m (N, M) = 10 / (3 T) sum_t (min(d*_t, enough) - d_mt)^2 [m^2] where that is positive: how
+def missing_clearances(distances: Tensor, experts: Tensor, cap: float) -> Tensor:
+    """C_m (N, M) = 10 / (3 T) sum_t (min(d*_t, cap) - d_mt)^2 [m^2] where that is positive: how
     much nearer to surfaces hypotheses are than the expert at the same time.
 
     Args:
         distances: d (N, M, T) [m], signed, at the waypoints.
         experts: d* (N, T) [m] at the best expert's; -inf where there is none, and nothing missing.
-        enough: [m], of which more is not better.
+        cap: [m], of which more is not asked.
     """
-    missing = (experts.clamp(max=enough)[:, None] - distances).clamp(min=0.0)
+    missing = (experts.clamp(max=cap)[:, None] - distances).clamp(min=0.0)
     return 10.0 / (3 * distances.shape[2]) * missing.square().sum(2)
 
 

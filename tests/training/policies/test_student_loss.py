@@ -82,8 +82,8 @@ def test_costs_are_of_error_and_of_the_clearance_of_the_own_way():
     assert perfect.tolist() == [[0.0, 0.0, 0.0]]
 
 
-def test_what_lacks_of_the_expert_s_clearance_counts_up_to_what_is_enough():
-    """Of an expert 0.5 m from surfaces, and of one that is far from them where 0.8 m are enough: a
+def test_lacking_clearance_counts_up_to_the_cap():
+    """Of an expert 0.5 m from surfaces, and of one that is far from them with a cap of 0.8 m: a
     hypothesis at 0.3 m lacks 0.2 and 0.5 m all along; one farther off than its expert nothing, and
     none of an expert that there is not."""
     distances = torch.tensor([0.3, 0.9], dtype=torch.float64)[:, None].expand(3, 2, 10)
