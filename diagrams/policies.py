@@ -21,7 +21,12 @@ from splatpilot.systems.policies.privileged_planner import (
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.reactive_planner import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
-from splatpilot.systems.policies.student import Student, StudentDepthConfig, StudentRgbConfig
+from splatpilot.systems.policies.student import (
+    PilotRgbConfig,
+    Student,
+    StudentDepthConfig,
+    StudentRgbConfig,
+)
 from splatpilot.systems.registry import Registry
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
 
@@ -125,7 +130,11 @@ register_policy(
     DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
-for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
+for _config, _name in (
+    (StudentRgbConfig, "student_rgb"),
+    (StudentDepthConfig, "student_depth"),
+    (PilotRgbConfig, "pilot_rgb"),
+):
     register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
 
 

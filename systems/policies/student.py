@@ -10,6 +10,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.policies.depth_policy_config import require_speed
 from splatpilot.systems.policies.hypotheses import no_plan
+from splatpilot.systems.policies.mirrored_views import plan_both_views
 from splatpilot.systems.policies.student_inference import HYPOTHESES, RATE, load_network, plan
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -23,6 +24,8 @@ class StudentConfig:
 
     observation: ClassVar[str]
     """What it sees: rgb or depth."""
+    mirrored: ClassVar[bool] = False
+    """Whether it sees each image in a mirror too, and flies what both views agree upon."""
     rate: ClassVar[float] = RATE
 
     # [m/s] Speed that it is asked to fly at; the model card of its weights says its expert's.
@@ -43,6 +46,14 @@ class StudentRgbConfig(StudentConfig):
     """A student that sees colours."""
 
     observation = "rgb"
+
+
+@dataclass
+class PilotRgbConfig(StudentRgbConfig):
+    """A student that sees colours twice, as they are and in a mirror; by the weights of
+    `student_rgb`."""
+
+    mirrored = True
 
 
 @dataclass
@@ -70,10 +81,12 @@ class Student(LeafSystem):
     - ``color_image`` (RGBA) or ``depth_image_32f`` (planar [m]) of the camera ``config.camera``, by
       ``config.observation``.
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
-      planning; a discrete state, NaN before the first update.
+      planning; a discrete state, NaN before the first update. Six of them, (8 + 31 * 6), of a
+      config that is ``mirrored``.
 
     Updates at 15 Hz from time 0 by
-    :func:`~splatpilot.systems.policies.student_inference.plan`.
+    :func:`~splatpilot.systems.policies.student_inference.plan`, or, ``mirrored``, by
+    :func:`~splatpilot.systems.policies.mirrored_views.plan_both_views`.
 
     Raises:
         ValueError, FileNotFoundError: from the constructor on a config out of range, on weights
@@ -106,14 +119,16 @@ class Student(LeafSystem):
         self._image_port = self.DeclareAbstractInputPort(
             name, Value(image(camera.width, camera.height))
         )
-        self.DeclareStateOutputPort("hypotheses", self.DeclareDiscreteState(no_plan(HYPOTHESES)))
+        self._plan = plan_both_views if config.mirrored else plan
+        plans = no_plan(2 * HYPOTHESES if config.mirrored else HYPOTHESES)
+        self.DeclareStateOutputPort("hypotheses", self.DeclareDiscreteState(plans))
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = np.asarray(self._state_port.Eval(context))
         pixels = np.asarray(cast(Any, self._image_port.Eval(context)).data)  # (H, W, 4 or 1)
         image = pixels[..., :3] if self._network.spec.observation == "rgb" else pixels[..., 0]
-        hypotheses = plan(
+        hypotheses = self._plan(
             self._network,
             context.get_time(),
             image,

@@ -232,6 +232,8 @@ def plan(
     X_WB: RigidTransform,
     v_WB: np.ndarray,
     p_WG: np.ndarray,
+    *,
+    mirrored: bool = False,
 ) -> Hypotheses:
     """The hypotheses of one observation.
 
@@ -240,11 +242,15 @@ def plan(
         image: (H, W, 3) uint8 colours or (H, W) [m] planar depth, as `network.spec.observation`.
         X_WB, v_WB: pose and velocity [m/s].
         p_WG: the goal [m].
+        mirrored: whether left is right, of what is seen and told and of the waypoints.
 
     Raises:
         ValueError: for an image of another size.
     """
     encode = encode_color if network.spec.pixels == "color" else encode_depth
     state = state_observation(X_WB, v_WB / network.pace, p_WG, network.reach)
-    waypoints_B, costs = network(encode(image), state)
+    seen = encode(image)
+    if mirrored:
+        seen, state = np.ascontiguousarray(seen[:, :, ::-1]), state * np.tile([1.0, -1.0, 1.0], 3)
+    waypoints_B, costs = network(seen, state)
     return Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))

@@ -12,8 +12,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.policies.mirrored_views import plan_both_views
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student import (
+    PilotRgbConfig,
     Student,
     StudentConfig,
     StudentDepthConfig,
@@ -84,6 +86,27 @@ def test_plans_at_its_rate(name, files):
     network = load_network(files[name], name, config.speed)
     X_WB = pose_from_state(state)
     expected = plan(network, 0.0, seen, X_WB, state[3:6], P_WG)
+    np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
+    np.testing.assert_array_equal(found.costs, expected.costs)
+
+
+def test_a_pilot_plans_by_both_views(files):
+    """By a student's weights, six hypotheses, which are those of the pure policy."""
+    system = Student(
+        PilotRgbConfig(weights=files["rgb"], camera=OnboardCamera(width=64, height=48))
+    )
+    simulator, state = Simulator(system), hover_state([1.0, 2.0, 1.5], yaw=0.6)
+    context, image = simulator.get_mutable_context(), ImageRgba8U(64, 48)
+    image.mutable_data[...] = np.random.default_rng(1).integers(0, 256, (48, 64, 4))
+    system.GetInputPort("state").FixValue(context, state)
+    system.GetInputPort("goal").FixValue(context, P_WG)
+    system.GetInputPort("color_image").FixValue(context, Value(image))
+    simulator.AdvanceTo(0.01)
+    vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
+    found = Hypotheses.from_vector(vector, 6)
+    network, seen = load_network(files["rgb"], "rgb", 2.0), np.asarray(image.data)[..., :3]
+    expected = plan_both_views(network, 0.0, seen, pose_from_state(state), state[3:6], P_WG)
+    assert found is not None
     np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
     np.testing.assert_array_equal(found.costs, expected.costs)
 
