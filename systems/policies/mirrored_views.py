@@ -33,11 +33,6 @@ def consensus(waypoints: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.
     return np.einsum("mn,ntk->mtk", weights / sums[:, None], waypoints), -np.log(sums)
 
 
-def mirrored_vectors(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of the body frame in a mirror: left is right."""
-    return vectors * np.array([1.0, -1.0, 1.0])
-
-
 def plan_both_views(
     network: StudentNetwork,
     time: float,
@@ -46,13 +41,16 @@ def plan_both_views(
     v_WB: np.ndarray,
     p_WG: np.ndarray,
 ) -> Hypotheses:
-    """The consensus of the six hypotheses of an image and of the same in a mirror, in whose world
-    velocity, goal and up are mirrored too, and out of which its hypotheses are mirrored back.
+    """The consensus of the six hypotheses of an image, three of them seen in a mirror.
 
     Args, raises: see :func:`~splatpilot.systems.policies.student_inference.plan`.
     """
-    seen = plan(network, time, image, X_WB, v_WB, p_WG)
-    other = plan(network, time, image, X_WB, v_WB, p_WG, mirrored=True)
-    waypoints = np.concatenate([seen.waypoints_B, mirrored_vectors(other.waypoints_B)])
-    waypoints_B, costs = consensus(waypoints, np.concatenate([seen.costs, other.costs]))
+    views = [
+        plan(network, time, image, X_WB, v_WB, p_WG, mirrored=mirrored)
+        for mirrored in (False, True)
+    ]
+    waypoints_B, costs = consensus(
+        np.concatenate([view.waypoints_B for view in views]),
+        np.concatenate([view.costs for view in views]),
+    )
     return Hypotheses(time, X_WB, waypoints_B, costs)

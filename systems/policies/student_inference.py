@@ -225,6 +225,11 @@ def state_observation(
     return (np.stack([v_WB, towards, [0.0, 0.0, 1.0]]) @ R_WB).ravel()
 
 
+def mirrored_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of the body frame in a mirror: left is right."""
+    return vectors * np.array([1.0, -1.0, 1.0])
+
+
 def plan(
     network: StudentNetwork,
     time: float,
@@ -242,7 +247,8 @@ def plan(
         image: (H, W, 3) uint8 colours or (H, W) [m] planar depth, as `network.spec.observation`.
         X_WB, v_WB: pose and velocity [m/s].
         p_WG: the goal [m].
-        mirrored: whether left is right, of what is seen and told and of the waypoints.
+        mirrored: whether the network sees all in a mirror, the image and what it is told, and its
+            waypoints are mirrored back.
 
     Raises:
         ValueError: for an image of another size.
@@ -251,6 +257,9 @@ def plan(
     state = state_observation(X_WB, v_WB / network.pace, p_WG, network.reach)
     seen = encode(image)
     if mirrored:
-        seen, state = np.ascontiguousarray(seen[:, :, ::-1]), state * np.tile([1.0, -1.0, 1.0], 3)
+        seen = np.ascontiguousarray(seen[:, :, ::-1])
+        state = mirrored_vectors(state.reshape(3, 3)).ravel()
     waypoints_B, costs = network(seen, state)
+    if mirrored:
+        waypoints_B = mirrored_vectors(waypoints_B)
     return Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))

@@ -10,10 +10,14 @@ from splatpilot.systems.policies.mirrored_views import (
     ALIKE,
     SHARPNESS,
     consensus,
-    mirrored_vectors,
     plan_both_views,
 )
-from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.policies.student_inference import (
+    StudentNetwork,
+    StudentSpec,
+    mirrored_vectors,
+    plan,
+)
 
 
 @pytest.fixture(scope="module", params=["rgb", "depth"])
@@ -33,7 +37,7 @@ def image_for(network: StudentNetwork) -> np.ndarray:
 
 
 def test_two_that_agree_outvote_a_cheaper_one():
-    """Of one trajectory far to the left and two that are 0.3 m apart to the right, in closed form:
+    """Of one trajectory far to the left and two that are 0.3 m apart ahead, in closed form:
     the weights of the pair are 1 and exp(-1), and each is drawn towards the other."""
     ends = np.array([3.0, -0.15, 0.15])
     waypoints = np.zeros((3, 10, 3))
