@@ -1,8 +1,14 @@
 """Where tensors live, and whether that is there."""
 
+import ctypes
 import importlib.util
 
 import torch
+
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
+"""Parameters of glibc's `mallopt`, see malloc.h."""
+_LARGEST_KEPT = 32 << 20
+"""[bytes] The most that glibc takes for the first; larger ones it always asks the system for."""
 
 
 def require_device(device: str) -> None:
@@ -32,3 +38,16 @@ def require_renderer(device: str) -> None:
             f"device is {device!r}, on which gsplat renders; pip install 'splatpilot[cuda]', or "
             "choose device=cpu"
         )
+
+
+def keep_freed_memory() -> None:
+    """Has this process keep the memory of tensors that are gone for those that come.
+
+    Otherwise glibc gives it back to the system after each pass of a network, and the system clears
+    it anew for the next: a quarter of the time of the student's encoder, and more where several
+    processes do so. Without effect where the C library is another.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_MMAP_THRESHOLD, _LARGEST_KEPT)
+        mallopt(_TRIM_THRESHOLD, 2**31 - 1)

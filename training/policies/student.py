@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, policy_of
 from splatpilot.systems.policies.student_inference import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
@@ -30,7 +30,12 @@ from splatpilot.training.policies.pretrained import imagenet_weights
 from splatpilot.training.policies.student_config import StudentTraining
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_features import FrozenFeatures
-from splatpilot.training.policies.student_images import clean_images, training_images
+from splatpilot.training.policies.student_images import (
+    clean_images,
+    in_a_mirror,
+    nearest_patches,
+    training_images,
+)
 from splatpilot.training.policies.student_loss import (
     barrier_along,
     cost_error,
@@ -61,7 +66,7 @@ lower penalty, of error and clearance."""
 
     def __init__(self, config: StudentTraining) -> None:
         self._config = config
-        self.policy = f"student_{config.observation}"
+        self.policy = config.policy
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
         camera = self._data.camera
@@ -74,7 +79,7 @@ lower penalty, of error and clearance."""
             nominal_speed=self._data.speed,
             way_version=2,
         )
-        self.network = StudentModule(self.spec)
+        self.network = StudentModule(self.spec, tells_depth=config.depth_weight > 0.0)
         if config.begin:
             self._load(config.begin)
         elif config.pretrained:
@@ -82,9 +87,9 @@ lower penalty, of error and clearance."""
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
         self.network.to(config.device).to(memory_format=torch.channels_last)
-        self._features = None
-        if config.frozen:
-            self._features = FrozenFeatures(
+        views = [False, True] if config.mirrored else [False]
+        self._features = [
+            FrozenFeatures(
                 Path(config.features),
                 self._data,
                 self.network,
@@ -92,7 +97,10 @@ lower penalty, of error and clearance."""
                 config.draws,
                 config.appearance,
                 config.noise,
+                mirrored,
             )
+            for mirrored in (views if config.frozen else [])
+        ]
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
         self._rank, self._processes = 0, 1
         data, count = self._data.held_out, config.validation_samples
@@ -101,7 +109,11 @@ lower penalty, of error and clearance."""
     def _load(self, weights: str) -> None:
         """Has the network begin with a file of weights: with its encoder, and with all else that
         has the same shape."""
-        checkpoint = PolicyCheckpoint.load(weights, self.policy, StudentSpec)
+        alike = {"rgb": ("student_rgb", "pilot_rgb"), "depth": ("student_depth",)}
+        policy = policy_of(weights)
+        if policy not in alike[self._config.observation]:
+            policy = self.policy  # which the file is then said not to be of
+        checkpoint = PolicyCheckpoint.load(weights, policy, StudentSpec)
         own = self.network.state_dict()
         fitting = {
             name: torch.from_numpy(values).float()
@@ -136,7 +148,10 @@ lower penalty, of error and clearance."""
     def losses(self) -> dict[str, Tensor]:
         training = self._data.training
         numbers = training[self._drawn(len(training))]
-        return self._judge(numbers, self._drawn_images(numbers)).terms
+        mirrored = np.zeros(len(numbers), bool)
+        if self._config.mirrored:
+            mirrored = self._drawn(2) == 1
+        return self._judge(numbers, self._drawn_images(numbers, mirrored), mirrored).terms
 
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
@@ -144,7 +159,8 @@ lower penalty, of error and clearance."""
         batch, rows = self._config.batch, []
         for first in range(0, len(self._validation), batch):
             numbers = self._validation[first : first + batch]
-            judged = self._judge(numbers, self._clean_images(numbers))
+            as_they_are = np.zeros(len(numbers), bool)
+            judged = self._judge(numbers, self._clean_images(numbers), as_they_are)
             chosen = judged.costs.argmin(1)
             each = torch.arange(len(chosen))
             clear = (judged.distances[each, chosen] > VEHICLE_RADIUS).all(1)
@@ -171,30 +187,45 @@ lower penalty, of error and clearance."""
         drawn = torch.randint(count, size, generator=self._generator, device=device)
         return drawn.cpu().numpy()[self._rank :: self._processes]
 
-    def _drawn_images(self, numbers: np.ndarray) -> Tensor:
-        """Images of samples to train with, or what frozen modules made of them."""
+    def _drawn_images(self, numbers: np.ndarray, mirrored: np.ndarray) -> Tensor:
+        """Images of samples to train with, some of them `mirrored` (N,), or what frozen modules
+        made of them."""
         config = self._config
-        if self._features is None:
+        if not self._features:
             pixels = self._data.pixels(numbers, self.spec.pixels)
+            pixels[mirrored] = in_a_mirror(pixels[mirrored])
             # Of its own: what it draws depends on how many images this process has.
             seed = int(torch.randint(2**62, (1,), generator=self._generator, device=config.device))
             disturbing = torch.Generator(config.device).manual_seed(seed + self._rank)
             return training_images(pixels, config.appearance, config.noise, disturbing)
-        return self._features(numbers, self._drawn(config.draws)).to(config.device)
+        draws = self._drawn(config.draws)
+        images = self._features[0](numbers, draws)
+        if mirrored.any():
+            images[mirrored] = self._features[1](numbers[mirrored], draws[mirrored])
+        return images.to(config.device)
 
     def _clean_images(self, numbers: np.ndarray) -> Tensor:
         """Images of held-out samples, or what frozen modules made of them."""
         device = self._config.device
-        if self._features is None:
+        if not self._features:
             return clean_images(self._data.pixels(numbers, self.spec.pixels), device)
-        return self._features(numbers, np.zeros(len(numbers), int)).to(device)
+        return self._features[0](numbers, np.zeros(len(numbers), int)).to(device)
 
-    def _judge(self, numbers: np.ndarray, images: Tensor) -> "_Judged":
-        """What the network makes of samples, against their experts and their worlds."""
+    def _judge(self, numbers: np.ndarray, images: Tensor, mirrored: np.ndarray) -> "_Judged":
+        """What the network makes of samples, against their experts and their worlds.
+
+        Where `mirrored` (N,), the image is in a mirror, as is then what the network is told, and
+        its waypoints are mirrored back.
+        """
         config, labels = self._config, self._data.labels(numbers)
         R_WB = rotation_matrix(labels.X_WB[:, :4])
         state = encode_state(R_WB, labels.v_B, labels.goal_B, self.spec.reach)
-        waypoints, costs = self.network(images, state, config.frozen)
+        sides = state.new_ones(len(numbers), 3)
+        sides[mirrored, 1] = -1.0
+        state = (state.unflatten(1, (3, 3)) * sides[:, None]).flatten(1)
+        cells = self.network.encode_image(images, config.frozen)
+        waypoints, costs = self.network.decide(cells, state)
+        waypoints = waypoints * sides[:, None, None]
         distances = self._data.distance_along(waypoints, labels)
         experts = labels.trajectories_B[:, : config.experts or None]
         errors = hypothesis_errors(experts, waypoints)
@@ -209,6 +240,12 @@ lower penalty, of error and clearance."""
             "cost": config.cost_weight * cost_error(costs, cost_targets(penalties)),
             **{f"votes_{m}": share for m, share in enumerate(shares)},
         }
+        if config.depth_weight:
+            pixels = self._data.pixels(numbers, "depth")
+            pixels[mirrored] = in_a_mirror(pixels[mirrored])
+            told = self.network.nearest_depth(cells)
+            apart = told - nearest_patches(torch.from_numpy(pixels).to(told), told.shape[1:])
+            terms["depth"] = config.depth_weight * apart.abs().mean()
         if config.clearance_weight:
             best = labels.trajectories_B[:, :1]
             kept = self._data.distance_along(best.nan_to_num(), labels)

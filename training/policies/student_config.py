@@ -14,6 +14,8 @@ from splatpilot.training.policies.trainer import Schedule
 class StudentTraining:
     """A training run."""
 
+    policy: ClassVar[str]
+    """Its name."""
     observation: ClassVar[str]
     """What the student sees: rgb or depth."""
 
@@ -36,8 +38,8 @@ class StudentTraining:
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
     pretrained: bool = True
-    # File of this policy's weights, which are trained further instead; a head of another shape
-    # begins anew. None where left empty.
+    # File of weights of a student that sees the same, which are trained further instead; a head of
+    # another shape begins anew. None where left empty.
     begin: str = ""
     # File of ImageNet's; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""
@@ -75,6 +77,11 @@ class StudentTraining:
     clearance_weight: float = 0.0
     # [m] From surfaces to the vehicle's centre; of an expert that is farther off, as much is asked.
     clearance_cap: float = 0.8
+    # Whether half of the images are seen in a mirror, as is what is told and asked of them.
+    mirrored: bool = False
+    # [-] Weight of the depth that the image's features are to tell too: of the nearest in each of
+    # 16x20 patches.
+    depth_weight: float = 0.0
     # How far images are relit; a corpus has looks of its own.
     appearance: Appearance = field(default_factory=lambda: Appearance(exposure=0.0, hue=0.0))
     # What the images are disturbed by. Where modules are frozen it costs more than it gains: their
@@ -98,7 +105,13 @@ class StudentTraining:
         for name in ("batch", "draws", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("geometric_weight", "cost_weight", "clearance_weight", "clearance_cap"):
+        for name in (
+            "geometric_weight",
+            "cost_weight",
+            "clearance_weight",
+            "clearance_cap",
+            "depth_weight",
+        ):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
         if not 0 <= self.frozen <= IMAGE_MODULES:
@@ -121,6 +134,7 @@ class StudentTraining:
 class StudentRgbTraining(StudentTraining):
     """Of a student that sees colours."""
 
+    policy = "student_rgb"
     observation = "rgb"
 
 
@@ -128,7 +142,20 @@ class StudentRgbTraining(StudentTraining):
 class StudentDepthTraining(StudentTraining):
     """Of a student that sees depth."""
 
+    policy = "student_depth"
     observation = "depth"
 
     # By colours it was tried, and gained nothing.
     clearance_weight: float = 5.0
+
+
+@dataclass
+class PilotRgbTraining(StudentTraining):
+    """Of the student that sees colours twice in flight, as they are and in a mirror; and that is
+    also taught what the paper's is not."""
+
+    policy = "pilot_rgb"
+    observation = "rgb"
+
+    mirrored: bool = True
+    depth_weight: float = 1.0

@@ -13,7 +13,12 @@ from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.policies.student_data import StudentData
-from splatpilot.training.policies.student_images import Appearance, clean_images, training_images
+from splatpilot.training.policies.student_images import (
+    Appearance,
+    clean_images,
+    in_a_mirror,
+    training_images,
+)
 from splatpilot.training.policies.student_network import StudentModule
 
 _BATCH = 8
@@ -37,6 +42,7 @@ class FrozenFeatures:
         frozen: how many of its first modules, of `IMAGE_MODULES`.
         draws: of each image that is trained with.
         appearance, noise: what is drawn.
+        mirrored: whether the images are seen in a mirror.
 
     Raises:
         OSError: if `folder` cannot be written.
@@ -51,22 +57,31 @@ class FrozenFeatures:
         draws: int,
         appearance: Appearance,
         noise: ObservationNoise,
+        mirrored: bool = False,
     ) -> None:
         require_writable_folder(folder)
         self._data, self.draws = data, draws
         below = None
         if frozen > _FIRST:
-            below = FrozenFeatures(folder, data, network, _FIRST, draws, appearance, noise)
+            below = FrozenFeatures(
+                folder, data, network, _FIRST, draws, appearance, noise, mirrored
+            )
         self._network, self._frozen = network, frozen
         self._pixels = network.spec.pixels
-        self._appearance, self._noise = appearance, noise
+        self._appearance, self._noise, self._mirrored = appearance, noise, mirrored
         settings = repr((network.spec.observation, draws, appearance, noise)).encode()
+        settings += b"mirrored" * mirrored
         modules = network.image_modules(frozen)
         weights = [values.detach().cpu().numpy() for values in modules.parameters()]
         what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
         files = []
         for number, shard in enumerate(
-            tqdm(data.shards, desc=f"features of {frozen}", unit="shard", disable=None)
+            tqdm(
+                data.shards,
+                desc=f"features of {frozen}{' in a mirror' if mirrored else ''}",
+                unit="shard",
+                disable=None,
+            )
         ):
             outside = shard.world in data.held_out_worlds
             digest = what.copy()
@@ -108,6 +123,8 @@ class FrozenFeatures:
         for _ in range(max(draws, 1)):
             for first in range(0, len(pixels), _BATCH):
                 batch = np.array(pixels[first : first + _BATCH])
+                if self._mirrored:
+                    batch = in_a_mirror(batch)
                 if draws:
                     yield training_images(batch, self._appearance, self._noise, generator)
                 else:

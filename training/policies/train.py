@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from splatpilot.systems.output_folders import held_folder
 from splatpilot.systems.torch_threads import one_torch_thread
-from splatpilot.training.device import require_device
+from splatpilot.training.device import keep_freed_memory, require_device
 from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
 from splatpilot.training.policies.torchrun import Processes, torchrun_processes
@@ -66,6 +66,7 @@ def run[Config: TrainingConfig](
     """
     config.validate()
     require_device(config.device)
+    keep_freed_memory()
     with torchrun_processes(config.device) as processes:
         with held_folder(out) if processes.first else nullcontext():
             return _run(config, out, make, bar_line, processes)

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform
 from torchvision.models import mobilenet_v2
 
 from splatpilot.diagrams.flight import fly
@@ -18,7 +20,10 @@ from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.policies.mobilenet import mobilenet_blocks
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.pretrained import imagenet_weights
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.student_config import StudentTraining
@@ -126,6 +131,24 @@ def test_training_goes_on_from_weights_that_are_given(trained, student_corpus, t
             np.testing.assert_allclose(after[name], before[name], atol=1e-3)
 
 
+def test_a_pilot_goes_on_from_a_students_weights(trained, student_corpus, tmp_path):
+    """Of one that sees the same; of one that sees something else they are refused."""
+    overrides = [f"corpora=[{student_corpus}]", *OVERRIDES]
+    kind = TRAINERS.find("pilot_rgb")
+    seeing_depth = PolicyCheckpoint.load(
+        trained / "student_depth.npz", "student_depth", StudentSpec
+    )
+    weights, spec = dict(seeing_depth.weights), replace(seeing_depth.spec, observation="rgb")
+    PolicyCheckpoint("student_rgb", spec, weights, {}).save(tmp_path / "rgb.npz")
+    config = load_config(kind.config(), overrides=[*overrides, f"begin={tmp_path / 'rgb.npz'}"])
+    began = kind.make(config).network.state_dict()
+    for name, value in weights.items():
+        np.testing.assert_array_equal(began[name], value.astype(np.float32))
+    config.begin = str(trained / "student_depth.npz")
+    with pytest.raises(ValueError, match="needed is 'pilot_rgb'"):
+        kind.make(config)
+
+
 def test_students_learn_to_keep_clear(trained, student_corpus, tmp_path):
     """What one lacks of its expert's clearance shrinks, from its weights on."""
     began = trained / "student_depth.npz"
@@ -165,6 +188,41 @@ def test_as_many_trajectories_vote_as_asked(student_corpus, tmp_path):
         (row,) = csv.DictReader((out / "curves.csv").open())
         pulls.append(float(row["winners"]))
     assert 0.2 * pulls[0] < pulls[1] < 0.5 * pulls[0]
+
+
+def test_half_is_learned_in_a_mirror(student_corpus):
+    """The pull of one sample is that of the waypoints that would be planned in flight, of the image
+    as it is or in a mirror and mirrored back; over some samples it is of either."""
+    overrides = ["batch=1", "mirrored=true", "epsilon=0"]
+    trainer = TRAINERS.find("student_rgb").make(training(student_corpus, "rgb", *overrides))
+    weights = {name: w.numpy() for name, w in trainer.network.flown_state_dict().items()}
+    network = StudentNetwork(trainer.spec, weights)
+    pulls = []
+    for shard in Corpus(student_corpus).shards:
+        samples = shard.arrays
+        for n in range(len(shard)):
+            X_WB = RigidTransform(Quaternion(samples["X_WB"][n, :4]), samples["X_WB"][n, 4:])
+            seen = samples["color"][n], X_WB, X_WB.rotation() @ samples["v_B"][n].astype(float)
+            goal = X_WB @ samples["goal_B"][n].astype(float)
+            plans = [plan(network, 0.0, *seen, goal, mirrored=side) for side in (False, True)]
+            apart = [view.waypoints_B - samples["trajectories_B"][n, 0] for view in plans]
+            pulls.append([np.square(a).sum((1, 2)).min() * 10.0 / 30.0 for a in apart])
+    found = [float(trainer.losses()["winners"].detach()) for _ in range(20)]
+    closest = np.abs(np.array(pulls)[..., None] / found - 1.0).reshape(-1, 2, 20).min(0)
+    assert (closest.min(0) < 1e-3).all()
+    assert 4 <= (closest.argmin(0) == 1).sum() <= 16
+
+
+def test_images_are_also_to_tell_depth(student_corpus, tmp_path):
+    """What colours tell of the nearest depth becomes less wrong; the weights that fly are as
+    many as without."""
+    config = training(student_corpus, "rgb", "depth_weight=10")
+    run(config=config, out=tmp_path, make=TRAINERS.find("student_rgb").make)
+    rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
+    apart = [float(row["depth"]) for row in rows]
+    assert apart[-1] < 0.8 * apart[0]
+    found = PolicyCheckpoint.load(tmp_path / "student_rgb.npz", "student_rgb", StudentSpec)
+    assert set(found.weights) == set(found.spec.weight_shapes())
 
 
 def test_frozen_modules_keep_the_weights_they_began_with(student_corpus, tmp_path):

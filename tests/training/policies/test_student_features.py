@@ -28,9 +28,9 @@ def network() -> StudentModule:
     return StudentModule(StudentSpec("depth", 32, 24))
 
 
-def features(folder: Path, data, network, noise=0.3, draws=2) -> FrozenFeatures:
+def features(folder: Path, data, network, noise=0.3, draws=2, mirrored=False) -> FrozenFeatures:
     disturbed = ObservationNoise(depth_additive=noise)
-    return FrozenFeatures(folder, data, network, FROZEN, draws, Appearance(), disturbed)
+    return FrozenFeatures(folder, data, network, FROZEN, draws, Appearance(), disturbed, mirrored)
 
 
 def test_features_are_those_of_the_modules(data, network, tmp_path):
@@ -49,6 +49,18 @@ def test_features_are_those_of_the_modules(data, network, tmp_path):
     with torch.no_grad():
         expected = network.features[:FROZEN](clean_images(data.pixels(numbers, "depth")))
     torch.testing.assert_close(bare(numbers, np.ones(2, int)), expected, atol=4e-3, rtol=4e-3)
+
+
+def test_features_in_a_mirror(data, network, tmp_path):
+    """They are what the modules make of mirrored images, beside the others in the same folder."""
+    plain = features(tmp_path, data, network, noise=0.0, draws=1)
+    mirrored = features(tmp_path, data, network, noise=0.0, draws=1, mirrored=True)
+    numbers, draws = data.training[[5, 30]], np.zeros(2, int)
+    pixels = data.pixels(numbers, "depth")
+    for kept, images in ((plain, pixels), (mirrored, np.ascontiguousarray(pixels[..., ::-1]))):
+        with torch.no_grad():
+            expected = network.features[:FROZEN](clean_images(images))
+        torch.testing.assert_close(kept(numbers, draws), expected, atol=4e-3, rtol=4e-3)
 
 
 def test_files_are_made_once_for_all_that_they_depend_on(data, network, tmp_path):

@@ -11,6 +11,8 @@ from splatpilot.training.policies.observation import disturb_color, noisy_color
 from splatpilot.training.policies.student_images import (
     Appearance,
     clean_images,
+    in_a_mirror,
+    nearest_patches,
     relit,
     training_images,
 )
@@ -96,3 +98,25 @@ def test_no_image_is_seen_twice_but_by_the_same_seed(observation):
     still = Appearance(exposure=0.0, hue=0.0)
     bare = training_images(pixels, still, ObservationNoise(), generator)
     torch.testing.assert_close(bare, clean_images(pixels), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("observation", ["rgb", "depth"])
+def test_a_mirror_exchanges_left_and_right(observation):
+    """Every row runs the other way, of colours and of depth; twice is as before."""
+    pixels = some_pixels(observation)
+    found = in_a_mirror(pixels)
+    for column in range(8):
+        np.testing.assert_array_equal(found[:, :, column], pixels[:, :, 7 - column])
+    np.testing.assert_array_equal(in_a_mirror(found), pixels)
+
+
+def test_patches_tell_what_is_nearest_in_them():
+    """Of 12x16 pixels in 3x4 patches, one nearer pixel decides its patch; what has no depth because
+    it is too near is as near as can be, and what is beyond reach as far."""
+    depth = torch.full((1, 12, 16), 10.0)
+    depth[0, 5, 6], depth[0, 0, 0], depth[0, 8:, 12:] = 2.0, 0.0, torch.inf
+    encoded = {z: float(student_inference.encode_depth(np.full((1, 1), z))[0]) for z in (2.0, 10.0)}
+    expected = np.full((3, 4), encoded[10.0])
+    expected[1, 1], expected[0, 0], expected[2, 3] = encoded[2.0], 1.0, -1.0
+    found = nearest_patches(depth, torch.Size([3, 4]))
+    np.testing.assert_allclose(found[0], expected, atol=1e-5)

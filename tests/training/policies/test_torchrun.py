@@ -43,12 +43,12 @@ def train_with_two(fields: list[str], out: Path) -> subprocess.CompletedProcess:
 
 def test_two_processes_learn_what_one_does(student_corpus, tmp_path):
     """Three steps with halves of each batch are three steps with the whole: the same losses, votes
-    and success, each written once."""
-    ended = train_with_two(fields(student_corpus), tmp_path / "two")
+    and success, each written once; also where some images are seen in a mirror."""
+    ended = train_with_two(fields(student_corpus, "mirrored=true"), tmp_path / "two")
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.count("weights in") == 1
     kind = TRAINERS.find("student_depth")
-    config = load_config(kind.config(), overrides=fields(student_corpus))
+    config = load_config(kind.config(), overrides=fields(student_corpus, "mirrored=true"))
     run(config=config, out=tmp_path / "one", make=kind.make)
     curves = {}
     for name in ("one", "two"):
