@@ -216,7 +216,8 @@ def test_half_is_learned_in_a_mirror(student_corpus):
 def test_images_are_also_to_tell_depth(student_corpus, tmp_path):
     """What colours tell of the nearest depth becomes less wrong; the weights that fly are as
     many as without."""
-    config = training(student_corpus, "rgb", "depth_weight=10")
+    longer = "schedule.updates=100", "schedule.learning_rate=0.003"
+    config = training(student_corpus, "rgb", "depth_weight=10", *longer)
     run(config=config, out=tmp_path, make=TRAINERS.find("student_rgb").make)
     rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
     apart = [float(row["depth"]) for row in rows]

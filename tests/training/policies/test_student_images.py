@@ -115,7 +115,7 @@ def test_patches_tell_what_is_nearest_in_them():
     it is too near is as near as can be, and what is beyond reach as far."""
     depth = torch.full((1, 12, 16), 10.0)
     depth[0, 5, 6], depth[0, 0, 0], depth[0, 8:, 12:] = 2.0, 0.0, torch.inf
-    encoded = {z: float(student_inference.encode_depth(np.full((1, 1), z))[0]) for z in (2.0, 10.0)}
+    encoded = {z: student_inference.encode_depth(np.full((1, 1), z))[0, 0, 0] for z in (2.0, 10.0)}
     expected = np.full((3, 4), encoded[10.0])
     expected[1, 1], expected[0, 0], expected[2, 3] = encoded[2.0], 1.0, -1.0
     found = nearest_patches(depth, torch.Size([3, 4]))
