@@ -130,8 +130,12 @@ register_policy(
     DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
-for _config in (StudentRgbConfig, StudentDepthConfig, PilotRgbConfig):
-    register_policy(_config, lambda config, world, vehicle: Student(config), name=_config.policy)
+for _config, _name in (
+    (StudentRgbConfig, "student_rgb"),
+    (StudentDepthConfig, "student_depth"),
+    (PilotRgbConfig, "pilot_rgb"),
+):
+    register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
 
 
 def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:

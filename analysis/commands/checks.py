@@ -39,7 +39,6 @@ TRAINERS = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
-    "pilot_rgb",
 )
 """The names of our own trainers."""
 

@@ -23,9 +23,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
             "recover student_depth --out out/depth --set 'corpora=[out/corpus]' --flights 3",
         ),
     )
-    recover.add_argument(
-        "policy", choices=["student_rgb", "student_depth", "pilot_rgb", "diffaero_rgb"]
-    )
+    recover.add_argument("policy", choices=["student_rgb", "student_depth", "diffaero_rgb"])
     recover.add_argument(
         "--out",
         type=Path,

@@ -22,8 +22,6 @@ from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 class StudentConfig:
     """The student's weights, what it is asked for, and the camera that it sees through."""
 
-    policy: ClassVar[str]
-    """Its name, and its weights'."""
     observation: ClassVar[str]
     """What it sees: rgb or depth."""
     mirrored: ClassVar[bool] = False
@@ -47,16 +45,14 @@ class StudentConfig:
 class StudentRgbConfig(StudentConfig):
     """A student that sees colours."""
 
-    policy = "student_rgb"
     observation = "rgb"
 
 
 @dataclass
-class PilotRgbConfig(StudentConfig):
-    """A student that sees colours twice, as they are and in a mirror, as it learned to."""
+class PilotRgbConfig(StudentRgbConfig):
+    """A student that sees colours twice, as they are and in a mirror; by the weights of
+    `student_rgb`."""
 
-    policy = "pilot_rgb"
-    observation = "rgb"
     mirrored = True
 
 
@@ -64,7 +60,6 @@ class PilotRgbConfig(StudentConfig):
 class StudentDepthConfig(StudentConfig):
     """A student that sees depth."""
 
-    policy = "student_depth"
     observation = "depth"
 
 
@@ -106,7 +101,7 @@ class Student(LeafSystem):
     def __init__(self, config: StudentConfig) -> None:
         super().__init__()
         config.validate()
-        self._network = load_network(config.weights, config.policy, config.speed)
+        self._network = load_network(config.weights, config.observation, config.speed)
         spec, camera = self._network.spec, config.camera
         for name in ("width", "height", "fov_x"):
             given, trained = getattr(camera, name), getattr(spec, name)

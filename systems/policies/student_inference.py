@@ -192,9 +192,9 @@ def _rectified(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, np.float32(0.0))
 
 
-def load_network(path: str, policy: str, speed: float | None = None) -> StudentNetwork:
+def load_network(path: str, observation: str, speed: float | None = None) -> StudentNetwork:
     """The network from a file of weights, see `PolicyCheckpoint.load`, asked for a speed [m/s]."""
-    checkpoint = PolicyCheckpoint.load(path, policy, StudentSpec)
+    checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
     return checkpoint.build(partial(StudentNetwork, speed=speed))
 
 

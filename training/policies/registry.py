@@ -12,11 +12,7 @@ from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTrainer, DiffAe
 from splatpilot.training.policies.diffaero_tof import DiffAeroTofLearner, DiffAeroTofTraining
 from splatpilot.training.policies.rollout_trainer import RolloutTrainer
 from splatpilot.training.policies.student import StudentTrainer
-from splatpilot.training.policies.student_config import (
-    PilotRgbTraining,
-    StudentDepthTraining,
-    StudentRgbTraining,
-)
+from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
 from splatpilot.training.policies.trainer import Trainer
 
 
@@ -68,5 +64,5 @@ register_trainer(
 )
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
 register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
-for _config in (StudentRgbTraining, StudentDepthTraining, PilotRgbTraining):
-    register_trainer(_config.policy, _config, StudentTrainer)
+register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
+register_trainer("student_depth", StudentDepthTraining, StudentTrainer)

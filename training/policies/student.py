@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, policy_of
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student_inference import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
@@ -66,7 +66,7 @@ lower penalty, of error and clearance."""
 
     def __init__(self, config: StudentTraining) -> None:
         self._config = config
-        self.policy = config.policy
+        self.policy = f"student_{config.observation}"
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
         camera = self._data.camera
@@ -109,11 +109,7 @@ lower penalty, of error and clearance."""
     def _load(self, weights: str) -> None:
         """Has the network begin with a file of weights: with its encoder, and with all else that
         has the same shape."""
-        alike = {"rgb": ("student_rgb", "pilot_rgb"), "depth": ("student_depth",)}
-        policy = policy_of(weights)
-        if policy not in alike[self._config.observation]:
-            policy = self.policy  # which the file is then said not to be of
-        checkpoint = PolicyCheckpoint.load(weights, policy, StudentSpec)
+        checkpoint = PolicyCheckpoint.load(weights, self.policy, StudentSpec)
         own = self.network.state_dict()
         fitting = {
             name: torch.from_numpy(values).float()

@@ -14,8 +14,6 @@ from splatpilot.training.policies.trainer import Schedule
 class StudentTraining:
     """A training run."""
 
-    policy: ClassVar[str]
-    """Its name."""
     observation: ClassVar[str]
     """What the student sees: rgb or depth."""
 
@@ -38,8 +36,8 @@ class StudentTraining:
     )
     # Whether the encoder begins with what it learned from ImageNet, or from nothing.
     pretrained: bool = True
-    # File of weights of a student that sees the same, which are trained further instead; a head of
-    # another shape begins anew. None where left empty.
+    # File of this policy's weights, which are trained further instead; a head of another shape
+    # begins anew. None where left empty.
     begin: str = ""
     # File of ImageNet's; where left empty, that of the data folder or torchvision's download.
     encoder: str = ""
@@ -134,7 +132,6 @@ class StudentTraining:
 class StudentRgbTraining(StudentTraining):
     """Of a student that sees colours."""
 
-    policy = "student_rgb"
     observation = "rgb"
 
 
@@ -142,20 +139,7 @@ class StudentRgbTraining(StudentTraining):
 class StudentDepthTraining(StudentTraining):
     """Of a student that sees depth."""
 
-    policy = "student_depth"
     observation = "depth"
 
     # By colours it was tried, and gained nothing.
     clearance_weight: float = 5.0
-
-
-@dataclass
-class PilotRgbTraining(StudentTraining):
-    """Of the student that sees colours twice in flight, as they are and in a mirror; and that is
-    also taught what the paper's is not."""
-
-    policy = "pilot_rgb"
-    observation = "rgb"
-
-    mirrored: bool = True
-    depth_weight: float = 1.0

@@ -33,21 +33,21 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 
 P_WG = np.array([12.0, 3.0, 2.0])
-CONFIGS = {"rgb": StudentRgbConfig, "depth": StudentDepthConfig, "pilot": PilotRgbConfig}
+CONFIGS = {"rgb": StudentRgbConfig, "depth": StudentDepthConfig}
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> dict[str, str]:
-    """Random weights of each kind for images of 64x48."""
+    """Random weights of both kinds for images of 64x48."""
     folder, rng = tmp_path_factory.mktemp("weights"), np.random.default_rng(0)
-    paths = {name: str(folder / f"{name}.npz") for name in CONFIGS}
+    paths = {name: str(folder / f"student_{name}.npz") for name in CONFIGS}
     for name, path in paths.items():
-        spec = StudentSpec(CONFIGS[name].observation, 64, 48)
+        spec = StudentSpec(name, 64, 48)
         weights = {
             key: rng.normal(scale=0.1, size=shape).astype(np.float32)
             for key, shape in spec.weight_shapes().items()
         }
-        PolicyCheckpoint(CONFIGS[name].policy, spec, weights, {}).save(Path(path))
+        PolicyCheckpoint(f"student_{name}", spec, weights, {}).save(Path(path))
     return paths
 
 
@@ -58,8 +58,8 @@ def config_of(name: str, files: dict[str, str], **camera) -> StudentConfig:
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_plans_at_its_rate(name, files):
-    """The hypotheses are those of the pure policy at the last multiple of the period, six of one
-    that sees all twice, from the kind of image that it sees and no other."""
+    """The hypotheses are those of the pure policy at the last multiple of the period, from the kind
+    of image that the student sees and no other."""
     config = config_of(name, files)
     system, rng = Student(config), np.random.default_rng(1)
     simulator = Simulator(system)
@@ -68,7 +68,7 @@ def test_plans_at_its_rate(name, files):
     state[3:6] = [1.0, 0.3, 0.1]
     system.GetInputPort("state").FixValue(context, state)
     system.GetInputPort("goal").FixValue(context, P_WG)
-    if config.observation == "rgb":
+    if name == "rgb":
         image, port = ImageRgba8U(64, 48), "color_image"
         image.mutable_data[...] = rng.integers(0, 256, (48, 64, 4))
         seen = np.asarray(image.data)[..., :3]
@@ -81,11 +81,32 @@ def test_plans_at_its_rate(name, files):
     simulator.Initialize()
     simulator.AdvanceTo(1.5 / config.rate)
     vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
-    found = Hypotheses.from_vector(vector, 6 if config.mirrored else 3)
+    found = Hypotheses.from_vector(vector, 3)
     assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
-    network = load_network(files[name], config.policy, config.speed)
-    pure = plan_both_views if config.mirrored else plan
-    expected = pure(network, 0.0, seen, pose_from_state(state), state[3:6], P_WG)
+    network = load_network(files[name], name, config.speed)
+    X_WB = pose_from_state(state)
+    expected = plan(network, 0.0, seen, X_WB, state[3:6], P_WG)
+    np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
+    np.testing.assert_array_equal(found.costs, expected.costs)
+
+
+def test_a_pilot_plans_by_both_views(files):
+    """By a student's weights, six hypotheses, which are those of the pure policy."""
+    system = Student(
+        PilotRgbConfig(weights=files["rgb"], camera=OnboardCamera(width=64, height=48))
+    )
+    simulator, state = Simulator(system), hover_state([1.0, 2.0, 1.5], yaw=0.6)
+    context, image = simulator.get_mutable_context(), ImageRgba8U(64, 48)
+    image.mutable_data[...] = np.random.default_rng(1).integers(0, 256, (48, 64, 4))
+    system.GetInputPort("state").FixValue(context, state)
+    system.GetInputPort("goal").FixValue(context, P_WG)
+    system.GetInputPort("color_image").FixValue(context, Value(image))
+    simulator.AdvanceTo(0.01)
+    vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
+    found = Hypotheses.from_vector(vector, 6)
+    network, seen = load_network(files["rgb"], "rgb", 2.0), np.asarray(image.data)[..., :3]
+    expected = plan_both_views(network, 0.0, seen, pose_from_state(state), state[3:6], P_WG)
+    assert found is not None
     np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
     np.testing.assert_array_equal(found.costs, expected.costs)
 
@@ -104,20 +125,19 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
     about = {"format": 1, "policy": "student_depth", "spec": {"depth": 3}, "provenance": {}}
     np.savez(tmp_path / "odd.npz", about=json.dumps(about))
     with pytest.raises(ValueError, match=r"odd\.npz holds weights of another architecture"):
-        load_network(str(tmp_path / "odd.npz"), "student_depth", 2.0)
+        load_network(str(tmp_path / "odd.npz"), "depth", 2.0)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_flies_as_fast_as_it_is_asked_to(name, files):
     """Upright and far from the goal it plans half as far at half of its expert's speed as at all of
     it, with the same costs; a speed that nobody flies at is refused."""
-    by_colors, policy = CONFIGS[name].observation == "rgb", CONFIGS[name].policy
-    image = np.zeros((48, 64, 3), np.uint8) if by_colors else np.full((48, 64), 5.0, np.float32)
+    image = np.zeros((48, 64, 3), np.uint8) if name == "rgb" else np.full((48, 64), 5.0, np.float32)
     X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.array([1.2, -0.4, 0.0])
 
     def hypotheses(speed: float) -> Hypotheses:
         asked = speed / StudentSpec.nominal_speed * v_WB
-        return plan(load_network(files[name], policy, speed), 0.0, image, X_WB, asked, P_WG)
+        return plan(load_network(files[name], name, speed), 0.0, image, X_WB, asked, P_WG)
 
     expected, found = hypotheses(2.0), hypotheses(1.0)
     np.testing.assert_allclose(2.0 * found.waypoints_B, expected.waypoints_B, atol=1e-5)
@@ -157,7 +177,7 @@ def corridor(low: int, high: int, distance: float) -> np.ndarray:
 def test_weights_that_ship_fly_around_what_stands_ahead():
     """At 2 m/s towards a goal straight ahead, the student that sees depth goes on where nothing
     stands, passes a wall on its free side, and slows before one that leaves none."""
-    network = load_network("", "student_depth", 2.6)
+    network = load_network("", "depth", 2.6)
     X_WB, v_WB, p_WG = RigidTransform([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.0]), [12.0, 0.0, 1.5]
 
     def end(depth: np.ndarray) -> np.ndarray:
@@ -170,11 +190,10 @@ def test_weights_that_ship_fly_around_what_stands_ahead():
     assert end(corridor(0, 95, 2.0))[1] < -0.4 and end(corridor(65, 160, 2.0))[1] > 0.4
 
 
-@pytest.mark.parametrize("policy", ["student_rgb", "pilot_rgb"])
-def test_weights_that_ship_see_colours(policy):
-    """Those that see colours, in flight, want other things where they see, or are told,
+def test_weights_that_ship_see_colours():
+    """The student that sees colours, in flight, wants other things where it sees, or is told,
     others."""
-    network, X_WB = load_network("", policy, 2.6), RigidTransform([0.0, 0.0, 1.5])
+    network, X_WB = load_network("", "rgb", 2.6), RigidTransform([0.0, 0.0, 1.5])
     v_WB = np.array([1.5, 0.0, 0.0])
     meadow = np.full((120, 160, 3), [150, 180, 220], np.uint8)
     meadow[60:] = 90, 110, 70

@@ -131,24 +131,6 @@ def test_training_goes_on_from_weights_that_are_given(trained, student_corpus, t
             np.testing.assert_allclose(after[name], before[name], atol=1e-3)
 
 
-def test_a_pilot_goes_on_from_a_students_weights(trained, student_corpus, tmp_path):
-    """Of one that sees the same; of one that sees something else they are refused."""
-    overrides = [f"corpora=[{student_corpus}]", *OVERRIDES]
-    kind = TRAINERS.find("pilot_rgb")
-    seeing_depth = PolicyCheckpoint.load(
-        trained / "student_depth.npz", "student_depth", StudentSpec
-    )
-    weights, spec = dict(seeing_depth.weights), replace(seeing_depth.spec, observation="rgb")
-    PolicyCheckpoint("student_rgb", spec, weights, {}).save(tmp_path / "rgb.npz")
-    config = load_config(kind.config(), overrides=[*overrides, f"begin={tmp_path / 'rgb.npz'}"])
-    began = kind.make(config).network.state_dict()
-    for name, value in weights.items():
-        np.testing.assert_array_equal(began[name], value.astype(np.float32))
-    config.begin = str(trained / "student_depth.npz")
-    with pytest.raises(ValueError, match="needed is 'pilot_rgb'"):
-        kind.make(config)
-
-
 def test_students_learn_to_keep_clear(trained, student_corpus, tmp_path):
     """What one lacks of its expert's clearance shrinks, from its weights on."""
     began = trained / "student_depth.npz"
