@@ -35,8 +35,8 @@ def measured(policy: str, overrides: list[str], corpus: str, out: Path) -> list[
         run(config=config, out=out, make=kind.make)
     trainer = kind.make(replace(config, corpora=[corpus], worlds=1))
     with np.load(out / f"{policy}.npz") as weights:
-        state = {name: torch.from_numpy(weights[name]) for name in trainer.spec.weight_shapes()}
-    trainer.network.load_state_dict(state, strict=False)
+        state = {name: torch.from_numpy(weights[name]) for name in trainer.network.state_dict()}
+    trainer.network.load_state_dict(state)
     found = trainer.evaluate()
     return [found[name] for name in MEASURES]
 

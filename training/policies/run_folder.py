@@ -41,13 +41,13 @@ class RunFolder:
     ) -> None:
         """Writes `POLICY.npz`; `best` is what was measured of these weights.
 
-        They are the network's, or its `flown_state_dict()` if it has one, in single precision, or
-        in the type that the architecture names as its `weights_type`.
+        They are written in single precision, or in the type that the architecture names as its
+        `weights_type`.
         """
         kept_as = getattr(spec, "weights_type", np.float32)
         weights = {
             name: w.detach().cpu().numpy().astype(kept_as)
-            for name, w in getattr(network, "flown_state_dict", network.state_dict)().items()
+            for name, w in network.state_dict().items()
         }
         provenance = {
             "command": f"splatpilot train {policy}",

@@ -30,12 +30,7 @@ from splatpilot.training.policies.pretrained import imagenet_weights
 from splatpilot.training.policies.student_config import StudentTraining
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_features import FrozenFeatures
-from splatpilot.training.policies.student_images import (
-    clean_images,
-    in_a_mirror,
-    nearest_patches,
-    training_images,
-)
+from splatpilot.training.policies.student_images import clean_images, in_a_mirror, training_images
 from splatpilot.training.policies.student_loss import (
     barrier_along,
     cost_error,
@@ -79,7 +74,7 @@ lower penalty, of error and clearance."""
             nominal_speed=self._data.speed,
             way_version=2,
         )
-        self.network = StudentModule(self.spec, tells_depth=config.depth_weight > 0.0)
+        self.network = StudentModule(self.spec)
         if config.begin:
             self._load(config.begin)
         elif config.pretrained:
@@ -219,8 +214,7 @@ lower penalty, of error and clearance."""
         sides = state.new_ones(len(numbers), 3)
         sides[mirrored, 1] = -1.0
         state = (state.unflatten(1, (3, 3)) * sides[:, None]).flatten(1)
-        cells = self.network.encode_image(images, config.frozen)
-        waypoints, costs = self.network.decide(cells, state)
+        waypoints, costs = self.network(images, state, config.frozen)
         waypoints = waypoints * sides[:, None, None]
         distances = self._data.distance_along(waypoints, labels)
         experts = labels.trajectories_B[:, : config.experts or None]
@@ -236,12 +230,6 @@ lower penalty, of error and clearance."""
             "cost": config.cost_weight * cost_error(costs, cost_targets(penalties)),
             **{f"votes_{m}": share for m, share in enumerate(shares)},
         }
-        if config.depth_weight:
-            pixels = self._data.pixels(numbers, "depth")
-            pixels[mirrored] = in_a_mirror(pixels[mirrored])
-            told = self.network.nearest_depth(cells)
-            apart = told - nearest_patches(torch.from_numpy(pixels).to(told), told.shape[1:])
-            terms["depth"] = config.depth_weight * apart.abs().mean()
         if config.clearance_weight:
             best = labels.trajectories_B[:, :1]
             kept = self._data.distance_along(best.nan_to_num(), labels)

@@ -77,9 +77,6 @@ class StudentTraining:
     clearance_cap: float = 0.8
     # Whether half of the images are seen in a mirror, as is what is told and asked of them.
     mirrored: bool = False
-    # [-] Weight of the depth that the image's features are to tell too: of the nearest in each of
-    # 16x20 patches.
-    depth_weight: float = 0.0
     # How far images are relit; a corpus has looks of its own.
     appearance: Appearance = field(default_factory=lambda: Appearance(exposure=0.0, hue=0.0))
     # What the images are disturbed by. Where modules are frozen it costs more than it gains: their
@@ -103,13 +100,7 @@ class StudentTraining:
         for name in ("batch", "draws", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        for name in (
-            "geometric_weight",
-            "cost_weight",
-            "clearance_weight",
-            "clearance_cap",
-            "depth_weight",
-        ):
+        for name in ("geometric_weight", "cost_weight", "clearance_weight", "clearance_cap"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
         if not 0 <= self.frozen <= IMAGE_MODULES:

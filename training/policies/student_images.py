@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_max_pool2d
 
 from splatpilot.systems.sensing.observation_noise import ObservationNoise, turned_hue
 from splatpilot.training.policies.observation import noisy_color, noisy_depth
@@ -39,12 +38,6 @@ def clean_images(pixels: np.ndarray, device: str = "cpu") -> Tensor:
     [m]."""
     images = torch.from_numpy(pixels).to(device).float()
     return encode_color(images) if images.ndim == 4 else encode_depth(images)
-
-
-def nearest_patches(depth: Tensor, shape: torch.Size) -> Tensor:
-    """The nearest in each of as many patches of images of depth (N, H, W) [m], encoded as images
-    are: 1 near and -1 far."""
-    return adaptive_max_pool2d(encode_depth(depth)[:, :1], tuple(shape))[:, 0]
 
 
 def training_images(

@@ -19,8 +19,6 @@ from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
 
 IMAGE_MODULES = BLOCKS + 1
 """Modules that an image goes through: the encoder's, and the layer of its cells."""
-PATCHES = 4
-"""Of a cell, in height and in width, whose depth its features are to tell."""
 
 
 class StudentModule(nn.Module):
@@ -28,16 +26,11 @@ class StudentModule(nn.Module):
 
     The encoder is torchvision's, with a bias in the place of each batch norm: what is trained is
     what flies, and no sample depends on the others of its batch.
-
-    Args:
-        spec: the architecture.
-        tells_depth: whether the image's features are also to tell depth, by a layer that never
-            flies; see `nearest_depth`.
     """
 
     _basis: Tensor
 
-    def __init__(self, spec: StudentSpec, tells_depth: bool = False) -> None:
+    def __init__(self, spec: StudentSpec) -> None:
         super().__init__()
         self.spec = spec
         self.features = mobilenet_v2(norm_layer=_Bias).features
@@ -49,8 +42,6 @@ class StudentModule(nn.Module):
         if spec.head_features:
             self.hidden_layer = nn.Linear(joined, spec.head_features)
         self.head = nn.Linear(spec.head_features or joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
-        if tells_depth:  # last, so that what is drawn for the others does not depend on it
-            self.depth_layer = nn.Linear(spec.cell_features, PATCHES**2)
         self.register_buffer("_basis", torch.from_numpy(BASIS).float(), persistent=False)
 
     def _initialize_encoder(self) -> None:
@@ -65,10 +56,6 @@ class StudentModule(nn.Module):
                 rectified = layer.rectified
             if adds_input(block):
                 nn.init.zeros_(weights[block[-1].weight])
-
-    def flown_state_dict(self) -> dict[str, Tensor]:
-        """The weights of a `StudentNetwork`: all but those that tell depth, in training alone."""
-        return {name: self.state_dict()[name] for name in self.spec.weight_shapes()}
 
     def load_encoder(self, weights: dict[str, Tensor]) -> None:
         """Has the encoder begin with weights by the names of `mobilenet_shapes`."""
@@ -102,22 +89,7 @@ class StudentModule(nn.Module):
             state: (N, 9), see `encode_state`.
             first: module that takes `image`.
         """
-        return self.decide(self.encode_image(image, first), state)
-
-    def nearest_depth(self, cells: Tensor) -> Tensor:
-        """What the image's features say of `nearest_patches` (N, rows, columns), `PATCHES` to the
-        side of each cell.
-
-        Args:
-            cells: (N, cells x features), see `encode_image`.
-        """
-        columns = -(-self.spec.width // 32)
-        patches = self.depth_layer(cells.unflatten(1, (-1, columns, self.spec.cell_features)))
-        patches = patches.unflatten(3, (PATCHES, PATCHES)).transpose(2, 3)
-        return patches.flatten(3, 4).flatten(1, 2)
-
-    def decide(self, cells: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """`forward`, of the image's features (N, cells x features)."""
+        cells = self.encode_image(image, first)
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
         joined = torch.cat([cells, y], 1)
         if self.spec.head_features:

@@ -85,8 +85,7 @@ class Trainer(Protocol):
 
     @property
     def network(self) -> torch.nn.Module:
-        """What is trained. It may have `flown_state_dict()`: of its weights those that fly, where
-        others only help it learn."""
+        """What is trained."""
         ...
 
     def begin_update(self, update: int) -> None:

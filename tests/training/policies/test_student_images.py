@@ -12,7 +12,6 @@ from splatpilot.training.policies.student_images import (
     Appearance,
     clean_images,
     in_a_mirror,
-    nearest_patches,
     relit,
     training_images,
 )
@@ -108,15 +107,3 @@ def test_a_mirror_exchanges_left_and_right(observation):
     for column in range(8):
         np.testing.assert_array_equal(found[:, :, column], pixels[:, :, 7 - column])
     np.testing.assert_array_equal(in_a_mirror(found), pixels)
-
-
-def test_patches_tell_what_is_nearest_in_them():
-    """Of 12x16 pixels in 3x4 patches, one nearer pixel decides its patch; what has no depth because
-    it is too near is as near as can be, and what is beyond reach as far."""
-    depth = torch.full((1, 12, 16), 10.0)
-    depth[0, 5, 6], depth[0, 0, 0], depth[0, 8:, 12:] = 2.0, 0.0, torch.inf
-    encoded = {z: student_inference.encode_depth(np.full((1, 1), z))[0, 0, 0] for z in (2.0, 10.0)}
-    expected = np.full((3, 4), encoded[10.0])
-    expected[1, 1], expected[0, 0], expected[2, 3] = encoded[2.0], 1.0, -1.0
-    found = nearest_patches(depth, torch.Size([3, 4]))
-    np.testing.assert_allclose(found[0], expected, atol=1e-5)

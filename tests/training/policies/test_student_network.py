@@ -166,22 +166,3 @@ def test_weights_of_the_data_folder_see_edges(monkeypatch):
     assert IN_DATA.name == "mobilenet_v2_imagenet.pt"
     features = folded_features(imagenet_weights(), torch.rand(1, 3, 96, 128) * 2.0 - 1.0)
     assert 0.02 < (features > 0.0).float().mean().item() < 0.9 and features.max() <= 6.0
-
-
-def test_features_tell_depth_where_it_is():
-    """The patches that a cell's features tell lie where the cell does: each patch in its row and
-    column of the cell, each cell in its row and column of the image; and only what flies is in
-    the weights that fly."""
-    spec = StudentSpec("rgb", 160, 70, cell_features=3)
-    module = StudentModule(spec, tells_depth=True)
-    cells = torch.zeros(1, 3, 5, 3)
-    cells[0, 1, 2] = torch.tensor([1.0, 0.0, 0.0])
-    with torch.no_grad():
-        module.depth_layer.bias.zero_()
-        module.depth_layer.weight[:, 0] = torch.arange(16.0)
-        told = module.nearest_depth(cells.flatten(1))
-    expected = torch.zeros(12, 20)
-    expected[4:8, 8:12] = torch.arange(16.0).reshape(4, 4)
-    np.testing.assert_array_equal(told[0], expected)
-    assert set(module.flown_state_dict()) == set(spec.weight_shapes())
-    assert set(module.state_dict()) > set(module.flown_state_dict())
