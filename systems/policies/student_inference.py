@@ -78,7 +78,7 @@ class StudentSpec:
         """Of the unobstructed way, see `MARGIN`."""
         return MARGIN if self.way_version > 1 else 0.0
 
-    def deviations(self, output: Any, goal_B: Any) -> Any:
+    def deviations(self, output: Any, goal_B: Any, fading: bool = False) -> Any:
         """From the unobstructed way, (..., M, T, 3) [m], in arrays and tensors.
 
         The way creeps up to a goal at hand: from rest 0.4 m before it, it leads 2 cm ahead in the
@@ -88,11 +88,12 @@ class StudentSpec:
         Args:
             output: (..., M, T, 3), the network's.
             goal_B: (..., 3) [m], the vector to the goal.
+            fading: also of weights that learned when deviations did not fade.
         """
-        if self.way_version == 1:
+        if self.way_version == 1 and not fading:
             return WAYPOINT_SCALE * output
-        fading = ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
-        return WAYPOINT_SCALE * fading[..., None, None, None] * output
+        left = ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
+        return WAYPOINT_SCALE * left[..., None, None, None] * output
 
     @property
     def reach(self) -> float:
@@ -131,15 +132,20 @@ class StudentNetwork:
         spec: the architecture.
         weights: by the names of `StudentSpec.weight_shapes`.
         speed: [m/s], nominal, that it is asked for; its expert's if None.
+        fading: see `StudentSpec.deviations`.
 
     Raises:
         ValueError: if weights are missing, of another shape or not finite.
     """
 
     def __init__(
-        self, spec: StudentSpec, weights: dict[str, np.ndarray], speed: float | None = None
+        self,
+        spec: StudentSpec,
+        weights: dict[str, np.ndarray],
+        speed: float | None = None,
+        fading: bool = False,
     ) -> None:
-        self.spec = spec
+        self.spec, self._fading = spec, fading
         self._speed = spec.nominal_speed if speed is None else speed
         self._weights = check_weights(weights, spec.weight_shapes())
         self._encoder = MobileNet(spec.height, spec.width, self._weights)
@@ -182,7 +188,7 @@ class StudentNetwork:
         goal_B = self.reach * towards
         way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed, margin=spec.margin)
         waypoints = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
-        return way + self.pace * spec.deviations(waypoints, goal_B), output[:, -1]
+        return way + self.pace * spec.deviations(waypoints, goal_B, self._fading), output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
@@ -192,10 +198,13 @@ def _rectified(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, np.float32(0.0))
 
 
-def load_network(path: str, observation: str, speed: float | None = None) -> StudentNetwork:
-    """The network from a file of weights, see `PolicyCheckpoint.load`, asked for a speed [m/s]."""
+def load_network(
+    path: str, observation: str, speed: float | None = None, fading: bool = False
+) -> StudentNetwork:
+    """The network from a file of weights, see `PolicyCheckpoint.load`, asked for a speed [m/s], and
+    `fading`, see `StudentSpec.deviations`."""
     checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
-    return checkpoint.build(partial(StudentNetwork, speed=speed))
+    return checkpoint.build(partial(StudentNetwork, speed=speed, fading=fading))
 
 
 def encode_color(color: np.ndarray) -> np.ndarray:

@@ -91,7 +91,8 @@ def test_plans_at_its_rate(name, files):
 
 
 def test_a_pilot_plans_by_both_views(files):
-    """By a student's weights, six hypotheses, which are those of the pure policy."""
+    """By a student's weights, six hypotheses, which are those of the pure policy; near the goal
+    their deviations fade although these weights learned when they did not."""
     system = Student(
         PilotRgbConfig(weights=files["rgb"], camera=OnboardCamera(width=64, height=48))
     )
@@ -99,14 +100,19 @@ def test_a_pilot_plans_by_both_views(files):
     context, image = simulator.get_mutable_context(), ImageRgba8U(64, 48)
     image.mutable_data[...] = np.random.default_rng(1).integers(0, 256, (48, 64, 4))
     system.GetInputPort("state").FixValue(context, state)
-    system.GetInputPort("goal").FixValue(context, P_WG)
+    near = np.array([1.3, 2.2, 1.6])
+    system.GetInputPort("goal").FixValue(context, near)
     system.GetInputPort("color_image").FixValue(context, Value(image))
     simulator.AdvanceTo(0.01)
     vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
     found = Hypotheses.from_vector(vector, 6)
-    network, seen = load_network(files["rgb"], "rgb", 2.0), np.asarray(image.data)[..., :3]
-    expected = plan_both_views(network, 0.0, seen, pose_from_state(state), state[3:6], P_WG)
+    seen = np.asarray(image.data)[..., :3], pose_from_state(state), state[3:6], near
+    expected, unfaded = (
+        plan_both_views(load_network(files["rgb"], "rgb", 2.0, fading), 0.0, *seen)
+        for fading in (True, False)
+    )
     assert found is not None
+    assert np.abs(found.waypoints_B - unfaded.waypoints_B).max() > 0.05
     np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
     np.testing.assert_array_equal(found.costs, expected.costs)
 
@@ -147,19 +153,24 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
 
 
 @pytest.mark.parametrize(
-    ("version", "distance", "scale"),
-    [(2, 0.0, 0.0), (2, 0.5, 0.5), (2, 1.0, 2.0), (2, 5.0, 2.0), (1, 0.0, 2.0), (1, 5.0, 2.0)],
+    ("version", "fading", "distance", "scale"),
+    [
+        *((2, False, 0.0, 0.0), (2, False, 0.5, 0.5), (2, False, 1.0, 2.0), (2, False, 5.0, 2.0)),
+        *((1, False, 0.0, 2.0), (1, False, 5.0, 2.0), (1, True, 0.5, 0.5), (1, True, 5.0, 2.0)),
+    ],
 )
-def test_deviations_fade_at_the_goal(version, distance, scale):
+def test_deviations_fade_at_the_goal(version, fading, distance, scale):
     """Of a network that always says 0.1, whose hypotheses are a fifth of a metre beside the
-    unobstructed way, and on it where they arrive; unless it learned when they did not fade."""
+    unobstructed way, and on it where they arrive; unless it learned when they did not fade, and
+    nobody asks it to."""
     spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, way_version=version)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
     weights["head.bias"][:] = 0.1
     X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.array([0.5, 0.0, 0.0])
     goal_B = np.array([0.6, 0.8, 0.0]) * distance
     depth, p_WG = np.full((48, 64), 5.0, np.float32), X_WB @ goal_B
-    found = plan(StudentNetwork(spec, weights), 0.0, depth, X_WB, v_WB, p_WG).waypoints_B
+    network = StudentNetwork(spec, weights, fading=fading)
+    found = plan(network, 0.0, depth, X_WB, v_WB, p_WG).waypoints_B
     way = unobstructed_way(v_WB, goal_B, np.array([0.0, 0.0, 1.0]), 2.6)
     np.testing.assert_allclose(found - way, np.full((3, 10, 3), 0.1 * scale), atol=1e-5)
 
