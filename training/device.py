@@ -44,7 +44,7 @@ def keep_freed_memory() -> None:
     """Has this process keep the memory of tensors that are gone for those that come.
 
     Otherwise glibc gives it back to the system after each pass of a network, and the system clears
-    it anew for the next: a quarter of the time of the student's encoder, and more where several
+    it anew for the next: a fifth of the time of the student's encoder, and more where several
     processes do so. Without effect where the C library is another.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

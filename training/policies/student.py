@@ -82,6 +82,7 @@ lower penalty, of error and clearance."""
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
         self.network.to(config.device).to(memory_format=torch.channels_last)
+        # Of images as they are, then in a mirror.
         views = [False, True] if config.mirrored else [False]
         self._features = [
             FrozenFeatures(

@@ -8,13 +8,8 @@ from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.mobilenet import BLOCKS, CHANNELS, adds_input, mobilenet_blocks
-from splatpilot.systems.policies.student_inference import (
-    FARTHEST,
-    HYPOTHESES,
-    NEAREST,
-    STATE_SIZE,
-    StudentSpec,
-)
+from splatpilot.systems.policies.student_inference import HYPOTHESES, StudentSpec
+from splatpilot.systems.policies.student_observation import FARTHEST, NEAREST, STATE_SIZE
 from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
 
 IMAGE_MODULES = BLOCKS + 1
@@ -116,8 +111,9 @@ class _Bias(nn.Module):
 
 
 def encode_state(R_WB: Tensor, v_B: Tensor, goal_B: Tensor, reach: float) -> Tensor:
-    """What the network is told (N, 9), see `student_inference`: of attitudes (N, 3, 3), velocities
-    (N, 3) [m/s] and vectors to the goal (N, 3) [m], whose lengths are told within `reach` [m]."""
+    """What the network is told (N, 9), see `student_observation`: of attitudes (N, 3, 3),
+    velocities (N, 3) [m/s] and vectors to the goal (N, 3) [m], whose lengths are told within
+    `reach` [m]."""
     towards = goal_B / goal_B.norm(dim=1, keepdim=True).clamp(min=reach)
     return torch.cat([v_B, towards, R_WB[:, 2]], 1)
 
@@ -128,7 +124,7 @@ def encode_color(color: Tensor) -> Tensor:
 
 
 def encode_depth(depth: Tensor) -> Tensor:
-    """Planar depth (N, H, W) [m] as grey images (N, 3, H, W), see `student_inference`."""
+    """Planar depth (N, H, W) [m] as grey images (N, 3, H, W), see `student_observation`."""
     z = depth.clamp(NEAREST, FARTHEST).log()
     near, far = math.log(NEAREST), math.log(FARTHEST)
     encoded = (far + near - 2.0 * z) / (far - near)

@@ -12,12 +12,8 @@ from splatpilot.systems.policies.mirrored_views import (
     consensus,
     plan_both_views,
 )
-from splatpilot.systems.policies.student_inference import (
-    StudentNetwork,
-    StudentSpec,
-    mirrored_vectors,
-    plan,
-)
+from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.policies.student_observation import mirrored_vectors
 
 
 @pytest.fixture(scope="module", params=["rgb", "depth"])

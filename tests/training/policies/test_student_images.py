@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.policies import student_inference
+from splatpilot.systems.policies import student_observation
 from splatpilot.systems.sensing import observation_noise
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.policies.observation import disturb_color, noisy_color
@@ -34,9 +34,9 @@ def test_images_of_training_are_those_of_flight(observation):
     images = clean_images(pixels).numpy()
     for n, image in enumerate(images):
         if observation == "rgb":
-            expected = student_inference.encode_color(pixels[n])
+            expected = student_observation.encode_color(pixels[n])
         else:
-            expected = student_inference.encode_depth(pixels[n].astype(np.float32))
+            expected = student_observation.encode_depth(pixels[n].astype(np.float32))
         np.testing.assert_allclose(image, expected, atol=2e-6)
     assert np.abs(images).max() <= 1.0 + 1e-6
     if observation == "depth":
