@@ -21,6 +21,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         examples=(
             "recover student_rgb --out out/rgb --set 'corpora=[out/corpus]'",
             "recover student_depth --out out/depth --set 'corpora=[out/corpus]' --flights 3",
+            "recover student_rgb --out out/next --set 'corpora=[out/rgb/corpora/0]' "
+            "--flown-by out/rgb/stage_2/student_rgb.npz",
         ),
     )
     recover.add_argument("policy", choices=["student_rgb", "student_depth", "diffaero_rgb"])
@@ -32,6 +34,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     )
     recover.add_argument(
         "--flights", type=int, default=6, metavar="N", help="in each world, at most (%(default)s)"
+    )
+    recover.add_argument(
+        "--flown-by",
+        default="",
+        metavar="POLICY",
+        help="name, or file of weights, of who flies instead of a student that is trained first",
     )
     recover.add_argument("--jobs", type=int, metavar="N", help="processes that fly; default: cores")
     recover.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
@@ -51,7 +59,12 @@ def _recover(options: argparse.Namespace) -> None:
     jobs = available_cores() if options.jobs is None else options.jobs
     make = TRAINERS.find(options.policy).make
     ledger = recovery.run(
-        config=config, make=make, out=options.out, flights=options.flights, jobs=jobs
+        config=config,
+        make=make,
+        out=options.out,
+        flights=options.flights,
+        jobs=jobs,
+        flown_by=options.flown_by,
     )
     flown = ", ".join(f"{count} {outcome}" for outcome, count in ledger["flights"].items())
     print(

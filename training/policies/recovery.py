@@ -3,7 +3,8 @@ have done where the student came too near to something.
 
 After the paper, Sec. III-B. The student of the first stage flies, without any guard, the ways that
 the expert flew in the worlds that it was trained in; the second is trained from nothing on all. For
-`diffaero_rgb`, which learns from the same corpora what it sees, the images alone matter.
+`diffaero_rgb`, which learns from the same corpora what it sees, the images alone matter. Another
+policy's flights may take the place of the first stage, as those of the round before.
 """
 
 import json
@@ -27,6 +28,8 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.files import folder_written_atomically, written_atomically
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.output_folders import claim_folder, holds_folder
+from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
+from splatpilot.systems.policies.student import StudentConfig
 from splatpilot.systems.processes import map_processes
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards
@@ -72,11 +75,19 @@ class RecoveryFlights:
 
     # [-] Of the student, at most, in each world.
     flights: int = 6
+    # Policy, or file of weights, that flies; the first stage's where left empty.
+    flown_by: str = ""
 
 
 @holds_folder("out")
 def run[Config: CorpusTraining](
-    *, config: Config, make: Callable[[Config], Trainer], out: Path, flights: int, jobs: int
+    *,
+    config: Config,
+    make: Callable[[Config], Trainer],
+    out: Path,
+    flights: int,
+    jobs: int,
+    flown_by: str = "",
 ) -> dict[str, Any]:
     """
     Trains a student, has it fly, gathers what it was to have done, and trains another on all.
@@ -84,30 +95,37 @@ def run[Config: CorpusTraining](
     Interrupted anywhere, even by `kill -9`, the same call goes on and leaves the same. The corpora
     that `config` names stay as they are.
 
-    Leaves in `out`: `stage_1` and `stage_2`, see `train.run`; `corpora`, links to those of the
-    first stage with the recovery samples beside them; `flights`, what the student flew, a file a
-    world; `recovery.yaml`, how many they may be; `recovery.json`, how many of what there are.
+    Leaves in `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
+    `corpora`, links to those of `config` with the recovery samples beside them; `flights`, what the
+    student flew, a file a world; `recovery.yaml`, how many they may be and whose;
+    `recovery.json`, how many of what there are.
 
     Args:
         config: of both stages.
         make: the trainer of that configuration.
         flights: of the student, at most, in each world.
         jobs: processes that fly.
+        flown_by: a policy or a file of weights that flies instead of a first stage. Students see
+            through the corpora's camera, others through their own.
 
     Returns:
         What `recovery.json` says.
 
     Raises:
-        FileNotFoundError, ValueError: see `train.run` and `add_recovery`; or if `out` holds
-            something else.
+        FileNotFoundError, ValueError: see `train.run`, `add_recovery` and `policy_named`; or if
+            `out` holds something else.
         OSError: if `out` cannot be written, or a process was killed.
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
         if value < 1:
             raise ValueError(f"--{name} is {value}; it must be at least 1")
-    claim_folder(out / "recovery.yaml", RecoveryFlights(flights))
-    first = train.run(config=config, out=out / "stage_1", make=make)
-    weights = out / "stage_1" / f"{first['policy']}.npz"
+    if flown_by:
+        policy_named(flown_by)
+    claim_folder(out / "recovery.yaml", RecoveryFlights(flights, flown_by))
+    pilot, first = flown_by, {}
+    if not flown_by:
+        first = train.run(config=config, out=out / "stage_1", make=make)
+        pilot = str(out / "stage_1" / f"{first['policy']}.npz")
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
     for source, folder in zip(config.corpora, folders, strict=True):
         _link_corpus(Path(source), folder)
@@ -117,13 +135,14 @@ def run[Config: CorpusTraining](
     outcomes: Counter[str] = Counter()
     for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
         tasks = _tasks([shard for shard in shards if shard.world not in held_out], flights)
-        flown, ended = _fly_worlds(corpus, tasks, weights, out / "flights" / folder.name, jobs)
+        flown, ended = _fly_worlds(corpus, tasks, pilot, out / "flights" / folder.name, jobs)
         outcomes += ended
         add_recovery(folder, flown, jobs)
     both = replace(config, corpora=[str(folder) for folder in folders])
     second = train.run(config=both, out=out / "stage_2", make=make)
     ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
-    ledger |= {"stage_1": first, "stage_2": second}
+    ledger |= {"flown_by": flown_by} if flown_by else {"stage_1": first}
+    ledger["stage_2"] = second
     with written_atomically(out / "recovery.json") as path:
         path.write_text(json.dumps(ledger, indent=2) + "\n")
     return ledger
@@ -161,9 +180,9 @@ def _tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
 
 
 def _fly_worlds(
-    corpus: Corpus, tasks: dict[str, list[Task]], weights: Path, folder: Path, jobs: int
+    corpus: Corpus, tasks: dict[str, list[Task]], pilot: str, folder: Path, jobs: int
 ) -> tuple[list[StudentFlight], Counter[str]]:
-    """The student's flights in worlds of a corpus, and how they ended."""
+    """The flights of a policy, or a file of weights, in worlds of a corpus, and how they ended."""
     folder.mkdir(parents=True, exist_ok=True)
     work = [
         (record, tasks[record.name], folder / f"{record.name}.npz")
@@ -171,7 +190,7 @@ def _fly_worlds(
         if record.name in tasks
     ]
     missing = [piece for piece in work if not piece[2].exists()]
-    fly_world = partial(_fly_world, weights, corpus.config)
+    fly_world = partial(_fly_world, pilot, corpus.config)
     with tqdm(
         total=len(work), initial=len(work) - len(missing), desc="flights", unit="world"
     ) as bar:
@@ -188,12 +207,13 @@ def _fly_worlds(
 
 
 def _fly_world(
-    weights: Path, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]
+    pilot: str, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]
 ) -> None:
     """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
     record, tasks, file = work
-    policy, world = policy_named(str(weights), config.expert.speed), record.make()
-    policy = replace(policy, camera=config.camera)
+    policy, world = policy_named(pilot, config.expert.speed), record.make()
+    if isinstance(policy, StudentConfig | DiffAeroRgbConfig):
+        policy = replace(policy, camera=config.camera)
     arrays: dict[str, Any] = {}
     outcomes = []
     for task in tasks:

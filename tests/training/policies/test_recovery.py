@@ -93,6 +93,34 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
 
 
+def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_path, monkeypatch):
+    """No first stage is trained: what flies is the file that is named, through the corpus's camera,
+    and its samples join those of the round before. No other round goes on in the same folder."""
+    both_stages(expert, tmp_path / "first")
+    flown, fly = [], recovery.fly
+
+    def watched(diagram, scenario, world):
+        flown.append(scenario.policy)
+        return fly(diagram, scenario, world)
+
+    monkeypatch.setattr(recovery, "fly", watched)
+    corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
+    pilot = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
+    round_of = {"config": config, "make": StudentTrainer, "out": out, "flights": 1, "jobs": 1}
+    ledger = recovery.run(**round_of, flown_by=pilot)
+    assert [(policy.weights, policy.camera.width) for policy in flown] == [(pilot, 32)]
+    assert ledger["flown_by"] == pilot and not (out / "stage_1").exists()
+    before = Corpus(corpus)
+    earlier = (before.samples(np.arange(len(before))).source == RECOVERY).sum()
+    assert ledger["recovery_samples"] > earlier > 0
+    with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
+        recovery.run(**round_of)
+    with pytest.raises(ValueError, match="nobody"):
+        recovery.run(**round_of | {"out": tmp_path / "third"}, flown_by="nobody")
+    assert not (tmp_path / "third").exists()
+
+
 def test_what_corpora_share_is_flown_once(expert, tmp_path):
     """Of a corpus and another that holds the same samples the student flies each way once, and the
     ledger counts each sample once."""
