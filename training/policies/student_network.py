@@ -84,7 +84,10 @@ class StudentModule(nn.Module):
             state: (N, 9), see `encode_state`.
             first: module that takes `image`.
         """
-        cells = self.encode_image(image, first)
+        # On a GPU convolutions of half the bits take half the time.
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=image.is_cuda):
+            cells = self.encode_image(image, first)
+        cells = cells.float()
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
         joined = torch.cat([cells, y], 1)
         if self.spec.head_features:
