@@ -23,20 +23,11 @@ from torch import Tensor
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
-TESTS = Path(__file__).parents[1] / "tests/systems/splats"
-
-
-def _load(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, TESTS / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+sys.path.append(str(Path(__file__).parents[1] / "tests/systems/splats"))
 
 
 def load_reference() -> Any:
-    return _load("reference_rasterizer")
+    return importlib.import_module("reference_rasterizer")
 
 
 def print_errors(label: str, got: Tensor, want: Tensor, clear: Tensor) -> None:
@@ -111,7 +102,7 @@ def print_gsplat_agreement() -> None:
     if "SPLATPILOT_DATA" not in os.environ:
         print("\ngsplat on CUDA: skipped, SPLATPILOT_DATA is not set: the garden is not here")
         return
-    garden = _load("garden").load_garden(Path(os.environ["SPLATPILOT_DATA"]))
+    garden = importlib.import_module("garden").load_garden(Path(os.environ["SPLATPILOT_DATA"]))
     size = {"width": garden.width, "height": garden.height, "render_mode": "RGB+D"}
     results = {}
     upstream: Tensor | None = None

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from splatpilot import _native
-from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
+from splatpilot.systems.splats.gsplat_kernels import rasterize_by_gsplat
 from splatpilot.systems.splats.rasterization_autograd import (
     Composite,
     Drawing,
@@ -160,8 +160,8 @@ def rasterize(
             raise NotImplementedError(
                 "distorted cameras are rendered on the CPU alone; move the tensors with .cpu()"
             )
-        return import_extra("gsplat", "cuda").rasterization(
-            *scene,
+        return rasterize_by_gsplat(
+            scene,
             Ks,
             width,
             height,

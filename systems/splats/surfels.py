@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from splatpilot import _native
-from splatpilot.systems.extras import import_extra
 from splatpilot.systems.splats.baked_scene import check_camera, create_renderer
 from splatpilot.systems.splats.depth_normals import depth_to_normals
+from splatpilot.systems.splats.gsplat_kernels import rasterize_surfels_by_gsplat
 from splatpilot.systems.splats.rasterization_autograd import joined
 from splatpilot.systems.splats.rasterization_checks import (
     by_name,
@@ -98,8 +98,8 @@ def rasterize_surfels(
     _check_options(render_mode, depth_mode, distloss, radius_clip)
     check_shapes(tensors, sh_degree)
     if means.device.type == "cuda":
-        return import_extra("gsplat", "cuda").rasterization_2dgs(
-            *scene,
+        return rasterize_surfels_by_gsplat(
+            scene,
             Ks,
             width,
             height,
