@@ -64,6 +64,11 @@ lower penalty, of error and clearance."""
         self.policy = f"student_{config.observation}"
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
+        if config.recovery_share and not len(self._data.recovered):
+            raise ValueError(
+                f"recovery_share is {config.recovery_share}, but the corpora have no samples of "
+                "recovery; name corpora of `splatpilot recover`, or set it to 0"
+            )
         camera = self._data.camera
         self.spec = StudentSpec(
             config.observation,
@@ -138,8 +143,7 @@ lower penalty, of error and clearance."""
         pass
 
     def losses(self) -> dict[str, Tensor]:
-        training = self._data.training
-        numbers = training[self._drawn(len(training))]
+        numbers = self._data.drawn(self._drawn, self._config.recovery_share)
         mirrored = np.zeros(len(numbers), bool)
         if self._config.mirrored:
             mirrored = self._drawn(2) == 1

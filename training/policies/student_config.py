@@ -57,6 +57,9 @@ class StudentTraining:
     features: str = "out/features"
     # [-] Samples a step of the optimiser.
     batch: int = 32
+    # [-] Part of the samples of a step that are of recovery: states that a student came to, before
+    # which those of the expert's flights stand in the corpora as many to one. As they come where 0.
+    recovery_share: float = 0.0
     # [-] Trajectories of a sample that vote, the cheapest first, K; all, as published, where 0. The
     # others are slower and higher in the mean than what the expert flies, and so is a
     # student that takes them for as good.
@@ -93,7 +96,7 @@ class StudentTraining:
                 raise ValueError(
                     f"{name} is {getattr(self, name)}; it must be at least 0, which is all"
                 )
-        for name, limit in (("held_out", 0.9), ("epsilon", 0.5)):
+        for name, limit in (("held_out", 0.9), ("epsilon", 0.5), ("recovery_share", 1.0)):
             value = getattr(self, name)
             if not 0.0 <= value <= limit:
                 raise ValueError(f"{name} is {value}; it must be 0 to {limit}")

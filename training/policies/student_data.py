@@ -1,6 +1,6 @@
 """What the student learns from: samples of several corpora, and the distances in their worlds."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
@@ -12,8 +12,12 @@ from torch import Tensor
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards
+from splatpilot.training.corpus.sample import RECOVERY
 from splatpilot.training.policies.ray_casting import EsdfGeometry
 from splatpilot.training.policies.vehicles import rotation_matrix
+
+_PARTS = 1 << 20
+"""[-] That a chance is counted in."""
 
 
 class Labels(NamedTuple):
@@ -80,6 +84,10 @@ class StudentData:
         outside = np.isin(world, [number[name] for name in self.held_out_worlds])
         self.training, self.held_out = np.flatnonzero(~outside), np.flatnonzero(outside)
         """Numbers of samples."""
+        recovered = np.repeat([shard.source == RECOVERY for shard in self.shards], counts)
+        self.recovered = np.flatnonzero(~outside & recovered)
+        """Numbers of those to train with that a student came to."""
+        self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
             raise ValueError(
                 f"of {len(self.worlds)} worlds {len(self.held_out_worlds)} are held out, which "
@@ -99,6 +107,18 @@ class StudentData:
             world=torch.from_numpy(world).to(device),
         )
         self._records = records
+
+    def drawn(self, draw: Callable[[int], np.ndarray], recovery_share: float = 0.0) -> np.ndarray:
+        """Numbers (N,) of samples to train with.
+
+        Args:
+            draw: gives N whole numbers, each from 0 to before a count, whichever is as likely.
+            recovery_share: chance of each to be of recovery; where 0, that of all that there are.
+        """
+        if not recovery_share:
+            return self.training[draw(len(self.training))]
+        met, shown = (group[draw(len(group))] for group in (self.recovered, self._shown))
+        return np.where(draw(_PARTS) < recovery_share * _PARTS, met, shown)
 
     def labels(self, numbers: np.ndarray) -> "Labels":
         """What belongs to the images of the samples of `numbers` (N,)."""

@@ -52,11 +52,15 @@ def training_images(
 ) -> Tensor:
     """The same in another light and through a worse camera, drawn anew each time."""
     images = torch.from_numpy(pixels).to(generator.device).float()
+    # Nothing is drawn that changes nothing: that takes a third as long as seven modules.
+    noisy = noise != ObservationNoise()
     if images.ndim == 3:
-        return encode_depth(noisy_depth(images, noise, generator))
-    draws = torch.rand(2, len(images), generator=generator, device=images.device) * 2.0 - 1.0
-    images = relit(images, 2.0 ** (appearance.exposure * draws[0]), appearance.hue * draws[1])
-    return encode_color(noisy_color(images, noise, generator))
+        return encode_depth(noisy_depth(images, noise, generator) if noisy else images)
+    if appearance != Appearance(0.0, 0.0):
+        draws = torch.rand(2, len(images), generator=generator, device=images.device) * 2.0 - 1.0
+        images = relit(images, 2.0 ** (appearance.exposure * draws[0]), appearance.hue * draws[1])
+        images = images.clamp(0.0, 255.0)
+    return encode_color(noisy_color(images, noise, generator) if noisy else images)
 
 
 def relit(color: Tensor, gain: Tensor, hue: Tensor) -> Tensor:
