@@ -10,6 +10,7 @@ with gsplat's CUDA kernels says why it is skipped where there is no GPU or no gs
 import importlib.util
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.surfels import rasterize_surfels
 
 sys.path.append(str(Path(__file__).parents[1] / "tests/systems/splats"))
 
@@ -91,25 +93,42 @@ def print_gradient_agreement(scene: GaussianScene, X_WC: RigidTransform, referen
             row(name, f"{p50:.1e}", f"{p99:.1e}", f"{len(error):,}")
 
 
-def print_gsplat_agreement() -> None:
-    """gsplat's CUDA kernels and ours on the garden, images and gradients, at its full size."""
+def print_gsplat_agreement(scene: GaussianScene, X_WC: RigidTransform) -> None:
+    """gsplat's CUDA kernels and ours: the scene at 320x240, and the garden at its full size."""
     if not torch.cuda.is_available():
         print("\ngsplat on CUDA: skipped, torch finds no GPU")
         return
     if importlib.util.find_spec("gsplat") is None:
         print("\ngsplat on CUDA: skipped, it is not installed: pip install 'splatpilot[cuda]'")
         return
+    version = importlib.import_module("gsplat").__version__
+    print(f"\ngsplat {version}, {torch.cuda.get_device_name()}")
+    viewmats, Ks = cameras_of(X_WC, 320, 240)
+    view: dict[str, Any] = {"viewmats": viewmats, "Ks": Ks, "width": 320, "height": 240}
+    view["render_mode"], tensors = "RGB+ED", tensors_of(scene)
+    print_devices(scene_name(), rasterize, tensors, view)
+    smooth = view | {"rasterize_mode": "antialiased"}
+    print_devices(f"{scene_name()}, antialiased", rasterize, tensors, smooth)
+    print_devices(f"{scene_name()}, surfels", rasterize_surfels, tensors, view)
     if "SPLATPILOT_DATA" not in os.environ:
-        print("\ngsplat on CUDA: skipped, SPLATPILOT_DATA is not set: the garden is not here")
+        print("\nthe garden: skipped, SPLATPILOT_DATA is not set")
         return
     garden = importlib.import_module("garden").load_garden(Path(os.environ["SPLATPILOT_DATA"]))
-    size = {"width": garden.width, "height": garden.height, "render_mode": "RGB+D"}
+    view = {"viewmats": garden.viewmats, "Ks": garden.Ks, "render_mode": "RGB+D"}
+    view |= {"width": garden.width, "height": garden.height}
+    print_devices("garden", rasterize, garden.scene, view)
+
+
+def print_devices(
+    name: str, draw: Callable[..., Any], scene: dict[str, Tensor], view: dict[str, Any]
+) -> None:
+    """Images and gradients of one rasteriser's CPU kernels against gsplat's."""
     results = {}
     upstream: Tensor | None = None
     for device in ("cpu", "cuda"):
-        leaves = {n: t.to(device).detach().requires_grad_() for n, t in garden.scene.items()}
-        cameras = {"viewmats": garden.viewmats.to(device), "Ks": garden.Ks.to(device)}
-        image, alpha, _ = rasterize(**leaves, **cameras, **size)
+        leaves = {n: t.to(device).detach().requires_grad_() for n, t in scene.items()}
+        there = {n: v.to(device) if isinstance(v, Tensor) else v for n, v in view.items()}
+        image, alpha, *_ = draw(**leaves, **there)
         upstream = torch.randn(image.shape) if upstream is None else upstream
         image.backward(upstream.to(device))
         gradients = {n: t.grad.cpu() for n, t in leaves.items() if t.grad is not None}
@@ -117,19 +136,16 @@ def print_gsplat_agreement() -> None:
     (ours, our_alpha, our_gradients), (theirs, their_alpha, their_gradients) = (
         results[device] for device in ("cpu", "cuda")
     )
-    print(
-        f"\ngsplat {importlib.import_module('gsplat').__version__}, {torch.cuda.get_device_name()}"
-    )
-    header("garden, ours against gsplat's CUDA", "median", "p99", "max", "beyond 1e-3", "max there")
+    header(f"{name}, ours against gsplat's", "median", "p99", "max", "beyond 1e-3", "max there")
     for label, got, want in (("image", ours, theirs), ("alpha", our_alpha, their_alpha)):
         # A threshold that falls the other way changes a pixel by up to 1/255 of a colour.
         print_errors(label, got, want, (got - want).abs() <= 1e-3)
     header("gradient", "relative error of the whole", "beyond rtol 1e-5, atol 1e-3")
-    for name, got in our_gradients.items():
-        want = their_gradients[name]
+    for tensor, got in our_gradients.items():
+        want = their_gradients[tensor]
         beyond = (got - want).abs() > 1e-3 + 1e-5 * want.abs()
         row(
-            name,
+            tensor,
             f"{(got - want).norm() / want.norm():.1e}",
             f"{int(beyond.sum())} of {got.numel()}",
         )
@@ -143,7 +159,7 @@ def main() -> None:
     reference = load_reference()
     print_image_agreement(scene, X_WC, reference)
     print_gradient_agreement(scene, X_WC, reference)
-    print_gsplat_agreement()
+    print_gsplat_agreement(scene, X_WC)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTrainer, DiffAe
 from splatpilot.training.policies.expert import ExpertConfig
 from splatpilot.training.policies.student import StudentTrainer
 from splatpilot.training.policies.student_config import StudentDepthTraining
+from splatpilot.training.policies.student_data import StudentData
 
 TINY = [
     "pretrained=false",
@@ -119,6 +120,28 @@ def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_pat
     with pytest.raises(ValueError, match="nobody"):
         recovery.run(**round_of | {"out": tmp_path / "third"}, flown_by="nobody")
     assert not (tmp_path / "third").exists()
+
+
+def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
+    """Of 4000 draws; without a share all samples are as likely. Corpora without any are refused."""
+    both_stages(expert, tmp_path)
+    data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
+    rng = np.random.default_rng(0)
+
+    def draw(count: int) -> np.ndarray:
+        return rng.integers(count, size=4000)
+
+    natural = len(data.recovered) / len(data.training)
+    assert 0.0 < natural < 1.0
+    for share, part in ((0.0, natural), (0.25, 0.25), (0.8, 0.8), (1.0, 1.0)):
+        drawn = data.drawn(draw, share)
+        assert set(drawn) <= set(data.training)
+        assert np.isin(drawn, data.recovered).mean() == pytest.approx(part, abs=0.03)
+    config = load_config(
+        StudentDepthTraining(), overrides=[f"corpora=[{expert}]", "recovery_share=0.5", *TINY]
+    )
+    with pytest.raises(ValueError, match=r"recovery_share is 0.5, but .* no samples of recovery"):
+        StudentTrainer(config)
 
 
 def test_what_corpora_share_is_flown_once(expert, tmp_path):
