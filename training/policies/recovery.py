@@ -211,7 +211,8 @@ def _fly_world(
 ) -> None:
     """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
     record, tasks, file = work
-    policy, world = policy_named(pilot, config.expert.speed), record.make()
+    policy: Any = policy_named(pilot, config.expert.speed)
+    world = record.make()
     if isinstance(policy, StudentConfig | DiffAeroRgbConfig):
         policy = replace(policy, camera=config.camera)
     arrays: dict[str, Any] = {}
