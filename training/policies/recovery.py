@@ -211,10 +211,9 @@ def _fly_world(
 ) -> None:
     """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
     record, tasks, file = work
-    policy: Any = policy_named(pilot, config.expert.speed)
-    world = record.make()
-    if isinstance(policy, StudentConfig | DiffAeroRgbConfig):
-        policy = replace(policy, camera=config.camera)
+    policy, world = policy_named(pilot, config.expert.speed), record.make()
+    learned_here = isinstance(policy, StudentConfig | DiffAeroRgbConfig)
+    policy = replace(policy, **({"camera": config.camera} if learned_here else {}))
     arrays: dict[str, Any] = {}
     outcomes = []
     for task in tasks:
