@@ -64,11 +64,6 @@ lower penalty, of error and clearance."""
         self.policy = f"student_{config.observation}"
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device, config.worlds)
-        if config.recovery_share and not len(self._data.recovered):
-            raise ValueError(
-                f"recovery_share is {config.recovery_share}, but the corpora have no samples of "
-                "recovery; name corpora of `splatpilot recover`, or set it to 0"
-            )
         camera = self._data.camera
         self.spec = StudentSpec(
             config.observation,

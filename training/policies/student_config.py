@@ -57,8 +57,8 @@ class StudentTraining:
     features: str = "out/features"
     # [-] Samples a step of the optimiser.
     batch: int = 32
-    # [-] Part of the samples of a step that are of recovery: states that a student came to, before
-    # which those of the expert's flights stand in the corpora as many to one. As they come where 0.
+    # [-] Part of each step's samples that are of recovery: states that a student came to. As many
+    # as there are, few beside the expert's, where it is 0; without effect where there are none.
     recovery_share: float = 0.0
     # [-] Trajectories of a sample that vote, the cheapest first, K; all, as published, where 0. The
     # others are slower and higher in the mean than what the expert flies, and so is a

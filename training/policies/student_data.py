@@ -113,9 +113,10 @@ class StudentData:
 
         Args:
             draw: gives N whole numbers, each from 0 to before a count, whichever is as likely.
-            recovery_share: chance of each to be of recovery; where 0, that of all that there are.
+            recovery_share: chance of each to be of recovery; where it is 0, or none is, all samples
+                are as likely.
         """
-        if not recovery_share:
+        if not (recovery_share and len(self.recovered)):
             return self.training[draw(len(self.training))]
         met, shown = (group[draw(len(group))] for group in (self.recovered, self._shown))
         return np.where(draw(_PARTS) < recovery_share * _PARTS, met, shown)
