@@ -26,7 +26,7 @@ def rasterize_by_gsplat(
     """
     gsplat = import_extra("gsplat", "cuda")
     image, alpha, meta = gsplat.rasterization(*scene, *arguments, **options)
-    return _before(backgrounds, image, alpha, options["render_mode"]), alpha, meta
+    return _over_backgrounds(backgrounds, image, alpha, options["render_mode"]), alpha, meta
 
 
 def rasterize_surfels_by_gsplat(
@@ -55,11 +55,13 @@ def rasterize_surfels_by_gsplat(
     R_WC = torch.linalg.inv(viewmats)[camera_ids, :3, :3]
     meta["normals"] = (R_WC @ meta["normals"][..., None])[..., 0]
     meta |= {"camera_ids": camera_ids, "gaussian_ids": gaussian_ids}
-    image = _before(backgrounds, image, alpha, options["render_mode"])
+    image = _over_backgrounds(backgrounds, image, alpha, options["render_mode"])
     return image, alpha, normals, surface, distort, median, meta
 
 
-def _before(backgrounds: Tensor | None, image: Tensor, alpha: Tensor, render_mode: str) -> Tensor:
+def _over_backgrounds(
+    backgrounds: Tensor | None, image: Tensor, alpha: Tensor, render_mode: str
+) -> Tensor:
     """The image (C, H, W, X) with colours (C, 3) behind its own, if it has some."""
     if backgrounds is None or "RGB" not in render_mode:
         return image

@@ -120,7 +120,7 @@ def run[Config: CorpusTraining](
         if value < 1:
             raise ValueError(f"--{name} is {value}; it must be at least 1")
     if flown_by:
-        policy_named(flown_by)
+        policy_named(flown_by)  # refused, if there is no such policy, before anything is written
     claim_folder(out / "recovery.yaml", RecoveryFlights(flights, flown_by))
     pilot, first = flown_by, {}
     if not flown_by:
@@ -212,8 +212,8 @@ def _fly_world(
     """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
     record, tasks, file = work
     policy, world = policy_named(pilot, config.expert.speed), record.make()
-    learned_here = isinstance(policy, StudentConfig | DiffAeroRgbConfig)
-    policy = replace(policy, **({"camera": config.camera} if learned_here else {}))
+    learns_from_corpora = isinstance(policy, StudentConfig | DiffAeroRgbConfig)
+    policy = replace(policy, **({"camera": config.camera} if learns_from_corpora else {}))
     arrays: dict[str, Any] = {}
     outcomes = []
     for task in tasks:

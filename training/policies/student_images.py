@@ -59,8 +59,9 @@ def training_images(
     if appearance != Appearance(0.0, 0.0):
         draws = torch.rand(2, len(images), generator=generator, device=images.device) * 2.0 - 1.0
         images = relit(images, 2.0 ** (appearance.exposure * draws[0]), appearance.hue * draws[1])
-        images = images.clamp(0.0, 255.0)
-    return encode_color(noisy_color(images, noise, generator) if noisy else images)
+    return encode_color(
+        noisy_color(images, noise, generator) if noisy else images.clamp(0.0, 255.0)
+    )
 
 
 def relit(color: Tensor, gain: Tensor, hue: Tensor) -> Tensor:
