@@ -1,5 +1,6 @@
 """Devices that are asked for."""
 
+import os
 import platform
 import subprocess
 import sys
@@ -50,27 +51,28 @@ layer = torch.nn.Conv2d(3, 96, 1)
 image = torch.zeros(8, 3, 60, 80)  # 15 MB become of it, four times at once
 
 
-def faults(passes):
+def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(passes):
+    for _ in range(10):
         with torch.no_grad():
             kept = [layer(image) for _ in range(4)]
         del kept
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
-faults(3)
-given_back = faults(10)
+given_back = min(faults() for _ in range(3))
 keep_freed_memory()
-faults(3)
-print(given_back, faults(10))
+# The least of several: at times the heap still grows, where what is free lies badly.
+print(given_back, min(faults() for _ in range(6)))
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is glibc that is told")
 def test_memory_of_tensors_that_are_gone_is_kept():
     """Passes of a layer no longer have the system clear memory for each of them."""
+    # As glibc begins; by itself it would raise this limit, at times so far that nothing is cleared.
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "131072"}
     command = [sys.executable, "-c", PASSES]
-    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    ended = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     given_back, kept = (int(word) for word in ended.stdout.split())
-    assert given_back > 1000 > 100 > kept
+    assert given_back > 100_000 > 100 > kept
