@@ -172,6 +172,7 @@ void bind_projected(nb::module_& m);
 void bind_losses(nb::module_& m);
 void bind_fitting(nb::module_& m);
 void bind_shape_worlds(nb::module_& m);
+void bind_descent(nb::module_& m);
 void bind_shape_field(nb::module_& m);
 void bind_grid_worlds(nb::module_& m);
 

@@ -238,6 +238,7 @@ NB_MODULE(_native, m) {
   bind_losses(m);
   bind_fitting(m);
   bind_shape_worlds(m);
+  bind_descent(m);
   bind_shape_field(m);
   bind_grid_worlds(m);
   bind_gradients(m);

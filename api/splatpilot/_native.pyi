@@ -136,6 +136,12 @@ class ShapeWorlds:
         Writes the distances (N, K) of the K nearest shapes and their gradients (N, K, 3).
         """
 
+def descend(*, times: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, p_WG: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], step: float, length: float, way: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C', device='cpu')]) -> int:
+    """
+    Writes points and the length up to them, rows (4,), down the gradient of `times` from
+    p_WQ to p_WG or until `length` is covered; returns how many.
+    """
+
 class ShapeField:
     """The distance field of analytic shapes."""
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from splatpilot import _native
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.soft_barrier import soft_barrier
 from splatpilot.systems.collision.trilinear import (
@@ -97,51 +99,27 @@ class TimeOfArrival:
         the goal if that is nearer, with direction zero.
         """
         step = max(self.voxel_size, 0.1)  # [m] Shorter steps resolve nothing more.
-        p_WP, direction = np.array(p_WQ, dtype=float), np.zeros(3)
-        points, covered = [p_WP], [0.0]
-        while covered[-1] < np.max(lengths):
-            to_goal = self.p_WG - p_WP
-            distance = float(np.sqrt(to_goal.dot(to_goal)))
-            if distance < 1e-9:
-                break
-            if distance < 2.0 * step:
-                direction = to_goal / distance
-            else:
-                # The mean with the last direction: plain steepest descent zigzags in a valley.
-                direction = _unit(direction - _unit(self._gradient_at(p_WP)))
-            length = min(step, distance)
-            p_WP = p_WP + length * direction
-            points.append(p_WP)
-            covered.append(covered[-1] + length)
-        way = np.array(points)  # (m, 3)
+        length = float(np.max(lengths))
+        rows = np.empty((ceil(length / step) + 3, 4))
+        count = _native.descend(
+            times=self.times,
+            lower_W=np.ascontiguousarray(self.lower_W),
+            voxel_size=self.voxel_size,
+            p_WG=self.p_WG,
+            p_WQ=np.ascontiguousarray(p_WQ, dtype=float),
+            step=step,
+            length=length,
+            way=rows,
+        )
+        *way, covered = rows[:count].T  # 3 of (m,), (m,)
 
         def point_at(length: np.ndarray) -> np.ndarray:
-            return np.stack([np.interp(length, covered, way[:, axis]) for axis in range(3)], -1)
+            return np.stack([np.interp(length, covered, along) for along in way], -1)
 
         ends = point_at(lengths)
         chords = ends - point_at(0.75 * lengths)
         chords[lengths > covered[-1]] = 0.0
         return ends, np.array([_unit(chord) for chord in chords])
-
-    def _gradient_at(self, p_WQ: np.ndarray) -> np.ndarray:
-        """`gradient` at one point (3,) to the last bit, in Python's floats: arrays of one number
-        take several times as long."""
-        nx, ny, nz = self.times.shape
-        x, y, z = ((p_WQ - self.lower_W) / self.voxel_size - 0.5).tolist()
-        x, y, z = (min(max(c, 0.0), n - 1.0) for c, n in ((x, nx), (y, ny), (z, nz)))
-        i, j, k = min(int(x), nx - 2), min(int(y), ny - 2), min(int(z), nz - 2)
-        fx, fy, fz = x - i, y - j, z - k
-        near, far = self.times[i : i + 2, j : j + 2, k : k + 2]  # (2, 2) each, by y and z
-        # What single precision rounds is left to arrays.
-        steps = far - near
-        (s00, s01), (s10, s11) = steps.tolist()
-        t0, t1 = (steps[1] - steps[0]).tolist()
-        (a00, a01), (a10, a11) = near.tolist()
-        a00, a01, a10, a11 = a00 + fx * s00, a01 + fx * s01, a10 + fx * s10, a11 + fx * s11
-        along_x, along_y = (s00 + fy * t0, s01 + fy * t1), (a10 - a00, a11 - a01)
-        along_z = (a01 + fy * along_y[1]) - (a00 + fy * along_y[0])
-        slopes = [*(low + fz * (high - low) for low, high in (along_x, along_y)), along_z]
-        return np.array(slopes) / self.voxel_size
 
     def _cell(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Corner values (2, 2, 2, N) and fractions (3, N) of the cells that hold the points."""
