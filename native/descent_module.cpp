@@ -62,8 +62,7 @@ class TimeGrid {
       along_x[k] = step[0][k] + f[1] * (step[1][k] - step[0][k]);
       along_y[k] = along[1][k] - along[0][k];
     }
-    const double along_z =
-        (along[0][1] + f[1] * along_y[1]) - (along[0][0] + f[1] * along_y[0]);
+    const double along_z = (along[0][1] + f[1] * along_y[1]) - (along[0][0] + f[1] * along_y[0]);
     const Vector slope = {along_x[0] + f[2] * (along_x[1] - along_x[0]),
                           along_y[0] + f[2] * (along_y[1] - along_y[0]), along_z};
     return slope / voxel_size_;
@@ -90,8 +89,8 @@ size_t descend(const Times& times, const Point& lower_W, double voxel_size, cons
     const double distance = to_goal.length();
     if (!(covered < length) || distance < 1e-9) return count + 1;
     // The mean with the last direction: plain steepest descent zigzags in a valley.
-    direction = distance < 2.0 * step ? to_goal / distance
-                                      : (direction - grid.gradient(p).unit()).unit();
+    direction =
+        distance < 2.0 * step ? to_goal / distance : (direction - grid.gradient(p).unit()).unit();
     const double stride = std::min(step, distance);
     p = {p.x + stride * direction.x, p.y + stride * direction.y, p.z + stride * direction.z};
     covered += stride;
