@@ -99,16 +99,16 @@ class TimeOfArrival:
         the goal if that is nearer, with direction zero.
         """
         step = max(self.voxel_size, 0.1)  # [m] Shorter steps resolve nothing more.
-        length = float(np.max(lengths))
-        rows = np.empty((ceil(length / step) + 3, 4))
+        longest = float(np.max(lengths))
+        rows = np.empty((ceil(longest / step) + 3, 4))  # both ends, and one for rounding
         count = _native.descend(
             times=self.times,
-            lower_W=np.ascontiguousarray(self.lower_W),
+            lower_W=self.lower_W,
             voxel_size=self.voxel_size,
             p_WG=self.p_WG,
             p_WQ=np.ascontiguousarray(p_WQ, dtype=float),
             step=step,
-            length=length,
+            length=longest,
             way=rows,
         )
         *way, covered = rows[:count].T  # 3 of (m,), (m,)
