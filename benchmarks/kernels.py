@@ -38,7 +38,8 @@ class Kernel:
             "colors": tensors["colors"].numpy()[:, None], "sh_degree": -1,
             "K": Ks[0].double().numpy(), "X_CW": viewmats[0].double().numpy(),
             "width": WIDTH, "height": HEIGHT, "near_plane": 0.01, "far_plane": 1e10,
-            "radius_clip": 0.0, "eps2d": 0.3, "antialiased": False, "expected_depth": False,
+            "radius_clip": 0.0, "eps2d": 0.3, "antialiased": False,
+            "depth_mode": _native.DepthMode.ACCUMULATED,
             "background": self._black, "image": self._image, "alpha": self._alpha, "keep": True,
         }  # fmt: skip
 

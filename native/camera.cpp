@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace splatpilot {
 
@@ -72,6 +73,7 @@ Camera make_camera(const CameraParameters& p) {
   c.radius_clip = static_cast<float>(std::floor(p.radius_clip));
   c.eps2d = static_cast<float>(p.eps2d);
   c.antialiased = p.antialiased;
+  c.max_depth = std::numeric_limits<float>::infinity();
 
   // centre = -R^-1 t by cofactors: R may be a rotation only to single precision.
   double R[3][3], t[3];

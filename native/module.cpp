@@ -105,11 +105,13 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Means& mean
                   const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW, int width,
                   int height, double near_plane, double far_plane, double eps2d,
                   const Floats<nb::shape<3>>& background, const Output& color, const Output& depth,
-                  const Output& alpha, int distortion, const Doubles<nb::shape<13>>& lens) {
+                  const Output& alpha, double max_depth, int distortion,
+                  const Doubles<nb::shape<13>>& lens) {
   require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
   const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
-  const Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d,
-                                    false, lens_from(distortion, lens));
+  Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, eps2d, false,
+                              lens_from(distortion, lens));
+  camera.max_depth = static_cast<float>(max_depth);
   check_size(color, camera, 3);
   check_size(depth, camera, 1);
   check_size(alpha, camera, 1);
@@ -123,15 +125,14 @@ void render_baked_depth(const BakedScene& scene, Renderer& renderer, const Means
                         const Quats& quats, const Means& scales, const Opacities& opacities,
                         const Colors& sh, int sh_degree, const Intrinsics& K, const Pose& X_CW,
                         int width, int height, double near_plane, double far_plane,
-                        double max_depth, double eps2d, const Output& depth, int distortion,
+                        double max_depth, const Output& depth, int distortion,
                         const Doubles<nb::shape<13>>& lens) {
   require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
   const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
-  // No Gaussian whose centre lies farther away has depth up to there at its nearest rim, and all
-  // of them are behind those that have.
-  const double reach = 1.01 * (1.0 + kMostFall) * max_depth;
-  const Camera camera = camera_from(K, X_CW, width, height, near_plane, std::min(far_plane, reach),
-                                    0.0, eps2d, false, lens_from(distortion, lens));
+  Camera camera = camera_from(K, X_CW, width, height, near_plane, far_plane, 0.0, kDepthBlur, false,
+                              lens_from(distortion, lens));
+  camera.max_depth = static_cast<float>(max_depth);
+  camera.depth_alone = true;
   check_size(depth, camera, 1);
   const Image out{nullptr, 0, depth.data(), 1, DepthMode::kMedian, nullptr, {}};
   const Exclusive use(renderer);
@@ -227,13 +228,12 @@ NB_MODULE(_native, m) {
   m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a,
         "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
         "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a, "depth"_a, "alpha"_a,
-        "distortion"_a, "lens"_a,
+        "max_depth"_a, "distortion"_a, "lens"_a,
         "Writes colour, median depth and alpha of the scene and of Gaussians among it.");
   m.def("render_baked_depth", &render_baked_depth, "scene"_a, "renderer"_a, nb::kw_only(),
         "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a, "K"_a, "X_CW"_a,
-        "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "max_depth"_a, "eps2d"_a, "depth"_a,
-        "distortion"_a, "lens"_a,
-        "Writes the median depth alone; what it is beyond max_depth is farther than that, or 0.");
+        "width"_a, "height"_a, "near_plane"_a, "far_plane"_a, "max_depth"_a, "depth"_a,
+        "distortion"_a, "lens"_a, "Writes the median depth alone.");
 
   bind_losses(m);
   bind_fitting(m);

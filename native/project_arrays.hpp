@@ -143,8 +143,12 @@ size_t project_arrays_through(const GaussianArrays& g, const Camera& camera, siz
     if (!bits) continue;
     if (planes) {
       const Vector16 n_C = plane_normal(camera, columns, in.scale, d_W);
-      append_planes(depth_plane<kDistorted>(camera, p_C, inverse_z, p0, p1, n_C), bits,
-                    planes + count);
+      PlanePack plane = depth_plane<kDistorted>(camera, p_C, inverse_z, p0, p1, n_C);
+      const float* forward = camera.R_CW + 6;
+      const F16 sigma_z =
+          norm({dot(forward, columns[0]), dot(forward, columns[1]), dot(forward, columns[2])});
+      hide_unless(within_max_depth(camera, p_C.z, sigma_z), plane);
+      append_planes(plane, bits, planes + count);
     }
     F16 color[3];
     gather_colors(g, indices, bits, d_W, color);

@@ -28,6 +28,10 @@ SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
   const F16 depth_reach = reach_along(forward);
   Mask16 visible = (p_C.z + depth_reach >= F16(camera.near_plane)) &
                    (p_C.z - depth_reach <= F16(camera.far_plane));
+  if (camera.depth_alone) {
+    const F16 nearest = max(p_C.z - depth_reach, F16(0.0f));
+    visible = visible & within_max_depth(camera, nearest, largest_scale, 1.0001f);
+  }
   for (int side = 0; side < 4; ++side) {
     const F16 reach =
         reach_along(camera.side_normal[side]) + F16(camera.side_reach[side]) * largest_scale;
@@ -67,19 +71,27 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
     return {row.x * L[0] + row.y * L[1] + row.z * L[3], row.y * L[2] + row.z * L[4], row.z * L[5]};
   };
   const Vector16 p0 = times_L(m[0]), p1 = times_L(m[1]);
+  const float* R = camera.R_CW;
+  const F16 sigma_z = norm(times_L({F16(R[6]), F16(R[7]), F16(R[8])}));
+  const Mask16 shown = within_max_depth(camera, p_C.z, sigma_z);
   SplatPack pack;
-  const uint32_t bits =
-      lane_bits(finish_projection<kDistorted>(camera, p_C, inverse_z, p0, p1, field(9), pack));
+  Mask16 visible = finish_projection<kDistorted>(camera, p_C, inverse_z, p0, p1, field(9), pack);
+  if (camera.depth_alone) visible = visible & shown;
+  const uint32_t bits = lane_bits(visible);
   if (!bits) return 0;
   if (planes) {
     const Vector16 n_C = plane_normal(camera, L, d_W);
-    append_planes(depth_plane<kDistorted>(camera, p_C, inverse_z, p0, p1, n_C), bits, planes);
+    PlanePack plane = depth_plane<kDistorted>(camera, p_C, inverse_z, p0, p1, n_C);
+    hide_unless(shown, plane);
+    append_planes(plane, bits, planes);
   }
 
   F16 color[3];
   const int coefficients = (scene.sh_degree + 1) * (scene.sh_degree + 1);
   const float* colors = scene.colors + group * (3 * coefficients) * kLanes;
-  if (scene.sh_degree == 0) {
+  if (camera.depth_alone) {
+    for (int c = 0; c < 3; ++c) color[c] = F16(0.0f);
+  } else if (scene.sh_degree == 0) {
     for (int c = 0; c < 3; ++c) color[c] = load(colors + c * kLanes);
   } else {
     evaluate_sh(scene.sh_degree, colors, d_W.x, d_W.y, d_W.z, color);

@@ -98,6 +98,30 @@ SP_INLINE F16 largest_component(const Vector16& a) {
   return max(max(max(a.x, -a.x), max(a.y, -a.y)), max(a.z, -a.z));
 }
 
+// Lanes of which some surface may lie within the camera's depth: of a Gaussian with centre at depth
+// z and variance along the optical axis, the plane of the median depth comes no nearer than z^2 /
+// (z + kMaxExtent sigma) where alpha is above the cut. Boxes of Gaussians are judged with some
+// `slack`.
+SP_INLINE Mask16 within_max_depth(const Camera& camera, const F16& z, const F16& sigma,
+                                  float slack = 1.0f) {
+  return z * z <= F16(slack * camera.max_depth) * (z + F16(kMaxExtent) * sigma);
+}
+
+SP_INLINE F16 norm(const Vector16& a) { return sqrt(a.x * a.x + (a.y * a.y + a.z * a.z)); }
+
+// Makes the planes of lanes outside the mask let all light through: NaN is above no cut.
+SP_INLINE void hide_unless(const Mask16& shown, PlanePack& plane) {
+  plane.ux = select(shown, plane.ux, F16(__builtin_nanf("")));
+}
+
+// Lanes whose interval mean -+ extent holds the centre of a pixel.
+SP_INLINE Mask16 hold_centre(const F16& mean, const F16& extent) {
+  // The nearest integer: adding 1.5 * 2^23 rounds. Means beyond have no fraction to lose.
+  const F16 corner = mean - F16(0.5f);
+  const F16 away = corner - ((corner + F16(12582912.0f)) - F16(12582912.0f));
+  return (away <= extent) & (-away <= extent);
+}
+
 // Finishes the projection from P (2x3), where P P^T is the 2D covariance before blurring. Working
 // from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
 // of large entries. Returns the lanes that are visible.
@@ -155,6 +179,10 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
   visible = visible & (out.mean_x + out.extent_x > F16(0.0f)) &
             (out.mean_x - out.extent_x < width) & (out.mean_y + out.extent_y > F16(0.0f)) &
             (out.mean_y - out.extent_y < height);
+  if (camera.depth_alone) {
+    visible =
+        visible & hold_centre(out.mean_x, out.extent_x) & hold_centre(out.mean_y, out.extent_y);
+  }
   // An overflow somewhere leaves an infinity or a NaN in one of these.
   const F16 finite = (out.ux + out.vy) * F16(0.0f) + out.uy * F16(0.0f);
   return visible & (finite >= F16(0.0f));
@@ -211,9 +239,8 @@ SP_INLINE void append_planes(const PlanePack& p, uint32_t bits, DepthPlane* plan
   for (int f = 0; f < 6; ++f) store(fields[f], *packs[f]);
   for (; bits; bits &= bits - 1, ++planes) {
     const int lane = __builtin_ctz(bits);
-    float row[8] = {};
-    for (int f = 0; f < 6; ++f) row[f] = fields[f][lane];
-    std::memcpy(planes, row, sizeof(DepthPlane));
+    *planes = {fields[0][lane], fields[1][lane], fields[2][lane],
+               fields[3][lane], fields[4][lane], fields[5][lane]};
   }
 }
 
@@ -228,11 +255,11 @@ SP_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t 
   size_t count = 0;
   for (; bits; bits &= bits - 1) {
     const int lane = __builtin_ctz(bits);
-    alignas(64) float row[kLanes] = {};
+    // Field by field: a whole row would wait for its parts.
+    float* row = reinterpret_cast<float*>(splats + count);
     for (int f = 0; f < 14; ++f) row[f] = fields[f][lane];
-    std::memcpy(row + 14, indices + lane, sizeof(uint32_t));
-    std::memcpy(splats + count, row, sizeof(Splat));
-    std::memcpy(depth_bits + count, row + 11, sizeof(uint32_t));
+    splats[count].index = indices[lane];
+    std::memcpy(depth_bits + count, fields[11] + lane, sizeof(uint32_t));
     ++count;
   }
   return count;

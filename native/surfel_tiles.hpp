@@ -16,7 +16,7 @@ SP_INLINE uint32_t blocks_of_disc(const Disc& disc, const BlockGrid& grid, float
   return lane_bits(x * x + y * y <= F16(disc.radius * disc.radius));
 }
 
-SP_INLINE TileRange united(const TileRange& a, const TileRange& b) {
+SP_INLINE PixelRange united(const PixelRange& a, const PixelRange& b) {
   return {a.first < b.first ? a.first : b.first, a.last > b.last ? a.last : b.last};
 }
 
@@ -27,13 +27,13 @@ struct SurfelFootprint {
     const Disc d = disc_of(s);
     return {d.x, d.y, d.radius * 1.0001f + 1e-3f};
   }
-  static SP_INLINE TileRange columns(const Splat& s, int tiles) {
+  static SP_INLINE PixelRange columns(const Splat& s, int tiles) {
     const Disc d = disc(s);
-    return united(SplatFootprint::columns(s, tiles), tile_range(d.x, d.radius, tiles));
+    return united(SplatFootprint::columns(s, tiles), pixel_range(d.x, d.radius, tiles));
   }
-  static SP_INLINE TileRange rows(const Splat& s, int tiles) {
+  static SP_INLINE PixelRange rows(const Splat& s, int tiles) {
     const Disc d = disc(s);
-    return united(SplatFootprint::rows(s, tiles), tile_range(d.y, d.radius, tiles));
+    return united(SplatFootprint::rows(s, tiles), pixel_range(d.y, d.radius, tiles));
   }
   static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
     return SplatFootprint::blocks(s, grid, left, top) | blocks_of_disc(disc(s), grid, left, top);

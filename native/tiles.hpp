@@ -6,19 +6,20 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-// Tiles [first, last] along one axis that meet the interval mean -+ extent.
-struct TileRange {
+// Pixels [first, last] along one axis whose centres lie within mean -+ extent; none if last <
+// first.
+struct PixelRange {
   int first, last;
 };
 
-SP_INLINE TileRange tile_range(float mean, float extent, int tiles) {
+SP_INLINE PixelRange pixel_range(float mean, float extent, int tiles) {
   // Pixel i has its centre at i + 1/2. Clamped as floats: extents may exceed any integer.
-  const float low = (mean - extent - 0.5f) * (1.0f / kTileSize);
-  const float high = (mean + extent - 0.5f) * (1.0f / kTileSize);
-  const float limit = static_cast<float>(tiles);
-  const float first = low > 0.0f ? (low < limit ? low : limit) : 0.0f;
-  const float last = high < limit ? high : limit - 0.5f;
-  return {static_cast<int>(first), last < 0.0f ? -1 : static_cast<int>(last)};
+  const float low = mean - extent - 0.5f, high = mean + extent - 0.5f;
+  const float limit = static_cast<float>(tiles * kTileSize);
+  const float begin = low > 0.0f ? (low < limit ? low : limit) : 0.0f;
+  const float end = high < limit ? high : limit - 0.5f;
+  const int whole = static_cast<int>(begin);
+  return {whole + (static_cast<float>(whole) < begin), end < 0.0f ? -1 : static_cast<int>(end)};
 }
 
 // The 16 blocks of a tile: pixel centres of block b span [left, left + 3] x [top, top + 3].
@@ -53,16 +54,16 @@ SP_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float t
   return lane_bits(min(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2) <= F16(budget));
 }
 
-// Which tiles to look at, and which blocks of one of them a splat touches.
+// Which pixels a splat lies in, and which blocks of a tile it touches; of both a little more, so
+// that rounding here never hides a pixel.
 struct SplatFootprint {
-  static SP_INLINE TileRange columns(const Splat& s, int tiles) {
-    return tile_range(s.mean_x, s.extent_x, tiles);
+  static SP_INLINE PixelRange columns(const Splat& s, int tiles) {
+    return pixel_range(s.mean_x, s.extent_x * 1.0001f + 1e-3f, tiles);
   }
-  static SP_INLINE TileRange rows(const Splat& s, int tiles) {
-    return tile_range(s.mean_y, s.extent_y, tiles);
+  static SP_INLINE PixelRange rows(const Splat& s, int tiles) {
+    return pixel_range(s.mean_y, s.extent_y * 1.0001f + 1e-3f, tiles);
   }
   static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
-    // A little more than log2(255 o), so that rounding here never hides a pixel.
     const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
     return touched_blocks(s, grid, left, top, budget);
   }
@@ -79,13 +80,16 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
   for (; i < end; ++i) {
     if (i + kPrefetchAhead < end) __builtin_prefetch(splats + order[i + kPrefetchAhead]);
     const Splat& s = splats[order[i]];
-    const TileRange columns = Footprint::columns(s, tiles_x), rows = Footprint::rows(s, tiles_y);
+    const PixelRange columns = Footprint::columns(s, tiles_x);
+    const PixelRange rows = Footprint::rows(s, tiles_y);
     if (columns.last < columns.first || rows.last < rows.first) continue;
-    const size_t most = static_cast<size_t>(columns.last - columns.first + 1) *
-                        static_cast<size_t>(rows.last - rows.first + 1);
+    const int first_column = columns.first / kTileSize, last_column = columns.last / kTileSize;
+    const int first_row = rows.first / kTileSize, last_row = rows.last / kTileSize;
+    const size_t most = static_cast<size_t>(last_column - first_column + 1) *
+                        static_cast<size_t>(last_row - first_row + 1);
     if (count + most > capacity) break;
-    for (int row = rows.first; row <= rows.last; ++row) {
-      for (int column = columns.first; column <= columns.last; ++column) {
+    for (int row = first_row; row <= last_row; ++row) {
+      for (int column = first_column; column <= last_column; ++column) {
         const uint32_t blocks = Footprint::blocks(s, grid, static_cast<float>(column * kTileSize),
                                                   static_cast<float>(row * kTileSize));
         const uint32_t tile = static_cast<uint32_t>(row * tiles_x + column);

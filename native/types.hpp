@@ -20,6 +20,9 @@ constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
+// Where there is no colour, what is left of the blur [px^2]: so little that it hides no pixel from
+// a footprint without any, and enough that needles are found in float32.
+constexpr float kDepthBlur = 0.0025f;
 // How far the inverse depth of a Gaussian may fall towards its rim, of that of its centre.
 constexpr float kMostFall = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.
@@ -44,6 +47,8 @@ struct Camera {
   float near_plane, far_plane;  // [m]
   float radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;             // opacities fall as the blur spreads small Gaussians
+  float max_depth;              // [m]; what lies beyond has no part in the median depth
+  bool depth_alone;             // Gaussians that hold no pixel's centre are left out, and colours
   float R_CW[9];                // row-major
   // The centre in two parts, so that p_W - centre keeps its digits far from the world's origin.
   float centre_high[3], centre_low[3];

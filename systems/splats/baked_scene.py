@@ -101,6 +101,7 @@ class BakedScene:
         background: "ArrayLike" = (0.0, 0.0, 0.0),
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
+        max_depth: float = np.inf,
     ) -> RenderedView:
         """Renders colour, median depth and alpha.
 
@@ -116,6 +117,8 @@ class BakedScene:
             moving: Gaussians among those of the scene, in this image alone; trusted to be valid.
             distortion: of the lens; None for a pinhole. What it does not show is black,
                 of alpha and depth 0.
+            max_depth: Gaussians of which no surface may lie so near [m] have no part in the depth:
+                what an image of depth does not show hides nothing that it shows.
 
         Raises:
             ValueError: intrinsics, image size, depth range or background make no sense.
@@ -132,10 +135,12 @@ class BakedScene:
             self._renderer,
             **_among(moving),
             **camera,
+            eps2d=EPS2D,
             background=background,
             color=color,
             depth=depth,
             alpha=alpha,
+            max_depth=_positive(max_depth),
         )
         _hide((color, depth, alpha), distortion, camera)
         return RenderedView(color, depth[..., 0], alpha[..., 0])
@@ -154,14 +159,11 @@ class BakedScene:
     ) -> "NDArray[np.float32]":
         """Renders the median depth of `render` alone, (H, W) [m], in a fraction of its time.
 
-        Up to `max_depth` [m] it has the same bits; what `render` shows farther away is farther
-        away here too, or 0. The other arguments are those of `render`.
+        The arguments are those of `render`, and so are the bits.
 
         Raises:
             ValueError: intrinsics, image size or depth range make no sense.
         """
-        if not max_depth > 0:
-            raise ValueError(f"max_depth is {max_depth:g} m; it must be positive")
         camera = _camera(K, width, height, X_WC, near, far, distortion)
         depth = np.empty((height, width, 1), dtype=np.float32)
         _native.render_baked_depth(
@@ -169,7 +171,7 @@ class BakedScene:
             self._renderer,
             **_among(moving),
             **camera,
-            max_depth=max_depth,
+            max_depth=_positive(max_depth),
             depth=depth,
         )
         _hide((depth,), distortion, camera)
@@ -194,9 +196,14 @@ def _camera(
         "height": height,
         "near_plane": near,
         "far_plane": far,
-        "eps2d": EPS2D,
         **native_lens(distortion, K, width, height)._asdict(),
     }
+
+
+def _positive(max_depth: float) -> float:
+    if not max_depth > 0:
+        raise ValueError(f"max_depth is {max_depth:g} m; it must be positive")
+    return max_depth
 
 
 def _among(moving: PlacedGaussians) -> dict[str, Any]:

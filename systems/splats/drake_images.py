@@ -27,15 +27,19 @@ def render_view(
     background: Background = BLACK,
     moving: PlacedGaussians = NO_GAUSSIANS,
     distortion: Distortion | None = None,
+    max_depth: float = np.inf,
 ) -> RenderedView:
     """What a camera of intrinsics K [px] at X_WC sees, through a lens; see `BakedScene.render`.
 
     Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so its
     intrinsics are taken as they are.
     """
-    if not isinstance(background, EnvironmentMap):
-        return scene.render(K, width, height, X_WC, near, far, background, moving, distortion)
-    view = scene.render(K, width, height, X_WC, near, far, moving=moving, distortion=distortion)
+    flat = not isinstance(background, EnvironmentMap)
+    color = background if flat else BLACK
+    camera = (K, width, height, X_WC, near, far)
+    view = scene.render(*camera, color, moving, distortion, max_depth)
+    if flat:
+        return view
     return put_behind(view, background, K, X_WC, distortion)
 
 

@@ -215,6 +215,7 @@ class SplatCamera(LeafSystem):
                 background=self._background,
                 moving=rows.moving,
                 distortion=self._distortion,
+                max_depth=self._depth_range[1],
             )
             for rows in self._bands(X_WB, time, X_WB_start)
         ]

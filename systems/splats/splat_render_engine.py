@@ -209,7 +209,7 @@ class SplatRenderEngine(RenderEngine):
     def DoRenderDepthImage(self, camera: DepthRenderCamera, depth_image_out: ImageDepth32F) -> None:
         depth_range = camera.depth_range()
         shapes = np.asarray(self._shapes().RenderDepthImage(*self._same(camera)).data)[..., 0]
-        splats = self._depth(camera.core(), depth_range.max_depth())
+        splats = self._depth(camera.core())
         splats = ranged_depth(splats, depth_range.min_depth(), depth_range.max_depth())
         np.asarray(depth_image_out.mutable_data)[..., 0] = np.minimum(shapes, splats)
 
@@ -240,14 +240,13 @@ class SplatRenderEngine(RenderEngine):
             self._last_view = key, view
         return self._last_view[1]
 
-    def _depth(self, core: RenderCameraCore, max_depth: float) -> NDArray[np.float32]:
-        """Up to `max_depth` that of `_view`, which is not made for it  # (H, W) [m]."""
+    def _depth(self, core: RenderCameraCore) -> NDArray[np.float32]:
+        """That of `_view`, which is not made for it  # (H, W) [m]."""
         if self._last_view is not None and self._last_view[0] == self._key(core):
             return self._last_view[1].depth
         info, clipping = core.intrinsics(), core.clipping()
         K, size = info.intrinsic_matrix(), (info.width(), info.height())
-        near, far = clipping.near(), clipping.far()
-        return self._scene.render_depth(K, *size, self._X_WC, near, far, max_depth)
+        return self._scene.render_depth(K, *size, self._X_WC, clipping.near(), clipping.far())
 
     def _key(self, core: RenderCameraCore) -> bytes:
         """The camera and where it is."""
