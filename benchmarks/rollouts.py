@@ -3,9 +3,10 @@
     python benchmarks/rollouts.py [--flights 8]
 
 Prints the real-time factor of flights through the default forest: without images (the planner),
-with depth images alone (the reactive policy), and with colour and depth at 320x240 and 15 Hz. Then
-the rollouts per minute of one and of two worker processes, on the same flights. Run it on an idle
-machine: factors are of wall time, the best of three; CPU time is given beside them.
+with depth images alone (the reactive policy, and DiffAero in P02), and with colour and depth at
+320x240 and 15 Hz. Then the rollouts per minute of one and of two worker processes, on the same
+flights. Run it on an idle machine: factors are of wall time, the best of three; CPU time is given
+beside them.
 """
 
 import argparse
@@ -18,21 +19,24 @@ from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.scenario_files import scenario_file
 from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.configuration import load_config
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def time_policies(repeats: int = 3) -> None:
     """Prints a line for each kind of flight."""
-    scenario = Scenario(seed=10)
-    world = make_world(scenario.world, scenario.seed)
-    print(f"{'flight':<34}{'x real time':>12}{'of CPU time':>12}")
-    for name, policy, video in (
-        ("planner, no images", "planner", False),
-        ("reactive, depth 64x36 at 15 Hz", "reactive", False),
-        ("planner, colour 320x240 at 15 Hz", "planner", True),
+    forest, p02 = Scenario(seed=10), load_config(Scenario(), scenario_file("P02"))
+    print(f"{'flight':<40}{'x real time':>12}{'of CPU time':>12}")
+    for name, scenario, policy, video in (
+        ("planner, no images", forest, "planner", False),
+        ("reactive, depth 64x36 at 15 Hz", forest, "reactive", False),
+        ("diffaero in P02, depth 64x36 at 15 Hz", p02, "diffaero", False),
+        ("planner, colour 320x240 at 15 Hz", forest, "planner", True),
     ):
+        world = make_world(scenario.world, scenario.seed)
         scenario.policy = policy_named(policy)
         diagram = BuildFlightDiagram(scenario, world, camera=video, video=video)
         wall, cpu = [], []
@@ -41,7 +45,7 @@ def time_policies(repeats: int = 3) -> None:
             flight = fly(diagram, scenario, world)
             cpu.append(flight.times[-1] / (time.process_time() - started))
             wall.append(flight.times[-1] / flight.wall_time)
-        print(f"{name:<34}{max(wall):>12.1f}{max(cpu):>12.1f}")
+        print(f"{name:<40}{max(wall):>12.1f}{max(cpu):>12.1f}")
 
 
 def time_workers(count: int) -> None:
@@ -64,5 +68,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--flights", type=int, default=8, help="for the workers (%(default)s)")
     options = parser.parse_args()
+    if options.flights < 3:
+        parser.error(f"--flights is {options.flights}; two workers need at least 3")
     time_policies()
     time_workers(options.flights)
