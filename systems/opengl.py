@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
+from importlib import import_module
 
 _PROBE = """
 from pydrake.geometry import *
@@ -15,10 +17,19 @@ MakeRenderEngineVtk(RenderEngineVtkParams()).RenderColorImage(
 """
 
 
+def load_triton() -> None:
+    """Loads Triton, where it is installed, before OpenGL brings Mesa's LLVM for the whole process
+    to see: Triton, which torch's optimisers load, has an LLVM of its own, and would take Mesa's
+    functions for it and end the process.
+    """
+    with suppress(ImportError):
+        import_module("triton")
+
+
 @cache
 def require_opengl() -> None:
-    """Checks that RenderEngineVtk can render; a library that is missing may end the process, so
-    another process tries.
+    """Checks that RenderEngineVtk can render, and sees to it that torch still can be used when it
+    has (see `load_triton`). A library that is missing may end the process, so another one tries.
 
     Raises:
         OSError: if it cannot; the message says what to install.
@@ -30,3 +41,4 @@ def require_opengl() -> None:
             f"RenderEngineVtk cannot render here ({reason}); on Debian, apt install libegl1 "
             "libegl-mesa0 libgl1-mesa-dri libglib2.0-0 libx11-6 libsm6"
         )
+    load_triton()

@@ -28,6 +28,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
+from splatpilot.systems.opengl import load_triton
 from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, pixel_rays
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.drake_images import (
@@ -100,6 +101,7 @@ class SplatRenderEngine(RenderEngine):
             color = np.asarray(background)
         if color.shape != (3,) or not np.all((color >= 0) & (color <= 1)):
             raise ValueError(f"background is {background}; it must be three numbers in [0, 1]")
+        load_triton()
         if shapes is None:
             shapes = MakeRenderEngineVtk(
                 RenderEngineVtkParams(default_clear_color=color, lights=_LIGHTS)

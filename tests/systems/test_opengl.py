@@ -1,8 +1,39 @@
 """Whether Drake's OpenGL renderer works."""
 
+import subprocess
+import sys
+
 import pytest
 
 from splatpilot.systems.opengl import require_opengl
+
+CAMERA = """
+from pydrake.geometry import *
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+core = RenderCameraCore("", CameraInfo(8, 8, 1.0), ClippingRange(0.1, 1), RigidTransform())
+camera = ColorRenderCamera(core)
+"""
+MESHES = """
+from splatpilot.systems.opengl import require_opengl
+require_opengl()
+engine = MakeRenderEngineVtk(RenderEngineVtkParams())
+"""
+SPLATS = """
+import numpy as np
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
+rows = [np.ones(shape, np.float32) for shape in ((1, 3), (1, 4), (1, 3), (1,), (1, 1, 3))]
+engine = SplatRenderEngine(BakedScene(GaussianScene(*rows)))
+"""
+TRAINING = """
+engine.RenderColorImage(camera, ImageRgba8U(8, 8))
+import torch
+weights = torch.nn.Parameter(torch.zeros(2))
+weights.sum().backward()
+torch.optim.Adam([weights]).step()
+"""
 
 
 def test_missing_driver_is_an_error_that_says_what_to_install(opengl, monkeypatch):
@@ -15,3 +46,12 @@ def test_missing_driver_is_an_error_that_says_what_to_install(opengl, monkeypatc
             require_opengl()
     finally:
         require_opengl.cache_clear()
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("engine", [MESHES, SPLATS])
+def test_torch_trains_after_a_picture(engine):
+    """Mesa's LLVM does not get into the way of the one that torch's optimisers load."""
+    program = CAMERA + engine + TRAINING
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
