@@ -98,10 +98,11 @@ SP_INLINE F16 largest_component(const Vector16& a) {
   return max(max(max(a.x, -a.x), max(a.y, -a.y)), max(a.z, -a.z));
 }
 
-// Lanes of which some surface may lie within the camera's depth: of a Gaussian with centre at depth
-// z and variance along the optical axis, the plane of the median depth comes no nearer than z^2 /
-// (z + kMaxExtent sigma) where alpha is above the cut. Boxes of Gaussians are judged with some
-// `slack`.
+// Lanes that may show a surface within the camera's max_depth. Of a Gaussian whose centre is at depth
+// z, and whose deviation along the optical axis is sigma, the plane of the median depth comes no
+// nearer than z^2 / (z + kMaxExtent sigma) where alpha is above the cut: towards its rim the inverse
+// depth rises by kMaxExtent sqrt(w^T S w), w being the plane's (w_x, w_y) and S the covariance on
+// the image, which is at most kMaxExtent sigma / z^2. Boxes of Gaussians are judged with `slack`.
 SP_INLINE Mask16 within_max_depth(const Camera& camera, const F16& z, const F16& sigma,
                                   float slack = 1.0f) {
   return z * z <= F16(slack * camera.max_depth) * (z + F16(kMaxExtent) * sigma);
