@@ -2,7 +2,7 @@
 // the candidates into packs and projects them.
 #pragma once
 
-#include "projection.hpp"
+#include "depth_planes.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 

@@ -2,7 +2,7 @@
 // is read straight as packs.
 #pragma once
 
-#include "projection.hpp"
+#include "depth_planes.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
