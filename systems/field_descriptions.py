@@ -64,8 +64,12 @@ def is_configuration(value: Any) -> bool:
 
 @functools.cache
 def _texts(config: type) -> dict[str, str]:
-    """What the source of one class says of the fields that it defines."""
-    lines = textwrap.dedent(inspect.getsource(config)).splitlines()
+    """What the source of one class says of the fields that it defines: nothing where there is no
+    source, of classes from a session or a package without it."""
+    try:
+        lines = textwrap.dedent(inspect.getsource(config)).splitlines()
+    except (OSError, TypeError):
+        return {}
     (definition,) = ast.parse("\n".join(lines)).body
     assert isinstance(definition, ast.ClassDef)
     texts = {}

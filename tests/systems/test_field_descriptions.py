@@ -86,6 +86,15 @@ def test_drakes_own_are_described_by_drake():
     assert texts["X_PB"].startswith("The pose of the body camera relative to a parent frame P.")
 
 
+def test_a_class_without_source_has_bare_fields():
+    """What was typed into a session has fields that nobody describes, after those of its base."""
+    names = {"dataclass": dataclass, "Car": Car, "__name__": "a_session"}
+    exec("@dataclass\nclass Taxi(Car):\n    fare: float = 2.0", names)
+    fields = {field.name: field for field in describe_fields(names["Taxi"]())}
+    assert (fields["fare"].value, fields["fare"].text) == (2.0, "")
+    assert fields["mass"].text == "[kg] Of the car."
+
+
 @pytest.mark.parametrize("value", [1, "text", None, [1.0], {}])
 def test_plain_values_have_no_fields(value):
     """Only configurations have fields."""
