@@ -203,9 +203,9 @@ class SplatCamera(LeafSystem):
     def render(
         self, X_WB: RigidTransform, time: float = 0.0, X_WB_start: RigidTransform | None = None
     ) -> RenderedView:
-        """The view from body pose X_WB at a time [s]: float colour, depth and alpha, before they
-        become Drake images. Where X_WB_start is given, the first row is read there, `readout`
-        before.
+        """The view from body pose X_WB at a time [s]: float colour, depth up to the camera's
+        `max_depth`, and alpha, before they become Drake images. Where X_WB_start is given, the
+        first row is read there, `readout` before.
         """
         views = [
             render_view(
