@@ -131,6 +131,23 @@ def test_needles_seen_edge_on_have_the_same_depth_alone(simd):
 
 
 @pytest.mark.parametrize("simd", LEVELS)
+def test_a_disc_seen_exactly_edge_on_has_depth_alone(simd):
+    """Without any blur it has no area; the pixels along it show it where its centre is."""
+    disc = GaussianScene(
+        means=np.array([[0.0, 0.0, 2.0]], np.float32),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
+        scales=np.array([[1e-30, 0.3, 0.3]], np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+    )
+    through_centres = np.array([[70.0, 0, 41.5], [0, 75.0, 30.5], [0, 0, 1]])
+    camera = (through_centres, WIDTH, HEIGHT, RigidTransform())
+    depth = BakedScene(disc, simd=simd).render_depth(*camera)
+    assert depth[30, 41] == pytest.approx(2.0)
+    np.testing.assert_array_equal(np.unique(np.nonzero(depth)[1]), [41])
+
+
+@pytest.mark.parametrize("simd", LEVELS)
 def test_what_is_too_far_hides_nothing(simd):
     """A wall at 6 m comes before the floor whose centre is at 6.5 m, though here the floor is seen
     at 5.45 m. In an image of up to 5.6 m the floor is alone."""
