@@ -5,6 +5,10 @@
 
 namespace splatpilot {
 
+// Where there is no colour, what is left of the blur [px^2]: so little that it hides no pixel from
+// a footprint without any, and enough that needles are found in float32.
+constexpr float kDepthBlur = 1e-4f;
+
 struct CameraParameters {
   int width, height;
   double K[9];                   // row-major, [px]; skew is ignored

@@ -20,9 +20,6 @@ constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
-// Where there is no colour, what is left of the blur [px^2]: so little that it hides no pixel from
-// a footprint without any, and enough that needles are found in float32.
-constexpr float kDepthBlur = 1e-4f;
 // How far the inverse depth of a Gaussian may fall towards its rim, of that of its centre.
 constexpr float kMostFall = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.

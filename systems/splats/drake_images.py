@@ -34,12 +34,10 @@ def render_view(
     Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so its
     intrinsics are taken as they are.
     """
-    flat = not isinstance(background, EnvironmentMap)
-    color = background if flat else BLACK
     camera = (K, width, height, X_WC, near, far)
-    view = scene.render(*camera, color, moving, distortion, max_depth)
-    if flat:
-        return view
+    if not isinstance(background, EnvironmentMap):
+        return scene.render(*camera, background, moving, distortion, max_depth)
+    view = scene.render(*camera, BLACK, moving, distortion, max_depth)
     return put_behind(view, background, K, X_WC, distortion)
 
 
