@@ -27,10 +27,10 @@ from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.metric_scale import camera_height
+from splatpilot.training.captures.shrink_frame import shrink_factor
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import start_and_goal
 from splatpilot.training.reconstruction.scene_distance_field import render_depth_of
-from splatpilot.training.reconstruction.views import shrink_factor
 
 
 @dataclass(frozen=True)

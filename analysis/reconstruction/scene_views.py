@@ -15,10 +15,10 @@ from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.captures.capture_of_scene import read_capture_of
+from splatpilot.training.captures.shrink_frame import shrink, shrink_factor
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.measures import SceneRenderer, ViewMeasures, measure_view
 from splatpilot.training.reconstruction.overlap import ThinnedFrame, seen_pixels
-from splatpilot.training.reconstruction.views import shrink, shrink_factor
 
 
 class SceneViews:

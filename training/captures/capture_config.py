@@ -79,14 +79,17 @@ class CaptureConfig:
     """Where metres come from when images alone were registered."""
     topics: list[str] = field(default_factory=list)
     """Topics of a ROS bag that has several of a kind: of colour, depth and poses, in this order."""
+    refine_poses: bool = False
+    """Moves poses to where depth and brightness of all frames agree, which mends the drift of
+    trackers: of phones, of odometry; exact poses are best left as they are."""
     partners: int = 0
     """With how many others a photograph is compared: half of them next to it by name, half those
     that look most alike; 0: with all, of more than 60 photographs with 20."""
     video_rate: float = 2.0
     """[Hz] Of each so long part of a video the sharpest frame is taken."""
     cache: str = ""
-    """Folder that keeps the registration of photographs, which takes minutes; empty: a folder
-    of their own in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`."""
+    """Folder that keeps the registration of photographs and refined poses, which take minutes;
+    empty: a folder of their own in the user's cache, `$XDG_CACHE_HOME` or `~/.cache`."""
 
     def validate(self) -> None:
         """Raises ValueError for values that make no sense."""

@@ -131,7 +131,8 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
         mistake = (
             f"the median error of depth between frames is {agreement.error:.1%}, at most "
             f"{TOLERANCE:.0%} is needed, and no known mistake explains it (the best, {best.name}, "
-            f"leaves {best.error:.1%}); poses may be inaccurate or things may have moved"
+            f"leaves {best.error:.1%}); poses may be inaccurate, which capture.refine_poses may "
+            "mend, or things may have moved"
         )
     else:
         color = fit_color_camera(capture, [pair.frames for pair in found])

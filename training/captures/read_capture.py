@@ -12,6 +12,7 @@ from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstud
 from splatpilot.training.captures.photographs import photographs_in, read_photographs
 from splatpilot.training.captures.polycam import is_polycam, read_polycam
 from splatpilot.training.captures.record3d import is_record3d, read_record3d
+from splatpilot.training.captures.refined_capture import refined_capture
 from splatpilot.training.captures.rosbag import is_rosbag, read_rosbag
 from splatpilot.training.captures.scannet import is_scannet, read_scannet
 from splatpilot.training.captures.seven_scenes import is_seven_scenes, read_seven_scenes
@@ -130,7 +131,7 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     Raises:
         FileNotFoundError: if there is nothing there.
         ValueError: if it is no capture of a known kind, or a damaged one, or `config` makes
-            no sense.
+            no sense, or its poses are to be refined and cannot be.
     """
     path = Path(path)
     if not path.exists():
@@ -140,7 +141,10 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
         said = replace(said, cache=str(Path(said.cache).absolute()))
     config = complete_config(path, said)
     kind = CAPTURES.find(config.kind) if config.kind else _recognize(path)
-    return replace(kind.read(path, config), folder=str(path.absolute()), config=said)
+    capture = kind.read(path, config)
+    if config.refine_poses:
+        capture = refined_capture(capture, path, config)
+    return replace(capture, folder=str(path.absolute()), config=said)
 
 
 def _recognize(path: Path) -> CaptureKind:

@@ -16,6 +16,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.shrink_frame import shrink_factor
 from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_same_run
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.environment import learn_background
@@ -34,11 +35,7 @@ from splatpilot.training.reconstruction.scene_distance_field import (
     FieldDifference,
     make_distance_field,
 )
-from splatpilot.training.reconstruction.views import (
-    ReconstructionViews,
-    ShrunkFrames,
-    shrink_factor,
-)
+from splatpilot.training.reconstruction.views import ReconstructionViews, ShrunkFrames
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.views import shrink, shrink_factor
+from splatpilot.training.captures.shrink_frame import shrink, shrink_factor
 
 
 def frame_of(depth: np.ndarray) -> CaptureFrame:

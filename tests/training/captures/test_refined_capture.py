@@ -1,0 +1,91 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from splatpilot.training.captures import refined_capture as module
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.read_capture import read_capture
+
+K = np.array([[300.0, 0, 160.0], [0, 300.0, 120.0], [0, 0, 1]])
+
+
+@pytest.fixture
+def folder(tmp_path, room_views, room_poses) -> Path:
+    """The room as a folder of the 7-Scenes kind, whose poses are off by a centimetre and more
+    along its length."""
+    path = tmp_path / "capture"
+    path.mkdir()
+    for i, view in enumerate(room_views(K, 320, 240, finer=8.0)):
+        stem = path / f"frame-{i:06d}"
+        cv2.imwrite(f"{stem}.color.png", view.image[..., ::-1])
+        cv2.imwrite(f"{stem}.depth.png", np.round(1000 * view.depth).astype(np.uint16))
+        off = RigidTransform([0.01 * np.sin(2 * i), 0, 0])
+        np.savetxt(f"{stem}.pose.txt", (off @ room_poses[i]).GetAsMatrix4())
+    return path
+
+
+@pytest.fixture
+def config(tmp_path) -> CaptureConfig:
+    intrinsics = [300.0, 300.0, 160.0, 120.0]
+    return CaptureConfig(
+        intrinsics=intrinsics,
+        depth_intrinsics=intrinsics,
+        p_DC=[0.0, 0.0, 0.0],
+        up="z",
+        refine_poses=True,
+        cache=str(tmp_path / "cache"),
+    )
+
+
+def test_poses_are_refined_once(folder, config, room_poses, monkeypatch, capfd):
+    """A capture opens with refined poses, which say what they mended, and are found again; a file
+    that has changed makes them anew."""
+    capture = read_capture(folder, config)
+    assert "poses moved by" in capfd.readouterr().err
+    wrong = [
+        np.linalg.norm((X.inverse() @ truth).translation() - (Y.inverse() @ other).translation())
+        for X, truth, Y, other in zip(
+            capture.X_WCs, room_poses, capture.X_WCs[1:], room_poses[1:], strict=False
+        )
+    ]
+    assert np.mean(wrong) < 0.003  # of 0.011
+    assert "refine_poses=true" in capture.config.settings()
+
+    def refused(*_):
+        raise AssertionError("refined again")
+
+    monkeypatch.setattr(module, "refine_poses", refused)
+    again = read_capture(folder, config)
+    for X_WC, same in zip(capture.X_WCs, again.X_WCs, strict=True):
+        assert X_WC.IsExactlyEqualTo(same)
+    assert capfd.readouterr().err == ""
+    (folder / "frame-000003.depth.png").touch()
+    with pytest.raises(AssertionError, match="refined again"):
+        read_capture(folder, config)
+
+
+def test_without_depth(tmp_path, config):
+    """What has no depth cannot be refined so, and no cache is begun."""
+    path = tmp_path / "nerfstudio"
+    path.mkdir()
+    cv2.imwrite(str(path / "0.png"), np.zeros((240, 320, 3), np.uint8))
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
+    camera = {"fl_x": 300, "fl_y": 300, "cx": 160, "cy": 120, "w": 320, "h": 240}
+    (path / "transforms.json").write_text(json.dumps(camera | {"frames": [frame, frame]}))
+    with pytest.raises(ValueError, match=r"nerfstudio: .* compares depth, and"):
+        read_capture(path, CaptureConfig(refine_poses=True, cache=config.cache))
+    assert not Path(config.cache).exists()
+
+
+def test_nothing_in_common(folder, config):
+    """A capture whose frames see nothing of each other is named."""
+    for file in folder.glob("*.pose.txt"):
+        X_WC = np.loadtxt(file)
+        X_WC[:3, 3] *= 100
+        np.savetxt(file, X_WC)
+    with pytest.raises(ValueError, match="capture: no two frames see the same"):
+        read_capture(folder, config)

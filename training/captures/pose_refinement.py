@@ -1,0 +1,185 @@
+"""Poses in which frames agree: all are moved to where depth and brightness fit best.
+
+Poses of trackers drift by centimetres and degrees, those of phones, of KinectFusion and of odometry
+alike, and what is reconstructed from them shows every surface twice. This is direct bundle
+adjustment of RGB-D frames (Kerl, Sturm and Cremers 2013; Schops, Sattler and Pollefeys 2019), by
+Gauss-Newton, of all frames at once.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.sparse import coo_matrix, csc_matrix, eye, kron
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from splatpilot.training.captures.frame_comparison import (
+    REACH,
+    ComparedFrame,
+    Comparison,
+    compare_frames,
+)
+
+_PARTNERS, _OVERLAP, _PROBES = 16, 0.2, 64
+"""With how many others a frame is compared, at most, and what part of so many of its points these
+must see."""
+_REACHES = REACH, 0.06, 0.05, 0.04
+"""Of the first rounds, and of all later ones."""
+_ROUNDS, _SETTLED = 30, 1e-3
+"""At most, and steps [m], [rad] below which it is done."""
+_SPREADS = np.array([0.01, 0.03])
+"""Of residuals in the first round; then as they are found."""
+_INDEPENDENT = 10
+"""What the points of a pair count for together: what one has wrong, its neighbours have too."""
+_DRIFT, _BELIEF = 0.005, 0.1
+"""[m], [rad] Standard deviations of what drifts from one frame to the next, and of poses: what no
+other frame sees, or sees only along stripes, moves as those before and after it do."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """Poses, and how well frames agree in them."""
+
+    X_WCs: list[RigidTransform]
+    moved: float  # [m], mean over frames
+    turned: float  # [rad], mean over frames
+    depth: tuple[float, float]
+    """Median relative difference of depth between frames, before and after."""
+    contrast: tuple[float, float]
+    """Median difference of contrast, before and after."""
+
+    def __str__(self) -> str:
+        turned = np.rad2deg(self.turned)
+        lines = [f"poses moved by {self.moved:.3f} m and {turned:.1f} degrees on average"]
+        for name in ("depth", "contrast"):
+            before, after = getattr(self, name)
+            lines.append(f"{name} differs between frames by {after:.2%}, before by {before:.2%}")
+        return "; ".join(lines)
+
+
+def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform]) -> RefinedPoses:
+    """Returns poses in which frames differ least: of the squares of all residuals, see
+    `Comparison`, over their spreads.
+
+    It mends drift of centimetres and of a degree or two, no lost tracking: nothing is compared
+    where depths differ by more than 8 %. Squares are not bounded further: weights as narrow as the
+    noise of a sensor hold frames where they are.
+
+    Args:
+        frames: in the order in which they were taken.
+        X_WCs: their poses.
+
+    Raises:
+        ValueError: if no two frames see the same.
+    """
+    poses = given = list(X_WCs)
+    pairs = _pairs(frames, poses)
+    spreads = _SPREADS
+    history = []
+    with tqdm(range(_ROUNDS), "refining poses", unit="round") as rounds:
+        for number in rounds:
+            reach = _REACHES[min(number, len(_REACHES) - 1)]
+            compared = [
+                (i, j, found)
+                for i, j in pairs
+                if (found := compare_frames(frames[i], frames[j], poses[i], poses[j], reach))
+            ]
+            if not compared:
+                raise ValueError(
+                    "no two frames see the same surfaces, so poses cannot be refined; look at what "
+                    "`splatpilot capture check` says of them"
+                )
+            differences = [np.median(np.abs(found.residuals), axis=1) for *_, found in compared]
+            history.append(np.median(differences, axis=0))
+            step = _step(compared, _corrections(poses, given), spreads)
+            poses = [_moved(X_WC, by) for X_WC, by in zip(poses, step, strict=True)]
+            # A median of absolute values is that of a normal distribution times 0.6745.
+            spreads = np.maximum(history[-1] / 0.6745, 1e-4)
+            largest = np.abs(step).max()
+            rounds.set_postfix_str(f"largest step {largest:.4f}")
+            if number >= len(_REACHES) and largest < _SETTLED:
+                break
+    turned, moved = np.split(_corrections(poses, given), 2, axis=1)
+    (depth, contrast), (depth_after, contrast_after) = history[0].tolist(), history[-1].tolist()
+    return RefinedPoses(
+        poses,
+        float(np.linalg.norm(moved, axis=1).mean()),
+        float(np.linalg.norm(turned, axis=1).mean()),
+        (depth, depth_after),
+        (contrast, contrast_after),
+    )
+
+
+def _pairs(
+    frames: Sequence[ComparedFrame], X_WCs: Sequence[RigidTransform]
+) -> list[tuple[int, int]]:
+    """Returns each frame with those that it is compared with: of all that see it most of those
+    nearest in the sequence, and ever fewer of those farther off, which keep the whole together."""
+    pairs = []
+    for i in tqdm(range(len(frames)), "comparing", unit="frame"):
+        probes = frames[i].p_CQ[:_PROBES]
+        if len(probes) < _PROBES:
+            continue
+        p_WQ = X_WCs[i].multiply(probes.T)
+        seeing = [
+            j
+            for j in sorted(range(len(frames)), key=lambda j: abs(j - i))
+            if j != i and frames[j].sees(X_WCs[j].inverse().multiply(p_WQ).T)[0].mean() > _OVERLAP
+        ]
+        ranks = np.geomspace(1, max(len(seeing), 1), _PARTNERS).round().astype(int)
+        pairs += [(i, seeing[rank - 1]) for rank in np.unique(ranks) if seeing]
+    return pairs
+
+
+def _step(
+    compared: Sequence[tuple[int, int, Comparison]],
+    corrections: NDArray[np.float64],
+    spreads: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Returns the step (N, 6) of Gauss-Newton from poses that have been corrected by so much."""
+    count = len(corrections)
+    right = np.zeros((count, 6))
+    numbers, blocks = [], []
+    for i, j, found in compared:
+        weight = np.sqrt(_INDEPENDENT / found.residuals.shape[1]) / spreads
+        J = (found.derivatives * weight[:, None, None]).reshape(-1, 12)
+        gradient = J.T @ (found.residuals * weight[:, None]).ravel()
+        right[i] -= gradient[:6]
+        right[j] -= gradient[6:]
+        numbers.append(np.add.outer(6 * np.array([i, j]), np.arange(6)).ravel())
+        blocks.append(J.T @ J)
+    rows = np.array(numbers)
+    H = coo_matrix(
+        (np.ravel(blocks), (rows.repeat(12, axis=1).ravel(), np.tile(rows, 12).ravel())),
+        shape=(6 * count, 6 * count),
+    )
+    change = eye(count - 1, count) - eye(count - 1, count, k=1)
+    believed = change.T @ change / _DRIFT**2 + eye(count) / _BELIEF**2
+    right -= believed @ corrections
+    factors = splu(csc_matrix(H + kron(believed, eye(6))))
+    return factors.solve(right.ravel()).reshape(-1, 6)
+
+
+def _moved(X_WC: RigidTransform, step: NDArray[np.float64]) -> RigidTransform:
+    """Returns a pose turned by step[:3] [rad] about its own centre and moved by step[3:] [m]."""
+    turn = RotationMatrix(Rotation.from_rotvec(step[:3]).as_matrix())
+    R_WC = RotationMatrix.ProjectToRotationMatrix((turn @ X_WC.rotation()).matrix())
+    return RigidTransform(R_WC, X_WC.translation() + step[3:])
+
+
+def _corrections(
+    X_WCs: Sequence[RigidTransform], given: Sequence[RigidTransform]
+) -> NDArray[np.float64]:
+    """Returns by how much each pose is turned [rad] and moved [m] from that given, (N, 6)."""
+    turns = [
+        (X_WC.rotation() @ X_WG.rotation().inverse()).matrix()
+        for X_WC, X_WG in zip(X_WCs, given, strict=True)
+    ]
+    moves = [
+        X_WC.translation() - X_WG.translation() for X_WC, X_WG in zip(X_WCs, given, strict=True)
+    ]
+    return np.concatenate([Rotation.from_matrix(turns).as_rotvec(), moves], axis=1)
