@@ -83,19 +83,19 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
     with tqdm(range(_ROUNDS), "refining poses", unit="round") as rounds:
         for number in rounds:
             reach = _REACHES[min(number, len(_REACHES) - 1)]
-            compared = [
-                (i, j, found)
-                for i, j in pairs
-                if (found := compare_frames(frames[i], frames[j], poses[i], poses[j], reach))
-            ]
-            if not compared:
+            terms, differences = [], []
+            for i, j in pairs:
+                found = compare_frames(frames[i], frames[j], poses[i], poses[j], reach)
+                if found is not None:
+                    terms.append(_Term.of(i, j, found, spreads))
+                    differences.append(np.median(np.abs(found.residuals), axis=1))
+            if not terms:
                 raise ValueError(
                     "no two frames see the same surfaces, so poses cannot be refined; look at what "
                     "`splatpilot capture check` says of them"
                 )
-            differences = [np.median(np.abs(found.residuals), axis=1) for *_, found in compared]
             history.append(np.median(differences, axis=0))
-            step = _step(compared, _corrections(poses, given), spreads)
+            step = _step(terms, _corrections(poses, given))
             poses = [_moved(X_WC, by) for X_WC, by in zip(poses, step, strict=True)]
             # A median of absolute values is that of a normal distribution times 0.6745.
             spreads = np.maximum(history[-1] / 0.6745, 1e-4)
@@ -135,33 +135,36 @@ def _pairs(
     return pairs
 
 
-def _step(
-    compared: Sequence[tuple[int, int, Comparison]],
-    corrections: NDArray[np.float64],
-    spreads: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Returns the step (N, 6) of Gauss-Newton from poses that have been corrected by so much."""
-    count = len(corrections)
-    right = np.zeros((count, 6))
-    numbers, blocks = [], []
-    for i, j, found in compared:
+@dataclass(frozen=True, eq=False)
+class _Term:
+    """What one pair adds to the normal equations of all frames, six unknowns each."""
+
+    unknowns: NDArray[np.intp]  # (12,), their numbers
+    hessian: NDArray[np.float64]  # (12, 12), of Gauss-Newton
+    gradient: NDArray[np.float64]  # (12,)
+
+    @classmethod
+    def of(cls, i: int, j: int, found: Comparison, spreads: NDArray[np.float64]) -> "_Term":
         weight = np.sqrt(_INDEPENDENT / found.residuals.shape[1]) / spreads
         J = (found.derivatives * weight[:, None, None]).reshape(-1, 12)
-        gradient = J.T @ (found.residuals * weight[:, None]).ravel()
-        right[i] -= gradient[:6]
-        right[j] -= gradient[6:]
-        numbers.append(np.add.outer(6 * np.array([i, j]), np.arange(6)).ravel())
-        blocks.append(J.T @ J)
-    rows = np.array(numbers)
-    H = coo_matrix(
-        (np.ravel(blocks), (rows.repeat(12, axis=1).ravel(), np.tile(rows, 12).ravel())),
-        shape=(6 * count, 6 * count),
-    )
+        unknowns = np.add.outer([6 * i, 6 * j], np.arange(6)).ravel()
+        return cls(unknowns, J.T @ J, J.T @ (found.residuals * weight[:, None]).ravel())
+
+
+def _step(terms: Sequence[_Term], corrections: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the step (N, 6) of Gauss-Newton from poses that have been corrected by so much."""
+    count = len(corrections)
+    unknowns = np.array([term.unknowns for term in terms])
+    hessians = np.array([term.hessian for term in terms])
+    rows, columns = unknowns[:, :, None], unknowns[:, None, :]
+    rows, columns = (np.broadcast_to(each, hessians.shape).ravel() for each in (rows, columns))
+    H = coo_matrix((hessians.ravel(), (rows, columns)), shape=(6 * count, 6 * count))
+    gradient = np.zeros(6 * count)
+    np.add.at(gradient, unknowns, np.array([term.gradient for term in terms]))
     change = eye(count - 1, count) - eye(count - 1, count, k=1)
-    believed = change.T @ change / _DRIFT**2 + eye(count) / _BELIEF**2
-    right -= believed @ corrections
-    factors = splu(csc_matrix(H + kron(believed, eye(6))))
-    return factors.solve(right.ravel()).reshape(-1, 6)
+    believed = kron(change.T @ change / _DRIFT**2 + eye(count) / _BELIEF**2, eye(6))
+    step = splu(csc_matrix(H + believed)).solve(-gradient - believed @ corrections.ravel())
+    return step.reshape(-1, 6)
 
 
 def _moved(X_WC: RigidTransform, step: NDArray[np.float64]) -> RigidTransform:
