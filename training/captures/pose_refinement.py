@@ -119,20 +119,29 @@ def _pairs(
 ) -> list[tuple[int, int]]:
     """Returns each frame with those that it is compared with: of all that see it most of those
     nearest in the sequence, and ever fewer of those farther off, which keep the whole together."""
+    X_CWs = np.array([X_WC.inverse().GetAsMatrix34() for X_WC in X_WCs])
     pairs = []
     for i in tqdm(range(len(frames)), "comparing", unit="frame"):
-        probes = frames[i].p_CQ[:_PROBES]
-        if len(probes) < _PROBES:
+        p_WQ = X_WCs[i].multiply(frames[i].p_CQ[:_PROBES].T)
+        if p_WQ.size < 3 * _PROBES:
             continue
-        p_WQ = X_WCs[i].multiply(probes.T)
+        p_CQs = X_CWs[:, :, :3] @ p_WQ + X_CWs[:, :, 3:]  # (N, 3, n)
         seeing = [
             j
-            for j in sorted(range(len(frames)), key=lambda j: abs(j - i))
-            if j != i and frames[j].sees(X_WCs[j].inverse().multiply(p_WQ).T)[0].mean() > _OVERLAP
+            for j in np.flatnonzero(_inside(frames[i], p_CQs).mean(axis=1) > _OVERLAP).tolist()
+            if j != i and frames[j].sees(p_CQs[j].T)[0].mean() > _OVERLAP
         ]
+        seeing.sort(key=lambda j: abs(j - i))
         ranks = np.geomspace(1, max(len(seeing), 1), _PARTNERS).round().astype(int)
         pairs += [(i, seeing[rank - 1]) for rank in np.unique(ranks) if seeing]
     return pairs
+
+
+def _inside(frame: ComparedFrame, p_CQs: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns which points (..., 3, n) in a camera's axes fall into an image of it, (..., n)."""
+    height, width = frame.contrast.shape
+    x, y, z = np.moveaxis(frame.K @ p_CQs, -2, 0)
+    return (z > 0) & (x > 0) & (x < width * z) & (y > 0) & (y < height * z)
 
 
 @dataclass(frozen=True, eq=False)
