@@ -42,6 +42,13 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
         )
     file = cache_folder(config, "poses") / f"poses-{_key(capture, path)}.npy"
     if not file.is_file():
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OSError(
+                f"{file.parent}: cannot be written ({error.strerror}); set capture.cache to a "
+                "folder that can"
+            ) from None
         factor = shrink_factor(capture.width, WIDTH)
         numbers = tqdm(range(len(capture)), "loading", unit="frame")
         frames = [ComparedFrame.of(shrink(capture.frame(i), factor)) for i in numbers]
@@ -50,13 +57,6 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         tqdm.write(f"{path}: {refined}", file=sys.stderr)
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OSError(
-                f"{file.parent}: cannot be written ({error.strerror}); set capture.cache to a "
-                "folder that can"
-            ) from None
         with written_atomically(file) as written, written.open("wb") as stream:
             np.save(stream, np.array([X_WC.GetAsMatrix34() for X_WC in refined.X_WCs]))
     return replace(capture, X_WCs=[_pose(matrix) for matrix in np.load(file)])

@@ -83,6 +83,14 @@ def test_without_depth(tmp_path, config):
     assert not Path(config.cache).exists()
 
 
+def test_no_place_for_the_cache(folder, config, tmp_path, monkeypatch):
+    """A cache that cannot be written is named before anything is refined."""
+    (tmp_path / "cache").touch()
+    monkeypatch.setattr(module, "refine_poses", lambda *_: pytest.fail("refined"))
+    with pytest.raises(OSError, match=r"cache: cannot be written .*; set capture\.cache to a"):
+        read_capture(folder, config)
+
+
 def test_nothing_in_common(folder, config):
     """A capture whose frames see nothing of each other is named."""
     for file in folder.glob("*.pose.txt"):
