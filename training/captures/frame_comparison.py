@@ -35,7 +35,7 @@ class ComparedFrame:
     """(H, W) [1/m]; 0 where it is not known, or not of one surface all around."""
     contrast: NDArray[np.float32]  # (H, W), brightness relative to what is around
     p_CQ: NDArray[np.float64]  # (n, 3) [m], points that it sees
-    contrast_of: NDArray[np.float64]  # (n,), of these
+    point_contrast: NDArray[np.float64]  # (n,), of these
 
     @classmethod
     def of(cls, frame: CaptureFrame) -> "ComparedFrame":
@@ -99,7 +99,7 @@ def compare_frames(
         return None
     p_WQ, q, u, inverse = p_WQ[same], q[same], u[:, same], inverse[:, same]
     contrast = _at(other.contrast, u)
-    residuals = np.array([inverse[0] * q[:, 2] - 1, contrast[0] - one.contrast_of[same]])
+    residuals = np.array([inverse[0] * q[:, 2] - 1, contrast[0] - one.point_contrast[same]])
     # A plane has w = m . ray, so that e = m . q - 1.
     f, c = np.diag(other.K)[:2, None], other.K[:2, 2, None]
     w_x, w_y = inverse[1:] * f

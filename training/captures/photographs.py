@@ -3,8 +3,6 @@
 The registration is kept in a cache under a name made from the photographs, so that it happens once.
 """
 
-import hashlib
-import os
 import shutil
 from pathlib import Path
 
@@ -12,9 +10,10 @@ from PIL import Image
 from tqdm import tqdm
 
 from splatpilot.systems.cores import available_cores
-from splatpilot.systems.files import folder_written_atomically, remove_leftovers
+from splatpilot.systems.files import folder_written_atomically
 from splatpilot.systems.processes import run_apart
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap, read_model
 from splatpilot.training.captures.image_files import IMAGE_SUFFIXES, image_size
@@ -64,7 +63,8 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
         raise ValueError(f"{path}: {len(files)} readable photographs, at least 3 are needed")
     folder = files[0].parent
     names = [file.name for file in files]
-    model = _cache(files, config) / "model"
+    key = cache_key(files, import_pycolmap().__version__, _MAX_SIZE, _SEED, config.partners)
+    model = cache_folder(config, "photographs", key) / "model"
     if not model.is_dir():
         _register(folder, names, one_camera(files), config.partners, model)
     reconstruction = read_model(model)
@@ -84,23 +84,6 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     )
 
 
-def cache_folder(config: CaptureConfig, *parts: str) -> Path:
-    """The folder that a capture keeps what is made of it in: what it names, or in the user's."""
-    if config.cache:
-        return Path(config.cache)
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home, "splatpilot", *parts)
-
-
-def _cache(files: list[Path], config: CaptureConfig) -> Path:
-    version = import_pycolmap().__version__
-    key = hashlib.sha256(f"{version} {_MAX_SIZE} {_SEED} {config.partners}".encode())
-    for file in files:
-        status = file.stat()
-        key.update(f"{file.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
-    return cache_folder(config, "photographs", key.hexdigest()[:16])
-
-
 def one_camera(files: list[Path]) -> bool:
     """Tells whether size, camera model and focal length are the same in all photographs."""
     kinds = set()
@@ -114,14 +97,7 @@ def one_camera(files: list[Path]) -> bool:
 
 def _register(folder: Path, names: list[str], one_camera: bool, partners: int, model: Path) -> None:
     """Registers photographs and writes the largest model that results, whole or not at all."""
-    try:
-        model.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(
-            f"{model.parent}: cannot be written ({error.strerror}); set capture.cache to a folder "
-            "that can"
-        ) from None
-    remove_leftovers(model.parent)
+    prepare_cache(model.parent)
     with folder_written_atomically(model) as written:
         work = folder, names, one_camera, partners, written
         run_apart(f"{model}: registration", _write_model, work)

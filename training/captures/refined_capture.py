@@ -11,9 +11,9 @@ from tqdm import tqdm
 
 from splatpilot.systems.files import written_atomically
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_comparison import WIDTH, ComparedFrame
-from splatpilot.training.captures.photographs import cache_folder
 from splatpilot.training.captures.pose_refinement import refine_poses
 from splatpilot.training.captures.shrink_frame import shrink, shrink_factor
 
@@ -42,13 +42,7 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
         )
     file = cache_folder(config, "poses") / f"poses-{_key(capture, path)}.npy"
     if not file.is_file():
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OSError(
-                f"{file.parent}: cannot be written ({error.strerror}); set capture.cache to a "
-                "folder that can"
-            ) from None
+        prepare_cache(file.parent)
         factor = shrink_factor(capture.width, WIDTH)
         numbers = tqdm(range(len(capture)), "loading", unit="frame")
         frames = [ComparedFrame.of(shrink(capture.frame(i), factor)) for i in numbers]
@@ -67,15 +61,10 @@ def _pose(matrix: np.ndarray) -> RigidTransform:
 
 
 def _key(capture: Capture, path: Path) -> str:
-    """Names a capture by its files, their sizes and times, and by how they were read."""
-    key = hashlib.sha256(f"{_VERSION} {np.__version__}".encode())
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file():
-            status = file.stat()
-            key.update(f"{file.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
-    key.update(capture.K.tobytes())
+    """Names a capture by its files and by how they were read."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    said = [capture.K, *(X_WC.GetAsMatrix34() for X_WC in capture.X_WCs)]
     if capture.depth_camera is not None:
-        key.update(capture.depth_camera.K.tobytes())
-        key.update(capture.depth_camera.X_CD.GetAsMatrix34().tobytes())
-    key.update(np.array([X_WC.GetAsMatrix34() for X_WC in capture.X_WCs]).tobytes())
-    return key.hexdigest()[:16]
+        said += [capture.depth_camera.K, capture.depth_camera.X_CD.GetAsMatrix34()]
+    read = hashlib.sha256(b"".join(each.tobytes() for each in said)).hexdigest()
+    return cache_key((file for file in files if file.is_file()), _VERSION, np.__version__, read)

@@ -9,7 +9,6 @@ root to that frame. Images and poses are written to the cache as a TUM sequence 
 that.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,11 +21,11 @@ from pydrake.math import RigidTransform
 from tqdm import tqdm
 
 from splatpilot.systems.extras import import_extra
-from splatpilot.systems.files import folder_written_atomically, remove_leftovers
+from splatpilot.systems.files import folder_written_atomically
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
-from splatpilot.training.captures.photographs import cache_folder
 from splatpilot.training.captures.poses import pose_from_quaternion
 from splatpilot.training.captures.ros_images import (
     COLORS,
@@ -73,13 +72,9 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
     if path.suffix in {".db3", ".mcap"}:
         raise ValueError(f"{path}: a part of a bag; name its folder, in which {_METADATA} lies")
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    status = [(file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    key = f"{path.resolve()} {config.topics} {status}"
-    digest = hashlib.sha256(key.encode()).hexdigest()[:16]
-    folder = cache_folder(config, "bags", digest) / path.stem
+    folder = cache_folder(config, "bags", cache_key(files, config.topics)) / path.stem
     if not folder.is_dir():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(folder.parent)
+        prepare_cache(folder.parent)
         with folder_written_atomically(folder) as written, _opened(path) as reader:
             _Bag(path, reader, config.topics).write(written)
     camera = json.loads((folder / _CAMERA).read_text())

@@ -1,16 +1,16 @@
 """Videos: of each short interval the sharpest frame, registered as photographs are."""
 
-import hashlib
 from pathlib import Path
 
 import cv2
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from splatpilot.systems.files import folder_written_atomically, remove_leftovers
+from splatpilot.systems.files import folder_written_atomically
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.photographs import cache_folder, read_photographs
+from splatpilot.training.captures.photographs import read_photographs
 
 _SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 _FEWEST = 3
@@ -31,13 +31,9 @@ def read_video(path: Path, config: CaptureConfig) -> Capture:
         ValueError: if it cannot be read or is too short, and see `read_photographs`.
         OSError: if the cache cannot be written.
     """
-    status = path.stat()
-    key = f"{path.resolve()} {status.st_size} {status.st_mtime_ns} {config.video_rate}"
-    digest = hashlib.sha256(key.encode()).hexdigest()[:16]
-    frames = cache_folder(config, "videos", digest) / "frames"
+    frames = cache_folder(config, "videos", cache_key([path], config.video_rate)) / "frames"
     if not frames.is_dir():
-        frames.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(frames.parent)
+        prepare_cache(frames.parent)
         with folder_written_atomically(frames) as written:
             _extract(path, config.video_rate, written)
     return read_photographs(frames, config)
