@@ -197,9 +197,20 @@ SP_INLINE I16 shift_right(const I16& a, int n) {
   return c;
 }
 
+SP_INLINE void store(int32_t* p, const I16& a) {
+  SP_EACH_REGISTER(k) std::memcpy(p + k * kRegisterLanes, &a.r[k], kRegisterBytes);
+}
+
 SP_INLINE F16 to_float(const I16& a) {
   F16 c;
   SP_EACH_REGISTER(k) c.r[k] = __builtin_convertvector(a.r[k], FloatRegister);
+  return c;
+}
+
+// Towards zero.
+SP_INLINE I16 to_int(const F16& a) {
+  I16 c;
+  SP_EACH_REGISTER(k) c.r[k] = __builtin_convertvector(a.r[k], IntRegister);
   return c;
 }
 

@@ -16,8 +16,16 @@ SP_INLINE uint32_t blocks_of_disc(const Disc& disc, const BlockGrid& grid, float
   return lane_bits(x * x + y * y <= F16(disc.radius * disc.radius));
 }
 
-SP_INLINE PixelRange united(const PixelRange& a, const PixelRange& b) {
-  return {a.first < b.first ? a.first : b.first, a.last > b.last ? a.last : b.last};
+// Boxes that hold both.
+SP_INLINE BlockBoxes united(const BlockBoxes& a, const BlockBoxes& b) {
+  BlockBoxes c;
+  for (int lane = 0; lane < kLanes; ++lane) {
+    c.left[lane] = a.left[lane] < b.left[lane] ? a.left[lane] : b.left[lane];
+    c.top[lane] = a.top[lane] < b.top[lane] ? a.top[lane] : b.top[lane];
+    c.right[lane] = a.right[lane] > b.right[lane] ? a.right[lane] : b.right[lane];
+    c.bottom[lane] = a.bottom[lane] > b.bottom[lane] ? a.bottom[lane] : b.bottom[lane];
+  }
+  return c;
 }
 
 // The ellipse's blocks and the disc's.
@@ -27,13 +35,18 @@ struct SurfelFootprint {
     const Disc d = disc_of(s);
     return {d.x, d.y, d.radius * 1.0001f + 1e-3f};
   }
-  static SP_INLINE PixelRange columns(const Splat& s, int tiles) {
-    const Disc d = disc(s);
-    return united(SplatFootprint::columns(s, tiles), pixel_range(d.x, d.radius, tiles));
-  }
-  static SP_INLINE PixelRange rows(const Splat& s, int tiles) {
-    const Disc d = disc(s);
-    return united(SplatFootprint::rows(s, tiles), pixel_range(d.y, d.radius, tiles));
+  static SP_INLINE BlockBoxes boxes(const Splat* const* splats, int tiles_x, int tiles_y) {
+    alignas(64) float fields[3][kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const Disc d = disc(*splats[lane]);
+      const float values[3] = {d.x, d.y, d.radius};
+      for (int f = 0; f < 3; ++f) fields[f][lane] = values[f];
+    }
+    const F16 x = load(fields[0]), y = load(fields[1]), radius = load(fields[2]);
+    BlockBoxes discs;
+    block_range(x - radius, x + radius, tiles_x, discs.left, discs.right);
+    block_range(y - radius, y + radius, tiles_y, discs.top, discs.bottom);
+    return united(SplatFootprint::boxes(splats, tiles_x, tiles_y), discs);
   }
   static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
     return SplatFootprint::blocks(s, grid, left, top) | blocks_of_disc(disc(s), grid, left, top);

@@ -6,20 +6,21 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-// Pixels [first, last] along one axis whose centres lie within mean -+ extent; none if last <
-// first.
-struct PixelRange {
-  int first, last;
+// The blocks of the image, from left to right and from top to bottom, that may hold a pixel of each
+// of 16 splats; none if right < left or bottom < top.
+struct BlockBoxes {
+  alignas(64) int32_t left[kLanes], top[kLanes], right[kLanes], bottom[kLanes];
 };
 
-SP_INLINE PixelRange pixel_range(float mean, float extent, int tiles) {
-  // Pixel i has its centre at i + 1/2. Clamped as floats: extents may exceed any integer.
-  const float low = mean - extent - 0.5f, high = mean + extent - 0.5f;
-  const float limit = static_cast<float>(tiles * kTileSize);
-  const float begin = low > 0.0f ? (low < limit ? low : limit) : 0.0f;
-  const float end = high < limit ? high : limit - 0.5f;
-  const int whole = static_cast<int>(begin);
-  return {whole + (static_cast<float>(whole) < begin), end < 0.0f ? -1 : static_cast<int>(end)};
+// Blocks [first, last] along one axis with a pixel centre in [low, high], which reaches into the
+// image: block b has them at 4 b + 1/2 to 4 b + 7/2.
+SP_INLINE void block_range(const F16& low, const F16& high, int tiles, int32_t* first,
+                           int32_t* last) {
+  constexpr float kBlocks = 1.0f / kBlockSize;
+  // Clamped as floats: a box may exceed any integer.
+  const F16 zero = F16(0.0f), most = F16(static_cast<float>(tiles * kTileSize / kBlockSize - 1));
+  store(first, to_int(clamp((low + F16(0.5f)) * F16(kBlocks), zero, most)));
+  store(last, to_int(clamp((high - F16(0.5f)) * F16(kBlocks), zero, most)));
 }
 
 // The 16 blocks of a tile: pixel centres of block b span [left, left + 3] x [top, top + 3].
@@ -54,14 +55,22 @@ SP_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float t
   return lane_bits(min(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2) <= F16(budget));
 }
 
-// Which pixels a splat lies in, and which blocks of a tile it touches; of both a little more, so
-// that rounding here never hides a pixel.
+// Which blocks splats touch; a little more, so that rounding here never hides a pixel.
 struct SplatFootprint {
-  static SP_INLINE PixelRange columns(const Splat& s, int tiles) {
-    return pixel_range(s.mean_x, s.extent_x * 1.0001f + 1e-3f, tiles);
-  }
-  static SP_INLINE PixelRange rows(const Splat& s, int tiles) {
-    return pixel_range(s.mean_y, s.extent_y * 1.0001f + 1e-3f, tiles);
+  static SP_INLINE BlockBoxes boxes(const Splat* const* splats, int tiles_x, int tiles_y) {
+    alignas(64) float fields[4][kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const Splat& s = *splats[lane];
+      const float values[4] = {s.mean_x, s.mean_y, s.extent_x, s.extent_y};
+      for (int f = 0; f < 4; ++f) fields[f][lane] = values[f];
+    }
+    const F16 x = load(fields[0]), y = load(fields[1]);
+    const F16 reach_x = load(fields[2]) * F16(1.0001f) + F16(1e-3f);
+    const F16 reach_y = load(fields[3]) * F16(1.0001f) + F16(1e-3f);
+    BlockBoxes boxes;
+    block_range(x - reach_x, x + reach_x, tiles_x, boxes.left, boxes.right);
+    block_range(y - reach_y, y + reach_y, tiles_y, boxes.top, boxes.bottom);
+    return boxes;
   }
   static SP_INLINE uint32_t blocks(const Splat& s, const BlockGrid& grid, float left, float top) {
     const float budget = (s.log2_opacity - kLog2AlphaCut) * 1.0001f + 1e-3f;
@@ -74,28 +83,51 @@ template <typename Footprint>
 size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, size_t end,
                       int tiles_x, int tiles_y, TilePair* pairs, size_t capacity,
                       size_t* pair_count, uint32_t* tile_counts) {
+  constexpr int kBlocks = kTileSize / kBlockSize;
   const BlockGrid grid = block_grid();
   size_t count = *pair_count;
   size_t i = begin;
-  for (; i < end; ++i) {
-    if (i + kPrefetchAhead < end) __builtin_prefetch(splats + order[i + kPrefetchAhead]);
-    const Splat& s = splats[order[i]];
-    const PixelRange columns = Footprint::columns(s, tiles_x);
-    const PixelRange rows = Footprint::rows(s, tiles_y);
-    if (columns.last < columns.first || rows.last < rows.first) continue;
-    const int first_column = columns.first / kTileSize, last_column = columns.last / kTileSize;
-    const int first_row = rows.first / kTileSize, last_row = rows.last / kTileSize;
-    const size_t most = static_cast<size_t>(last_column - first_column + 1) *
-                        static_cast<size_t>(last_row - first_row + 1);
-    if (count + most > capacity) break;
-    for (int row = first_row; row <= last_row; ++row) {
-      for (int column = first_column; column <= last_column; ++column) {
-        const uint32_t blocks = Footprint::blocks(s, grid, static_cast<float>(column * kTileSize),
-                                                  static_cast<float>(row * kTileSize));
+  bool fits = true;
+  while (i < end && fits) {
+    const int lanes = end - i < kLanes ? static_cast<int>(end - i) : kLanes;
+    const Splat* pack[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      pack[lane] = splats + order[lane < lanes ? i + lane : i];
+      if (i + lane + kLanes < end) __builtin_prefetch(splats + order[i + lane + kLanes]);
+    }
+    const BlockBoxes boxes = Footprint::boxes(pack, tiles_x, tiles_y);
+    for (int lane = 0; lane < lanes; ++lane, ++i) {
+      const int left = boxes.left[lane], right = boxes.right[lane];
+      const int top = boxes.top[lane], bottom = boxes.bottom[lane];
+      if (right < left || bottom < top) continue;
+      const int first_column = left / kBlocks, last_column = right / kBlocks;
+      const int first_row = top / kBlocks, last_row = bottom / kBlocks;
+      const size_t most = static_cast<size_t>(last_column - first_column + 1) *
+                          static_cast<size_t>(last_row - first_row + 1);
+      if (count + most > capacity) {
+        fits = false;
+        break;
+      }
+      const auto append = [&](int column, int row, uint32_t blocks) {
         const uint32_t tile = static_cast<uint32_t>(row * tiles_x + column);
         pairs[count] = {tile, {order[i], blocks}};
         count += blocks != 0;
         tile_counts[tile] += blocks != 0;
+      };
+      // What is small touches nearly all blocks of its box: to take them all costs less than to
+      // ask.
+      if (most == 1 && right - left <= 1 && bottom - top <= 1) {
+        const uint32_t row = (1u << (left % kBlocks)) | (1u << (right % kBlocks));
+        append(first_column, first_row,
+               (row << (kBlocks * (top % kBlocks))) | (row << (kBlocks * (bottom % kBlocks))));
+        continue;
+      }
+      for (int row = first_row; row <= last_row; ++row) {
+        for (int column = first_column; column <= last_column; ++column) {
+          append(column, row,
+                 Footprint::blocks(*pack[lane], grid, static_cast<float>(column * kTileSize),
+                                   static_cast<float>(row * kTileSize)));
+        }
       }
     }
   }
