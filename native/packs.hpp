@@ -16,7 +16,8 @@
 #endif
 
 #define SP_INLINE inline __attribute__((always_inline))
-#define SP_EACH_REGISTER(k) _Pragma("GCC unroll 4") for (int k = 0; k < kRegisters; ++k)
+#define SP_EACH_OF(count, k) _Pragma("GCC unroll 4") for (int k = 0; k < (count); ++k)
+#define SP_EACH_REGISTER(k) SP_EACH_OF(kRegisters, k)
 
 // An operator on packs, register by register as `each` loops over k.
 #define SP_BINARY(Pack, each, op)                            \

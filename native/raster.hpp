@@ -23,19 +23,23 @@ SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneC
                          BlockState& state) {
   BlockState s = state;
   bool open = true, seeking = kMedian;
-  for (int word = 0; word < words && open; ++word) {
-    for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
-      const int i = 64 * word + __builtin_ctzll(bits);
-      const StagedSplat& splat = staged.splats[i];
-      if constexpr (kMedian) {
-        if (seeking)
-          seeking = seek_median(staged.planes[i], splat.log2_opacity, pixel.x, pixel.y,
-                                s.sharp_transmittance, s.median_w);
+  TouchingSplats touching(staged, words, b);
+  int indices[kGroupSize];
+  while (open && touching.next(indices)) {
+    F16 alphas[kGroupSize];
+    SP_EACH_OF(kGroupSize, n) { alphas[n] = alpha_at(staged.splats[indices[n]], pixel.x, pixel.y); }
+    if constexpr (kMedian) {
+      for (int n = 0; n < kGroupSize && seeking; ++n) {
+        seeking = seek_median(staged.planes[indices[n]], staged.splats[indices[n]].log2_opacity,
+                              pixel.x, pixel.y, s.sharp_transmittance, s.median_w);
       }
-      const F16 alpha = alpha_at(splat, pixel.x, pixel.y);
-      const F16 rest = s.transmittance * (F16(1.0f) - alpha);
-      const Mask16 keep = rest > F16(kMinTransmittance);
-      const F16 weight = zero_unless(keep, s.transmittance * alpha);
+    }
+    Mask16 keep;
+    SP_EACH_OF(kGroupSize, n) {
+      const StagedSplat& splat = staged.splats[indices[n]];
+      const F16 rest = s.transmittance * (F16(1.0f) - alphas[n]);
+      keep = rest > F16(kMinTransmittance);
+      const F16 weight = zero_unless(keep, s.transmittance * alphas[n]);
       s.transmittance = rest;
       s.alpha += weight;
       if constexpr (kColor) {
@@ -44,13 +48,10 @@ SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneC
         s.blue += weight * F16(splat.blue);
       }
       if constexpr (kDepth) s.depth += weight * F16(splat.depth);
-      if (!any(keep)) {
-        if (!seeking) {
-          open = false;
-          break;
-        }
-        s.transmittance = max(rest, F16(1e-20f));  // and never a subnormal number
-      }
+    }
+    if (!any(keep)) {
+      open = seeking;
+      s.transmittance = max(s.transmittance, F16(1e-20f));  // and never a subnormal number
     }
   }
   state = s;

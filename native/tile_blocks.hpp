@@ -10,9 +10,39 @@ namespace splatpilot::SIMD_LEVEL {
 constexpr int kStageWords = kStageSize / 64;
 
 struct alignas(64) StagedTile {
-  StagedSplat splats[kStageSize];
-  StagedPlane planes[kStageSize];
+  StagedSplat splats[kStageSize + 1];  // the last shows nothing
+  StagedPlane planes[kStageSize + 1];
   uint64_t touching[kBlocksPerTile][kStageWords];  // bit i: splat i touches the block
+};
+
+// Splats whose opacities are found before the first of them is composited: each takes long and
+// waits for none of the others.
+constexpr int kGroupSize = 4;
+
+// Goes through the staged splats that touch a block, in order.
+class TouchingSplats {
+ public:
+  SP_INLINE TouchingSplats(const StagedTile& staged, int words, int b)
+      : touching_(staged.touching[b]), words_(words), bits_(touching_[0]) {}
+
+  // Indices of the next; where 64 bits hold fewer, for the rest that of the splat that shows
+  // nothing. Returns whether there were any.
+  SP_INLINE bool next(int (&indices)[kGroupSize]) {
+    while (!bits_) {
+      if (++word_ >= words_) return false;
+      bits_ = touching_[word_];
+    }
+    SP_EACH_OF(kGroupSize, n) {
+      indices[n] = bits_ ? 64 * word_ + __builtin_ctzll(bits_) : kStageSize;
+      bits_ &= bits_ - 1;
+    }
+    return true;
+  }
+
+ private:
+  const uint64_t* touching_;
+  int words_, word_ = 0;
+  uint64_t bits_;
 };
 
 // From the blocks that each of `count` splats touches to the splats that touch each block. Bits are
@@ -37,6 +67,10 @@ SP_INLINE void transpose_blocks(int32_t* blocks, int count,
 SP_INLINE void stage(const RasterInput& in, bool planes, size_t begin, int count, float left,
                      float top, StagedTile& staged) {
   alignas(64) int32_t blocks[kStageSize];
+  staged.splats[kStageSize] = {};
+  staged.splats[kStageSize].log2_opacity = 2.0f * kLog2AlphaCut;
+  staged.planes[kStageSize] = {};
+  staged.planes[kStageSize].w = staged.planes[kStageSize].mean_w = 1.0f;
   for (int i = 0; i < count; ++i) {
     const Pair* pair = in.pairs + begin + i;
     if (i + kPrefetchAhead < count) {
