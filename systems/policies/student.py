@@ -102,10 +102,7 @@ class Student(LeafSystem):
     def __init__(self, config: StudentConfig) -> None:
         super().__init__()
         config.validate()
-        # The mean of six hypotheses is never exactly at the goal: before it a vehicle would hover.
-        self._network = load_network(
-            config.weights, config.observation, config.speed, fading=config.mirrored
-        )
+        self._network = load_network(config.weights, config.observation, config.speed)
         spec, camera = self._network.spec, config.camera
         for name in ("width", "height", "fov_x"):
             given, trained = getattr(camera, name), getattr(spec, name)

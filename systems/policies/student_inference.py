@@ -17,13 +17,21 @@ from splatpilot.systems.policies.student_observation import (
     mirrored_vectors,
     state_observation,
 )
-from splatpilot.systems.policies.unobstructed_way import HORIZON, MARGIN, unobstructed_way
+from splatpilot.systems.policies.unobstructed_way import (
+    BASIS,
+    HORIZON,
+    MARGIN,
+    unobstructed_way,
+)
 
 RATE = 15.0  # [Hz]
 HYPOTHESES = 3
 OBSERVATIONS = "rgb", "depth"
 WAYPOINT_SCALE = 2.0  # [m] from the unobstructed way that 1 at the network's output means
 AT_HAND = 1.0  # [m] from the goal, within which deviations fade
+STOPPED = 0.77
+"""[-] Part of the goals out of reach at which rounding stopped the way with which weights of
+`way_version` 1 learned."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +60,8 @@ class StudentSpec:
     nominal_speed: float = 2.0
     """[m/s] of the expert."""
     way_version: int = 1
-    """2 in what is trained. Files that do not say learned with the first, by which rounding decides
-    whether the unobstructed way to a goal out of reach stops there, and deviations do not fade at
+    """2 in what is trained. Files that do not say learned with the first, when rounding decided
+    whether the unobstructed way to a goal out of reach stops there, and deviations did not fade at
     the goal."""
 
     def __post_init__(self) -> None:
@@ -78,13 +86,23 @@ class StudentSpec:
         """The name of what it sees, of a sample of a corpus: `color` or `depth`."""
         return {"rgb": "color", "depth": "depth"}[self.observation]
 
-    @property
-    def margin(self) -> float:
-        """Of the unobstructed way, see `MARGIN`."""
-        return MARGIN if self.way_version > 1 else 0.0
+    def way(self, v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any = BASIS) -> Any:
+        """What waypoints deviate from (..., 10, 3) [m], see `unobstructed_way`.
 
-    def deviations(self, output: Any, goal_B: Any, fading: bool = False) -> Any:
-        """From the unobstructed way, (..., M, T, 3) [m], in arrays and tensors.
+        Of `way_version` 1 the mean of the ways that stop at a goal out of reach and that fly on, as
+        often as rounding had chosen each in training: told nothing of its choice, the network
+        learned what is left from their mean.
+        """
+        if self.way_version > 1:
+            return unobstructed_way(v_B, goal_B, up_B, speed, basis)
+        stopping, going = (
+            unobstructed_way(v_B, part * goal_B, up_B, speed, basis, margin=0.0)
+            for part in (1.0 - MARGIN, 1.0 + MARGIN)
+        )
+        return STOPPED * stopping + (1.0 - STOPPED) * going
+
+    def deviations(self, output: Any, goal_B: Any) -> Any:
+        """From the way, (..., M, T, 3) [m], in arrays and tensors.
 
         The way creeps up to a goal at hand: from rest 0.4 m before it, it leads 2 cm ahead in the
         controller's lookahead. A network that is off by as much hovers there for good, so within
@@ -93,10 +111,7 @@ class StudentSpec:
         Args:
             output: (..., M, T, 3), the network's.
             goal_B: (..., 3) [m], the vector to the goal.
-            fading: also of weights that learned when deviations did not fade.
         """
-        if self.way_version == 1 and not fading:
-            return WAYPOINT_SCALE * output
         left = ((goal_B * goal_B).sum(-1) / AT_HAND**2).clip(max=1.0)
         return WAYPOINT_SCALE * left[..., None, None, None] * output
 
@@ -137,7 +152,6 @@ class StudentNetwork:
         spec: the architecture.
         weights: by the names of `StudentSpec.weight_shapes`.
         speed: [m/s], nominal, that it is asked for; its expert's if None.
-        fading: see `StudentSpec.deviations`.
 
     Raises:
         ValueError: if weights are missing, of another shape or not finite.
@@ -148,9 +162,8 @@ class StudentNetwork:
         spec: StudentSpec,
         weights: dict[str, np.ndarray],
         speed: float | None = None,
-        fading: bool = False,
     ) -> None:
-        self.spec, self._fading = spec, fading
+        self.spec = spec
         self._speed = spec.nominal_speed if speed is None else speed
         self._weights = check_weights(weights, spec.weight_shapes())
         self._encoder = MobileNet(spec.height, spec.width, self._weights)
@@ -191,9 +204,9 @@ class StudentNetwork:
         output = self._linear("head", joined).reshape(HYPOTHESES, -1)
         v_B, towards, up_B = np.reshape(state, (3, 3))
         goal_B = self.reach * towards
-        way = unobstructed_way(self.pace * v_B, goal_B, up_B, self._speed, margin=spec.margin)
+        way = spec.way(self.pace * v_B, goal_B, up_B, self._speed)
         waypoints = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
-        return way + self.pace * spec.deviations(waypoints, goal_B, self._fading), output[:, -1]
+        return way + self.pace * spec.deviations(waypoints, goal_B), output[:, -1]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
@@ -203,13 +216,10 @@ def _rectified(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, np.float32(0.0))
 
 
-def load_network(
-    path: str, observation: str, speed: float | None = None, fading: bool = False
-) -> StudentNetwork:
-    """The network from a file of weights, see `PolicyCheckpoint.load`, asked for a speed [m/s], and
-    `fading`, see `StudentSpec.deviations`."""
+def load_network(path: str, observation: str, speed: float | None = None) -> StudentNetwork:
+    """The network from a file of weights, see `PolicyCheckpoint.load`, asked for a speed [m/s]."""
     checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
-    return checkpoint.build(partial(StudentNetwork, speed=speed, fading=fading))
+    return checkpoint.build(partial(StudentNetwork, speed=speed))
 
 
 def plan(

@@ -184,7 +184,8 @@ class Project(torch.autograd.Function):
                 overwrite=c == 0,
                 overwrite_colors=c == 0 or views.per_camera_colors,
             )
-            v_viewmats[c, :3] = torch.from_numpy(_pose_gradient(by_camera, views.poses[c]))
+            if ctx.needs_input_grad[-1]:
+                v_viewmats[c, :3] = torch.from_numpy(_pose_gradient(by_camera, views.poses[c]))
         return None, None, *scene_gradients, v_viewmats
 
 

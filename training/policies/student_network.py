@@ -10,7 +10,7 @@ from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.mobilenet import BLOCKS, CHANNELS, adds_input, mobilenet_blocks
 from splatpilot.systems.policies.student_inference import HYPOTHESES, StudentSpec
 from splatpilot.systems.policies.student_observation import FARTHEST, NEAREST, STATE_SIZE
-from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
+from splatpilot.systems.policies.unobstructed_way import BASIS
 
 IMAGE_MODULES = BLOCKS + 1
 """Modules that an image goes through: the encoder's, and the layer of its cells."""
@@ -96,9 +96,7 @@ class StudentModule(nn.Module):
         waypoints = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * towards
-        way = unobstructed_way(
-            v_B, goal_B, up_B, self.spec.nominal_speed, self._basis, self.spec.margin
-        )
+        way = self.spec.way(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
         return way[:, None] + self.spec.deviations(waypoints, goal_B), output[..., -1]
 
 
