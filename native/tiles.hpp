@@ -6,6 +6,8 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
+constexpr int kTileBlocks = kTileSize / kBlockSize;  // on a side
+
 // The blocks of the image, from left to right and from top to bottom, that may hold a pixel of each
 // of 16 splats; none if right < left or bottom < top.
 struct BlockBoxes {
@@ -16,11 +18,11 @@ struct BlockBoxes {
 // image: block b has them at 4 b + 1/2 to 4 b + 7/2.
 SP_INLINE void block_range(const F16& low, const F16& high, int tiles, int32_t* first,
                            int32_t* last) {
-  constexpr float kBlocks = 1.0f / kBlockSize;
+  constexpr float kPerPixel = 1.0f / kBlockSize;
   // Clamped as floats: a box may exceed any integer.
-  const F16 zero = F16(0.0f), most = F16(static_cast<float>(tiles * kTileSize / kBlockSize - 1));
-  store(first, to_int(clamp((low + F16(0.5f)) * F16(kBlocks), zero, most)));
-  store(last, to_int(clamp((high - F16(0.5f)) * F16(kBlocks), zero, most)));
+  const F16 zero = F16(0.0f), most = F16(static_cast<float>(tiles * kTileBlocks - 1));
+  store(first, to_int(clamp((low + F16(0.5f)) * F16(kPerPixel), zero, most)));
+  store(last, to_int(clamp((high - F16(0.5f)) * F16(kPerPixel), zero, most)));
 }
 
 // The 16 blocks of a tile: pixel centres of block b span [left, left + 3] x [top, top + 3].
@@ -55,6 +57,13 @@ SP_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float t
   return lane_bits(min(u1 * u1 + v1 * v1, u2 * u2 + v2 * v2) <= F16(budget));
 }
 
+// The blocks of a box within one tile, of one or two a side; ends count from the image's corner.
+SP_INLINE uint32_t blocks_of_box(int left, int top, int right, int bottom) {
+  const uint32_t row = (1u << (left % kTileBlocks)) | (1u << (right % kTileBlocks));
+  return (row << (kTileBlocks * (top % kTileBlocks))) |
+         (row << (kTileBlocks * (bottom % kTileBlocks)));
+}
+
 // Which blocks splats touch; a little more, so that rounding here never hides a pixel.
 struct SplatFootprint {
   static SP_INLINE BlockBoxes boxes(const Splat* const* splats, int tiles_x, int tiles_y) {
@@ -83,12 +92,10 @@ template <typename Footprint>
 size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, size_t end,
                       int tiles_x, int tiles_y, TilePair* pairs, size_t capacity,
                       size_t* pair_count, uint32_t* tile_counts) {
-  constexpr int kBlocks = kTileSize / kBlockSize;
   const BlockGrid grid = block_grid();
   size_t count = *pair_count;
   size_t i = begin;
-  bool fits = true;
-  while (i < end && fits) {
+  while (i < end) {
     const int lanes = end - i < kLanes ? static_cast<int>(end - i) : kLanes;
     const Splat* pack[kLanes];
     for (int lane = 0; lane < kLanes; ++lane) {
@@ -100,13 +107,13 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
       const int left = boxes.left[lane], right = boxes.right[lane];
       const int top = boxes.top[lane], bottom = boxes.bottom[lane];
       if (right < left || bottom < top) continue;
-      const int first_column = left / kBlocks, last_column = right / kBlocks;
-      const int first_row = top / kBlocks, last_row = bottom / kBlocks;
+      const int first_column = left / kTileBlocks, last_column = right / kTileBlocks;
+      const int first_row = top / kTileBlocks, last_row = bottom / kTileBlocks;
       const size_t most = static_cast<size_t>(last_column - first_column + 1) *
                           static_cast<size_t>(last_row - first_row + 1);
       if (count + most > capacity) {
-        fits = false;
-        break;
+        *pair_count = count;
+        return i;
       }
       const auto append = [&](int column, int row, uint32_t blocks) {
         const uint32_t tile = static_cast<uint32_t>(row * tiles_x + column);
@@ -117,9 +124,7 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
       // What is small touches nearly all blocks of its box: to take them all costs less than to
       // ask.
       if (most == 1 && right - left <= 1 && bottom - top <= 1) {
-        const uint32_t row = (1u << (left % kBlocks)) | (1u << (right % kBlocks));
-        append(first_column, first_row,
-               (row << (kBlocks * (top % kBlocks))) | (row << (kBlocks * (bottom % kBlocks))));
+        append(first_column, first_row, blocks_of_box(left, top, right, bottom));
         continue;
       }
       for (int row = first_row; row <= last_row; ++row) {
