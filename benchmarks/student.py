@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from harness import seconds
 
-from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.policies.student_inference import StudentNetwork, plan
+from splatpilot.systems.policies.student_spec import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.training.policies.student import StudentTrainer

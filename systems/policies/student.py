@@ -11,7 +11,8 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from splatpilot.systems.policies.depth_policy_config import require_speed
 from splatpilot.systems.policies.hypotheses import no_plan
 from splatpilot.systems.policies.mirrored_views import plan_both_views
-from splatpilot.systems.policies.student_inference import HYPOTHESES, RATE, load_network, plan
+from splatpilot.systems.policies.student_inference import RATE, load_network, plan
+from splatpilot.systems.policies.student_spec import HYPOTHESES
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.student_inference import StudentSpec
+from splatpilot.systems.policies.student_spec import StudentSpec
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.pretrained import imagenet_weights

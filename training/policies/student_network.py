@@ -8,8 +8,8 @@ from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.mobilenet import BLOCKS, CHANNELS, adds_input, mobilenet_blocks
-from splatpilot.systems.policies.student_inference import HYPOTHESES, StudentSpec
 from splatpilot.systems.policies.student_observation import FARTHEST, NEAREST, STATE_SIZE
+from splatpilot.systems.policies.student_spec import HYPOTHESES, StudentSpec
 from splatpilot.systems.policies.unobstructed_way import BASIS
 
 IMAGE_MODULES = BLOCKS + 1

@@ -12,8 +12,9 @@ from splatpilot.systems.policies.mirrored_views import (
     consensus,
     plan_both_views,
 )
-from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.policies.student_inference import StudentNetwork, plan
 from splatpilot.systems.policies.student_observation import mirrored_vectors
+from splatpilot.systems.policies.student_spec import StudentSpec
 
 
 @pytest.fixture(scope="module", params=["rgb", "depth"])

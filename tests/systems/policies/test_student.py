@@ -21,12 +21,8 @@ from splatpilot.systems.policies.student import (
     StudentDepthConfig,
     StudentRgbConfig,
 )
-from splatpilot.systems.policies.student_inference import (
-    StudentNetwork,
-    StudentSpec,
-    load_network,
-    plan,
-)
+from splatpilot.systems.policies.student_inference import StudentNetwork, load_network, plan
+from splatpilot.systems.policies.student_spec import StudentSpec
 from splatpilot.systems.policies.unobstructed_way import unobstructed_way
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.policies.student_inference import StudentSpec
+from splatpilot.systems.policies.student_spec import StudentSpec
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.student_data import StudentData

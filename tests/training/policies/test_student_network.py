@@ -9,8 +9,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.mobilenet import mobilenet_shapes
-from splatpilot.systems.policies.student_inference import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.policies.student_inference import StudentNetwork, plan
 from splatpilot.systems.policies.student_observation import STATE_SIZE
+from splatpilot.systems.policies.student_spec import StudentSpec
 from splatpilot.training.policies.pretrained import IN_DATA, imagenet_weights
 from splatpilot.training.policies.student_images import clean_images
 from splatpilot.training.policies.student_network import StudentModule, encode_state

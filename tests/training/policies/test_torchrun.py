@@ -9,7 +9,7 @@ import pytest
 
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.student_inference import StudentSpec
+from splatpilot.systems.policies.student_spec import StudentSpec
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.torchrun import (
     Processes,
