@@ -25,18 +25,15 @@ class TouchingSplats {
   SP_INLINE TouchingSplats(const StagedTile& staged, int words, int b)
       : touching_(staged.touching[b]), words_(words), bits_(touching_[0]) {}
 
-  // Indices of the next; where 64 bits hold fewer, for the rest that of the splat that shows
-  // nothing. Returns whether there were any.
+  // Indices of the next; where there are fewer, for the rest that of the splat that shows nothing.
+  // Returns whether there were any.
   SP_INLINE bool next(int (&indices)[kGroupSize]) {
-    while (!bits_) {
-      if (++word_ >= words_) return false;
-      bits_ = touching_[word_];
-    }
     SP_EACH_OF(kGroupSize, n) {
+      while (!bits_ && word_ + 1 < words_) bits_ = touching_[++word_];
       indices[n] = bits_ ? 64 * word_ + __builtin_ctzll(bits_) : kStageSize;
       bits_ &= bits_ - 1;
     }
-    return true;
+    return indices[0] != kStageSize;
   }
 
  private:
