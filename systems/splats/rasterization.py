@@ -10,14 +10,7 @@ from torch import Tensor
 from splatpilot import _native
 from splatpilot.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
 from splatpilot.systems.splats.gsplat_kernels import rasterize_by_gsplat
-from splatpilot.systems.splats.rasterization_autograd import (
-    Composite,
-    Drawing,
-    Project,
-    Views,
-    joined,
-    to_numpy,
-)
+from splatpilot.systems.splats.rasterization_autograd import Composite, Project
 from splatpilot.systems.splats.rasterization_checks import (
     CHANNELS,
     by_name,
@@ -34,6 +27,7 @@ from splatpilot.systems.splats.rasterization_unscented import (
     check_camera_model,
     render_unscented,
 )
+from splatpilot.systems.splats.rasterization_views import Drawing, Views, joined, to_numpy
 
 RASTERIZE_MODES = ("classic", "antialiased")
 

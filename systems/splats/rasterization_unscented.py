@@ -20,13 +20,8 @@ from splatpilot.systems.splats.camera_models import (
     project_opencv,
     unscented_projection,
 )
-from splatpilot.systems.splats.rasterization_autograd import (
-    Drawing,
-    Views,
-    splat_gradients,
-    splat_outputs,
-    to_numpy,
-)
+from splatpilot.systems.splats.rasterization_autograd import splat_gradients, splat_outputs
+from splatpilot.systems.splats.rasterization_views import Drawing, Views, to_numpy
 from splatpilot.systems.splats.spherical_harmonics import sh_basis_functions
 
 CAMERA_MODELS = ("pinhole", "fisheye")

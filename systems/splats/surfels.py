@@ -10,7 +10,6 @@ from splatpilot import _native
 from splatpilot.systems.splats.baked_scene import check_camera, create_renderer
 from splatpilot.systems.splats.depth_normals import depth_to_normals
 from splatpilot.systems.splats.gsplat_kernels import rasterize_surfels_by_gsplat
-from splatpilot.systems.splats.rasterization_autograd import joined
 from splatpilot.systems.splats.rasterization_checks import (
     by_name,
     check_device,
@@ -19,6 +18,7 @@ from splatpilot.systems.splats.rasterization_checks import (
     check_values,
     pair_meta,
 )
+from splatpilot.systems.splats.rasterization_views import joined
 from splatpilot.systems.splats.surfels_autograd import (
     RasterizeSurfels,
     SurfelView,

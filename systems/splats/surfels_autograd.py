@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpilot import _native
-from splatpilot.systems.splats.rasterization_autograd import (
+from splatpilot.systems.splats.rasterization_views import (
     gradient_arguments,
     scene_arguments,
     scene_arrays,
