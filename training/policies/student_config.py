@@ -64,9 +64,14 @@ class StudentTraining:
     # others are slower and higher in the mean than what the expert flies, and so is a
     # student that takes them for as good.
     experts: int = 1
-    # [-] Part of an expert's pull that hypotheses without votes share; more of it makes all
-    # hypotheses alike, none lets those that begin badly never be used.
-    epsilon: float = 0.05
+    # [-] Times that the errors of all hypotheses but the first count where they contend for votes:
+    # at 10 another gets an expert's only where the first is over three times as far off. Where all
+    # are equal, as published, at 1, they share states that one of them would do as well in, and
+    # which of them comes closest there is noise.
+    handicap: float = 10.0
+    # [-] Part of an expert's pull that hypotheses without votes share, published as 0.05; more of
+    # it makes all hypotheses alike.
+    epsilon: float = 0.0
     # [1/(m s)] What a metre of soft barrier for a second adds to an error in square metres: at 1
     # grazing an obstacle all along costs as much as flying half a metre beside the expert.
     geometric_weight: float = 1.0
@@ -100,6 +105,11 @@ class StudentTraining:
             value = getattr(self, name)
             if not 0.0 <= value <= limit:
                 raise ValueError(f"{name} is {value}; it must be 0 to {limit}")
+        if not 1.0 <= self.handicap < float("inf"):
+            raise ValueError(
+                f"handicap is {self.handicap}; it must be at least 1, at which all hypotheses are "
+                "equal"
+            )
         for name in ("batch", "draws", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")

@@ -35,14 +35,20 @@ def root_mean_square(errors: Tensor) -> Tensor:
     return (0.3 * errors).sqrt()
 
 
-def winners(errors: Tensor) -> Tensor:
+def winners(errors: Tensor, handicap: float = 1.0) -> Tensor:
     """Votes (N, K, M), 1 where hypothesis m is the closest to expert k; none of experts that there
-    are not."""
-    votes = torch.zeros_like(errors).scatter(2, errors.argmin(2, keepdim=True), 1.0)
+    are not.
+
+    Args:
+        errors: L (N, K, M).
+        handicap: times that the errors of all hypotheses but the first count.
+    """
+    contending = torch.cat([errors[..., :1], handicap * errors[..., 1:]], dim=2)
+    votes = torch.zeros_like(errors).scatter(2, contending.argmin(2, keepdim=True), 1.0)
     return torch.where(errors.isfinite(), votes, 0.0)
 
 
-def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
+def imitation_terms(errors: Tensor, epsilon: float, handicap: float = 1.0) -> tuple[Tensor, Tensor]:
     """How far the winners are from the experts that voted for them, and what pulls the others.
 
         winners = mean_n sum_k (1 - epsilon) L_km of the closest m
@@ -51,8 +57,9 @@ def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     Args:
         errors: L (N, K, M); expert 0 is the best.
         epsilon: the part of the pull that the unvoted share.
+        handicap: see `winners`.
     """
-    votes = winners(errors)
+    votes = winners(errors, handicap)
     finite = torch.where(errors.isfinite(), errors, 0.0)
     won = (1.0 - epsilon) * (votes * finite).sum((1, 2)).mean()
     unvoted = votes.sum(1) == 0.0  # (N, M)

@@ -65,6 +65,18 @@ def test_winners_take_nearly_all_and_the_unvoted_follow_the_best():
     assert unvoted.item() == pytest.approx(0.025 * 10 / 3 * mean_square * (2**2 + 2**2))
 
 
+def test_others_than_the_first_win_where_it_is_far_off():
+    """With a handicap of 10 in squares, against a first hypothesis d off its expert another wins at
+    0.3 d and does not at 0.33 d; among the others the closest wins."""
+    experts = straight((2, 0, 0))
+    loses = hypothesis_errors(experts, straight((2, 1, 0), (2, 0.33, 0), (2, 0.8, 0)))
+    wins = hypothesis_errors(experts, straight((2, 1, 0), (2, 0.31, 0), (2, 0.3, 0)))
+    assert winners(loses, 10.0)[0, 0].tolist() == [1, 0, 0]
+    assert winners(wins, 10.0)[0, 0].tolist() == [0, 0, 1]
+    assert imitation_terms(loses, 0.05, 10.0)[0].item() == pytest.approx(0.95 * loses[0, 0, 0])
+    assert imitation_terms(wins, 0.05, 10.0)[0].item() == pytest.approx(0.95 * wins[0, 0, 2])
+
+
 def test_costs_are_of_error_and_of_the_clearance_of_the_own_way():
     """Equation 4: of two hypotheses the one that runs at 1.354 m from a surface for a second has
     log(2) / 4 of barrier; targets have the mean 1 and no gradient."""
@@ -101,6 +113,8 @@ def test_gradients_are_those_of_finite_differences():
     costs, targets = random(3, 3, 3).requires_grad_(), random(4, 3, 3)
     check = torch.autograd.gradcheck
     assert check(lambda w: imitation_terms(hypothesis_errors(experts, w), 0.05)[0], waypoints)
+    handicapped = lambda w: imitation_terms(hypothesis_errors(experts, w), 0.05, 10.0)[0]  # noqa: E731
+    assert check(handicapped, waypoints)
     # Far from the experts, so that one hypothesis gets no votes.
     aside = (waypoints.detach() + 9.0 * torch.eye(3, dtype=torch.float64)[:, None]).requires_grad_()
     unvoted = lambda w: imitation_terms(hypothesis_errors(experts, w), 0.05)[1]  # noqa: E731
