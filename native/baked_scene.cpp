@@ -4,7 +4,8 @@
 #include <array>
 #include <cmath>
 #include <limits>
-#include <numeric>
+
+#include "radix_sort.hpp"
 
 namespace splatpilot {
 namespace {
@@ -36,17 +37,18 @@ std::vector<uint32_t> morton_order(const GaussianArrays& g) {
     size = std::max(size, static_cast<double>(high[axis]) - low[axis]);
   }
   const double scale = size > 0.0 ? ((1 << 21) - 1) / size : 0.0;
-  std::vector<uint64_t> codes(g.count);
+  std::vector<KeyValue<uint64_t>> codes(g.count), scratch;
   for (size_t i = 0; i < g.count; ++i) {
+    codes[i].value = static_cast<uint32_t>(i);
     for (size_t axis = 0; axis < 3; ++axis) {
       const double cell = (static_cast<double>(g.means[3 * i + axis]) - low[axis]) * scale;
-      codes[i] |= spread(static_cast<uint64_t>(cell)) << axis;
+      codes[i].key |= spread(static_cast<uint64_t>(cell)) << axis;
     }
   }
+  radix_sort(codes, scratch);
   std::vector<uint32_t> order(g.count);
-  std::iota(order.begin(), order.end(), 0u);
-  std::stable_sort(order.begin(), order.end(),
-                   [&](uint32_t a, uint32_t b) { return codes[a] < codes[b]; });
+  std::transform(codes.begin(), codes.end(), order.begin(),
+                 [](const KeyValue<uint64_t>& code) { return code.value; });
   return order;
 }
 
@@ -76,24 +78,11 @@ std::array<double, 6> lower_factor(const float* quat, const float* scale) {
   return L;
 }
 
-}  // namespace
-
-BakedScene::BakedScene(const GaussianArrays& g) {
-  const std::vector<uint32_t> order = morton_order(g);
-  arrays_.groups = (g.count + kPack - 1) / kPack;
-  arrays_.sh_degree = g.sh_degree;
-  store_geometry(g, order);
-  store_colors(g, order);
-  store_bounds(g, order);
-  arrays_.geometry = geometry_.data();
-  arrays_.colors = colors_.data();
-  arrays_.bounds = bounds_.data();
-}
-
-void BakedScene::store_geometry(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  geometry_.assign(arrays_.groups * 10 * kPack, 0.0f);
-  for (size_t slot = 0; slot < arrays_.groups * kPack; ++slot) {
-    float* pack = geometry_.data() + slot / kPack * 10 * kPack + slot % kPack;
+std::vector<float> geometry_of(const GaussianArrays& g, const std::vector<uint32_t>& order) {
+  const size_t groups = (g.count + kPack - 1) / kPack;
+  std::vector<float> geometry(groups * 10 * kPack, 0.0f);
+  for (size_t slot = 0; slot < groups * kPack; ++slot) {
+    float* pack = geometry.data() + slot / kPack * 10 * kPack + slot % kPack;
     pack[9 * kPack] = -std::numeric_limits<float>::infinity();
     if (slot >= g.count) continue;
     const size_t i = order[slot];
@@ -102,29 +91,18 @@ void BakedScene::store_geometry(const GaussianArrays& g, const std::vector<uint3
     for (size_t k = 0; k < 6; ++k) pack[(3 + k) * kPack] = static_cast<float>(L[k]);
     pack[9 * kPack] = static_cast<float>(std::log2(static_cast<double>(g.opacities[i])));
   }
+  return geometry;
 }
 
-void BakedScene::store_colors(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  const size_t values = 3 * static_cast<size_t>((g.sh_degree + 1) * (g.sh_degree + 1));
-  colors_.assign(arrays_.groups * values * kPack, 0.0f);
-  for (size_t slot = 0; slot < g.count; ++slot) {
-    float* pack = colors_.data() + slot / kPack * values * kPack + slot % kPack;
-    const float* row = g.colors + 3 * static_cast<size_t>(g.sh_coefficients) * order[slot];
-    for (size_t k = 0; k < values; ++k) {
-      pack[k * kPack] =
-          g.sh_degree == 0 ? std::max(0.0f, 0.5f + 0.28209479177387814f * row[k]) : row[k];
-    }
-  }
-}
-
-void BakedScene::store_bounds(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  const size_t boxes = (arrays_.groups * kPack + kBoundSize - 1) / kBoundSize;
+std::vector<float> bounds_of(const GaussianArrays& g, const std::vector<uint32_t>& order) {
+  const size_t groups = (g.count + kPack - 1) / kPack;
+  const size_t boxes = (groups * kPack + kBoundSize - 1) / kBoundSize;
   const size_t box_groups = (boxes + kPack - 1) / kPack;
   // A box that does not exist is NaN, which passes no comparison.
-  bounds_.assign(box_groups * 7 * kPack, std::numeric_limits<float>::quiet_NaN());
+  std::vector<float> bounds(box_groups * 7 * kPack, std::numeric_limits<float>::quiet_NaN());
   for (size_t box = 0; box < boxes; ++box) {
     const size_t begin = box * kBoundSize, end = std::min(g.count, begin + kBoundSize);
-    float* pack = bounds_.data() + box / kPack * 7 * kPack + box % kPack;
+    float* pack = bounds.data() + box / kPack * 7 * kPack + box % kPack;
     float largest_scale = 0.0f;
     for (size_t slot = begin; slot < end; ++slot) {
       const float* scale = g.scales + 3 * static_cast<size_t>(order[slot]);
@@ -145,6 +123,41 @@ void BakedScene::store_bounds(const GaussianArrays& g, const std::vector<uint32_
       pack[(3 + axis) * kPack] = static_cast<float>(half + slack);
     }
   }
+  return bounds;
+}
+
+}  // namespace
+
+BakedScene::BakedScene(const GaussianArrays& g)
+    : shape_(std::make_shared<const Shape>(shape_of(g))) {
+  store_colors(g.colors, g.sh_coefficients, g.sh_degree);
+}
+
+BakedScene::BakedScene(const BakedScene& other, const float* colors, int sh_coefficients,
+                       int sh_degree)
+    : shape_(other.shape_) {
+  store_colors(colors, sh_coefficients, sh_degree);
+}
+
+BakedScene::Shape BakedScene::shape_of(const GaussianArrays& g) {
+  std::vector<uint32_t> order = morton_order(g);
+  std::vector<float> geometry = geometry_of(g, order), bounds = bounds_of(g, order);
+  return {std::move(order), std::move(geometry), std::move(bounds)};
+}
+
+void BakedScene::store_colors(const float* colors, int sh_coefficients, int sh_degree) {
+  const size_t values = 3 * static_cast<size_t>((sh_degree + 1) * (sh_degree + 1));
+  const size_t groups = (count() + kPack - 1) / kPack;
+  colors_.assign(groups * values * kPack, 0.0f);
+  for (size_t slot = 0; slot < count(); ++slot) {
+    float* pack = colors_.data() + slot / kPack * values * kPack + slot % kPack;
+    const float* row = colors + 3 * static_cast<size_t>(sh_coefficients) * shape_->order[slot];
+    for (size_t k = 0; k < values; ++k) {
+      pack[k * kPack] =
+          sh_degree == 0 ? std::max(0.0f, 0.5f + 0.28209479177387814f * row[k]) : row[k];
+    }
+  }
+  arrays_ = {groups, shape_->geometry.data(), colors_.data(), sh_degree, shape_->bounds.data()};
 }
 
 }  // namespace splatpilot

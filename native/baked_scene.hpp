@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 #include "types.hpp"
@@ -14,14 +15,25 @@ class BakedScene {
  public:
   explicit BakedScene(const GaussianArrays& gaussians);
 
+  // The Gaussians of another scene in other colours (count, sh_coefficients, 3); what does not
+  // depend on colours is shared.
+  BakedScene(const BakedScene& other, const float* colors, int sh_coefficients, int sh_degree);
+
+  size_t count() const { return shape_->order.size(); }
   const BakedArrays& arrays() const { return arrays_; }
 
  private:
-  void store_geometry(const GaussianArrays& g, const std::vector<uint32_t>& order);
-  void store_colors(const GaussianArrays& g, const std::vector<uint32_t>& order);
-  void store_bounds(const GaussianArrays& g, const std::vector<uint32_t>& order);
+  // All but colours.
+  struct Shape {
+    std::vector<uint32_t> order;  // (count), of the Gaussians as they were given
+    std::vector<float> geometry, bounds;
+  };
 
-  std::vector<float> geometry_, colors_, bounds_;
+  static Shape shape_of(const GaussianArrays& g);
+  void store_colors(const float* colors, int sh_coefficients, int sh_degree);
+
+  std::shared_ptr<const Shape> shape_;
+  std::vector<float> colors_;
   BakedArrays arrays_{};
 };
 

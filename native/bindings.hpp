@@ -164,8 +164,10 @@ inline int32_t radius_of(float extent) {
   return static_cast<int32_t>(std::ceil(std::min(extent, 1073741824.0f)));
 }
 
-// Add to the module: the backward pass of Gaussians, the renderer of surfels, the rendering of
-// projected Gaussians, the losses, what fits Gaussians, worlds of shapes, worlds of grids.
+// Add to the module: baked scenes, the backward pass of Gaussians, the renderer of surfels, the
+// rendering of projected Gaussians, the losses, what fits Gaussians, worlds of shapes, worlds of
+// grids.
+void bind_baked(nb::module_& m);
 void bind_gradients(nb::module_& m);
 void bind_surfels(nb::module_& m);
 void bind_projected(nb::module_& m);

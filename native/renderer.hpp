@@ -97,7 +97,7 @@ class Renderer {
   FramePool<Frame> frames_;
   FramePool<SurfelFrame> surfel_frames_;
   std::vector<uint32_t> depth_bits_;
-  std::vector<KeyValue> items_, sort_scratch_;  // visible splats, by depth after sorting
+  std::vector<KeyValue<uint32_t>> items_, sort_scratch_;  // visible splats, by depth after sorting
   std::vector<uint32_t> order_;
   struct BinTask {
     std::vector<TilePair> pairs;

@@ -88,10 +88,8 @@ def seen_otherwise(world: World, strength: float, seed: int) -> World:
 
 def with_appearance(world: World, look: Appearance) -> World:
     """The same world, seen otherwise. What moves in it keeps its colours."""
-    return replace(
-        world,
-        gaussians=recolored(world.gaussians, look),
-        background=recolored_background(world.background, look),
+    return world.recolored(
+        recolored(world.gaussians, look), recolored_background(world.background, look)
     )
 
 
@@ -107,8 +105,9 @@ def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
     after = _developed(linear @ look.mixing.T)
     sh = scene.sh.copy()
     sh[:, 0] = (after - 0.5) / C0
-    brighter = (after.sum(axis=1) + 0.01) / (before.sum(axis=1) + 0.01)
-    sh[:, 1:] *= np.minimum(brighter, 2.0)[:, None, None]
+    if scene.sh_degree > 0:
+        brighter = (after.sum(axis=1) + 0.01) / (before.sum(axis=1) + 0.01)
+        sh[:, 1:] *= np.minimum(brighter, 2.0)[:, None, None]
     return replace(scene, sh=sh)
 
 
@@ -138,19 +137,10 @@ def _paint(colors: Array, look: Appearance) -> Array:
 
 def _light(scene: GaussianScene, look: Appearance) -> Array:
     """The light (N,) on the Gaussians, 1 in the mean over all directions and places."""
-    w, x, y, z = scene.quats.T
-    axes = np.stack(  # (N, 3, 3) rows: the principal axes in W
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1),
-            np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1),
-            np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1),
-        ],
-        axis=1,
-    )
-    normals = axes[np.arange(len(scene)), scene.scales.argmin(axis=1)]
     # A Gaussian has no outside: it is lit alike from both sides. |cos| is 1/2 in the mean.
-    facing = 2 * np.abs(normals @ look.light_W)
-    mottled = np.cos(scene.means @ look.waves[:, :3].T + look.waves[:, 3]).sum(axis=1)
+    facing = 2 * np.abs(scene.normals @ look.light_W)
+    phases = look.waves[:, :3] @ scene.means.T + look.waves[:, 3:]  # (5, N)
+    mottled = np.cos(phases).sum(axis=0)
     return (1 - look.relief + look.relief * facing) * (1 + look.mottle * mottled / np.sqrt(_WAVES))
 
 

@@ -1,6 +1,6 @@
 """What is flown in: what cameras see, the truth about its surfaces, and where to fly."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -57,3 +57,14 @@ class World:
     def baked(self) -> BakedScene:
         """The Gaussians as cameras render them; made when first asked for, and shared by all."""
         return BakedScene(self.gaussians)
+
+    def recolored(self, gaussians: GaussianScene, background: Background) -> "World":
+        """The same place in other colours; what was baked of it is shared.
+
+        Args:
+            gaussians: those of this world, but for their colours.
+            background: what is seen where none is.
+        """
+        seen = replace(self, gaussians=gaussians, background=background)
+        vars(seen)["baked"] = self.baked.recolored(gaussians.sh)
+        return seen

@@ -165,7 +165,7 @@ class TrajectoryLattice:
             toa: the time of arrival at the goal.
         """
         config = self.config
-        positions = trajectories.positions
+        positions, jerks = trajectories
         distances = field.distance(positions)  # (N, S)
         starts = np.broadcast_to(p_WB, (len(positions), 1, 3))
         steps = lengths(np.diff(positions, axis=1, prepend=starts))  # (N, S) [m]
@@ -177,7 +177,7 @@ class TrajectoryLattice:
             + nearness
             + config.penetration_weight * too_close.sum(axis=1)
             + config.speed_weight * np.square(too_fast).mean(axis=1)
-            + config.jerk_weight * np.square(trajectories.jerks).sum(axis=2).mean(axis=1)
+            + config.jerk_weight * np.einsum("nsi,nsi->n", jerks, jerks) / jerks.shape[1]
         )
 
     def best(

@@ -90,6 +90,24 @@ class BakedScene:
         arrays = {n: np.ascontiguousarray(getattr(scene, n), dtype=np.float32) for n in names}
         self._scene = _native.BakedScene(**arrays, sh_degree=degree_of(scene.sh.shape[1]))
 
+    def recolored(self, sh: np.ndarray) -> "BakedScene":
+        """The same Gaussians in other colours, by the same renderer; in a tenth of the time that
+        baking takes, because whatever does not depend on colours is shared.
+
+        Args:
+            sh: (N, K, 3), see `GaussianScene`, in the order of the scene that was baked.
+
+        Raises:
+            ValueError: on another shape, or another number of Gaussians.
+        """
+        sh = np.ascontiguousarray(sh, dtype=np.float32)
+        if sh.ndim != 3 or sh.shape[2] != 3:
+            raise ValueError(f"sh has shape {sh.shape}; it must be (N, K, 3)")
+        seen = object.__new__(BakedScene)
+        seen._scene = self._scene.recolored(sh, degree_of(sh.shape[1]))
+        seen._renderer = self._renderer
+        return seen
+
     def render(
         self,
         K: "ArrayLike",

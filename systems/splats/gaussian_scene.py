@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -118,6 +119,12 @@ class GaussianScene:
     def rotations(self) -> NDArray[np.float64]:
         """Orientations of the principal axes as matrices, (N, 3, 3)."""
         return Rotation.from_quat(self.quats, scalar_first=True).as_matrix()
+
+    @cached_property
+    def normals(self) -> NDArray[np.float32]:
+        """Their shortest principal axes, (N, 3) unit vectors, of either sign."""
+        shortest = self.scales.argmin(axis=1)
+        return self.rotations[np.arange(len(self)), :, shortest].astype(np.float32)
 
     @property
     def covariances(self) -> NDArray[np.float64]:

@@ -81,8 +81,8 @@ def attitude_from_thrust(f_W: np.ndarray, yaw: float) -> np.ndarray:
         x_W = x_W / math.copysign(length, zz)
     else:
         y_W = np.array([-zz * sin_yaw, zz * cos_yaw, zx * sin_yaw - zy * cos_yaw])  # z × heading
-        x_W = _cross(y_W / math.sqrt(y_W.dot(y_W)), z_W)
-    return np.column_stack((x_W, _cross(z_W, x_W), z_W))
+        x_W = cross(y_W / math.sqrt(y_W.dot(y_W)), z_W)
+    return np.column_stack((x_W, cross(z_W, x_W), z_W))
 
 
 def attitude_error(R_WB: np.ndarray, R_WD: np.ndarray) -> tuple[np.ndarray, float]:
@@ -112,8 +112,8 @@ def limit_norm(vector: np.ndarray, limit: float) -> np.ndarray:
     return vector * (limit / norm) if norm > limit else vector
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a × b; np.cross costs twenty times as much on single vectors."""
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b, (3,) each; np.cross costs twenty times as much on single vectors."""
     a1, a2, a3 = a.tolist()
     b1, b2, b3 = b.tolist()
     return np.array([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1])

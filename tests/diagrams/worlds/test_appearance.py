@@ -5,11 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.appearance import draw_appearance, recolored, recolored_background
+from splatpilot.diagrams.worlds.appearance import (
+    draw_appearance,
+    recolored,
+    recolored_background,
+    with_appearance,
+)
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 COUNT = 200
+ARRAYS = "means", "quats", "scales", "opacities", "sh"
 
 
 @pytest.fixture
@@ -57,7 +67,7 @@ def test_exposure_is_in_stops(scene):
 
 def test_one_paint_stays_one_paint(scene):
     """Gaussians of one colour, place and orientation have one colour in any look."""
-    one = {name: getattr(scene, name)[np.zeros(COUNT, int)] for name in vars(scene)}
+    one = {name: getattr(scene, name)[np.zeros(COUNT, int)] for name in ARRAYS}
     alike = GaussianScene(**one)
     colors = recolored(alike, draw(3)).base_colors
     np.testing.assert_allclose(colors, np.tile(colors[0], (COUNT, 1)), atol=1e-6)
@@ -98,3 +108,17 @@ def test_environments_are_recoloured_in_every_direction():
     found = recolored_background(EnvironmentMap(texels), look).texels
     np.testing.assert_allclose(found[2, 3], recolored_background(tuple(texels[2, 3]), look))
     assert np.abs(found - texels).mean() > 0.02
+
+
+def test_world_in_another_look_is_rendered_as_if_made_so():
+    """Its own colours, bit for bit as if baked anew, and depth as before."""
+    world = make_world(ForestConfig(length=8.0, width=6.0, height=4.0), 1)
+    seen = with_appearance(world, draw(3))
+    camera = OnboardCamera(width=64, height=48)
+    view = camera.camera_info().intrinsic_matrix(), 64, 48, camera.X_BC()
+    image = seen.baked.render(*view)
+    for one, same in zip(image, BakedScene(seen.gaussians).render(*view), strict=True):
+        np.testing.assert_array_equal(one, same)
+    before = world.baked.render(*view)
+    np.testing.assert_array_equal(image.depth, before.depth)
+    assert np.abs(image.color - before.color).mean() > 0.01

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -65,6 +66,30 @@ def test_culling_by_boxes_loses_nothing(seed):
     assert alpha.any()
     assert np.mean(np.abs(view.color - image[..., :3]) > 1e-3) < 1e-3
     assert np.mean(np.abs(view.alpha - alpha) > 1e-3) < 1e-3
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_other_colours_are_as_if_baked_anew(degree):
+    """Bit for bit, whatever the degree that the scene was baked with; its own colours stay."""
+    scene = random_scene(count=3000, sh_degree=1)
+    other = replace(scene, sh=random_scene(count=3000, seed=1, sh_degree=degree).sh)
+    baked = BakedScene(scene)
+    before = baked.render(K, WIDTH, HEIGHT, X_WC)
+    view = baked.recolored(other.sh).render(K, WIDTH, HEIGHT, X_WC)
+    for one, same in zip(view, BakedScene(other).render(K, WIDTH, HEIGHT, X_WC), strict=True):
+        np.testing.assert_array_equal(one, same)
+    assert np.abs(view.color - before.color).mean() > 0.01
+    np.testing.assert_array_equal(baked.render(K, WIDTH, HEIGHT, X_WC).color, before.color)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [((300, 3), "must be"), ((299, 1, 3), "as many colours"), ((300, 2, 3), "1, 4, 9 or 16")],
+)
+def test_colours_of_other_gaussians_are_refused(shape, message):
+    baked = BakedScene(random_scene(count=300))
+    with pytest.raises(ValueError, match=message):
+        baked.recolored(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("simd", LEVELS)
