@@ -69,7 +69,7 @@ class PolicyCheckpoint:
             FileNotFoundError: if there is no such file.
             ValueError: if it is damaged, or of another policy, version or architecture.
         """
-        path = Path(path) if path else _SHIPPED / f"{policy}.npz"
+        path = Path(path) if path else shipped_weights(policy)
         remedy = f"train them with: splatpilot train {policy} --out DIR"
         about, weights = _read(path, remedy)
         found_format, found_policy = about["format"], about["policy"]
@@ -97,6 +97,11 @@ class PolicyCheckpoint:
                 f"{path} holds weights of another architecture ({', '.join(differing)}); {remedy}"
             )
         return cls(policy, spec, weights, provenance, path)
+
+
+def shipped_weights(name: str) -> Path:
+    """The file of weights that ships under the name of a policy."""
+    return _SHIPPED / f"{name}.npz"
 
 
 def policy_of(path: str | Path) -> str:

@@ -11,6 +11,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from splatpilot.systems.policies.depth_policy_config import require_speed
 from splatpilot.systems.policies.hypotheses import no_plan
 from splatpilot.systems.policies.mirrored_views import plan_both_views
+from splatpilot.systems.policies.policy_checkpoint import shipped_weights
 from splatpilot.systems.policies.student_inference import RATE, load_network, plan
 from splatpilot.systems.policies.student_spec import HYPOTHESES
 from splatpilot.systems.ports import input_port, output_port
@@ -25,6 +26,8 @@ class StudentConfig:
 
     observation: ClassVar[str]
     """What it sees: rgb or depth."""
+    shipped: ClassVar[str]
+    """The name of its weights that ship."""
     mirrored: ClassVar[bool] = False
     """Whether it sees each image in a mirror too, and flies what both views agree upon, which at
     the goal is the unobstructed way."""
@@ -48,13 +51,15 @@ class StudentRgbConfig(StudentConfig):
     """A student that sees colours."""
 
     observation = "rgb"
+    shipped = "student_rgb"
 
 
 @dataclass
 class PilotRgbConfig(StudentRgbConfig):
-    """A student that sees colours twice, as they are and in a mirror; by the weights of
-    `student_rgb`."""
+    """A student that sees colours twice, as they are and in a mirror; by weights of `student_rgb`,
+    of which others ship for it."""
 
+    shipped = "pilot_rgb"
     mirrored = True
 
 
@@ -63,6 +68,7 @@ class StudentDepthConfig(StudentConfig):
     """A student that sees depth."""
 
     observation = "depth"
+    shipped = "student_depth"
 
 
 class Student(LeafSystem):
@@ -103,7 +109,8 @@ class Student(LeafSystem):
     def __init__(self, config: StudentConfig) -> None:
         super().__init__()
         config.validate()
-        self._network = load_network(config.weights, config.observation, config.speed)
+        weights = config.weights or str(shipped_weights(config.shipped))
+        self._network = load_network(weights, config.observation, config.speed)
         spec, camera = self._network.spec, config.camera
         for name in ("width", "height", "fov_x"):
             given, trained = getattr(camera, name), getattr(spec, name)
