@@ -65,9 +65,9 @@ class StudentTraining:
     # student that takes them for as good.
     experts: int = 1
     # [-] Times that the errors of all hypotheses but the first count where they contend for votes:
-    # at 10 another gets an expert's only where the first is over three times as far off. Where all
-    # are equal, as published, at 1, they share states that one of them would do as well in, and
-    # which of them comes closest there is noise.
+    # at 10 another gets an expert's only where the first is over three times as far off. By colours
+    # fewer flights arrive where all are equal, as published, at 1: they share states that one of
+    # them would do as well in, and which of them comes closest there is noise.
     handicap: float = 10.0
     # [-] Part of an expert's pull that hypotheses without votes share, published as 0.05; more of
     # it makes all hypotheses alike.
@@ -145,5 +145,8 @@ class StudentDepthTraining(StudentTraining):
 
     observation = "depth"
 
+    # Depth tells one way from another better than colours do: the mean of both is rarely wanted.
+    handicap: float = 1.0
+    epsilon: float = 0.05
     # By colours it was tried, and gained nothing.
     clearance_weight: float = 5.0

@@ -55,14 +55,14 @@ def trained(student_corpus, tmp_path_factory) -> Path:
 
 
 def test_student_learns_what_it_is_shown(trained):
-    """A minute's worth of samples is imitated better and better, above all by the first hypothesis,
-    and what is chosen is measured on the held-out world."""
+    """A minute's worth of samples is imitated better and better, every hypothesis keeps votes, and
+    what is chosen is measured on the held-out world."""
     rows = list(csv.DictReader((trained / "curves.csv").open()))
     curve = [{name: float(value) for name, value in row.items() if value} for row in rows]
     assert curve[-1]["winners"] < 0.8 * curve[0]["winners"]
     votes = [[row[f"votes_{m}"] for m in range(3)] for row in curve]
     np.testing.assert_allclose(np.sum(votes, axis=1), 1.0, atol=1e-5)
-    assert votes[-1][0] > 0.5
+    assert min(votes[-1]) > 0.05
     terms = sum(curve[-1][name] for name in ("winners", "unvoted", "cost", "clearance"))
     assert curve[-1]["loss"] == pytest.approx(terms, rel=1e-5)
     best = max(row["success"] for row in curve if "success" in row)
