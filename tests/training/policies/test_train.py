@@ -22,7 +22,7 @@ from splatpilot.systems.configuration import load_config
 from splatpilot.systems.output_folders import claim_folder
 from splatpilot.systems.policies import policy_checkpoint
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, policy_of
 from splatpilot.systems.seeds import TRAINING_SEEDS
 from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
@@ -155,7 +155,8 @@ def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch)
     folder of the data where captured places were trained in."""
     config = tmp_path / "config.yaml"
     config.write_text(re.search("```yaml\n(.*?)```", card.read_text(), re.DOTALL)[1])
-    made_with = load_config(TRAINERS.find(card.stem).config(), config)
+    trainer = TRAINERS.find(policy_of(card.with_suffix(".npz")))
+    made_with = load_config(trainer.config(), config)
     if getattr(getattr(made_with, "worlds", None), "scenes", ()):
         if "SPLATPILOT_DATA" not in os.environ:
             pytest.skip("SPLATPILOT_DATA is not set")
