@@ -65,13 +65,14 @@ class StudentTraining:
     # student that takes them for as good.
     experts: int = 1
     # [-] Times that the errors of all hypotheses but the first count where they contend for votes:
-    # at 10 another gets an expert's only where the first is over three times as far off. By colours
-    # fewer flights arrive where all are equal, as published, at 1: they share states that one of
-    # them would do as well in, and which of them comes closest there is noise.
-    handicap: float = 10.0
-    # [-] Part of an expert's pull that hypotheses without votes share, published as 0.05; more of
-    # it makes all hypotheses alike.
-    epsilon: float = 0.0
+    # at 10 another gets an expert's only where the first is over three times as far off. All are
+    # equal, as published, at 1. More flights arrive by colours at 10 with an epsilon of 0, and
+    # fewer by depth; it takes a head that began with equal ones (`begin`), as of a new one all
+    # but the first would never get a vote.
+    handicap: float = 1.0
+    # [-] Part of an expert's pull that hypotheses without votes share; more of it makes all
+    # hypotheses alike, none lets those that begin badly never be used.
+    epsilon: float = 0.05
     # [1/(m s)] What a metre of soft barrier for a second adds to an error in square metres: at 1
     # grazing an obstacle all along costs as much as flying half a metre beside the expert.
     geometric_weight: float = 1.0
@@ -145,8 +146,5 @@ class StudentDepthTraining(StudentTraining):
 
     observation = "depth"
 
-    # Depth tells one way from another better than colours do: the mean of both is rarely wanted.
-    handicap: float = 1.0
-    epsilon: float = 0.05
     # By colours it was tried, and gained nothing.
     clearance_weight: float = 5.0

@@ -174,7 +174,7 @@ def test_as_many_trajectories_vote_as_asked(student_corpus, tmp_path):
 def test_half_is_learned_in_a_mirror(student_corpus):
     """The pull of one sample is that of the waypoints that would be planned in flight, of the image
     as it is or in a mirror and mirrored back; over some samples it is of either."""
-    overrides = ["batch=1", "mirrored=true", "handicap=1"]
+    overrides = ["batch=1", "mirrored=true", "epsilon=0"]
     trainer = TRAINERS.find("student_rgb").make(training(student_corpus, "rgb", *overrides))
     weights = {name: w.numpy() for name, w in trainer.network.state_dict().items()}
     network = StudentNetwork(trainer.spec, weights)
