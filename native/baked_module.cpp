@@ -76,6 +76,7 @@ void bind_baked(nb::module_& m) {
             new (self) BakedScene(gaussian_arrays(means, quats, scales, opacities, sh, sh_degree));
           },
           nb::kw_only(), "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a)
+      .def_prop_ro("count", &BakedScene::count)
       .def(
           "recolored",
           [](const BakedScene& scene, const Colors& sh, int sh_degree) {

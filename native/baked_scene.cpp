@@ -12,6 +12,8 @@ namespace {
 
 constexpr size_t kPack = 16;
 
+size_t groups_of(size_t count) { return (count + kPack - 1) / kPack; }
+
 // Spreads the low 21 bits of x to every third bit.
 uint64_t spread(uint64_t x) {
   x = (x | x << 32) & 0x1f00000000ffff;
@@ -79,7 +81,7 @@ std::array<double, 6> lower_factor(const float* quat, const float* scale) {
 }
 
 std::vector<float> geometry_of(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  const size_t groups = (g.count + kPack - 1) / kPack;
+  const size_t groups = groups_of(g.count);
   std::vector<float> geometry(groups * 10 * kPack, 0.0f);
   for (size_t slot = 0; slot < groups * kPack; ++slot) {
     float* pack = geometry.data() + slot / kPack * 10 * kPack + slot % kPack;
@@ -95,9 +97,8 @@ std::vector<float> geometry_of(const GaussianArrays& g, const std::vector<uint32
 }
 
 std::vector<float> bounds_of(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  const size_t groups = (g.count + kPack - 1) / kPack;
-  const size_t boxes = (groups * kPack + kBoundSize - 1) / kBoundSize;
-  const size_t box_groups = (boxes + kPack - 1) / kPack;
+  const size_t boxes = (groups_of(g.count) * kPack + kBoundSize - 1) / kBoundSize;
+  const size_t box_groups = groups_of(boxes);
   // A box that does not exist is NaN, which passes no comparison.
   std::vector<float> bounds(box_groups * 7 * kPack, std::numeric_limits<float>::quiet_NaN());
   for (size_t box = 0; box < boxes; ++box) {
@@ -147,7 +148,7 @@ BakedScene::Shape BakedScene::shape_of(const GaussianArrays& g) {
 
 void BakedScene::store_colors(const float* colors, int sh_coefficients, int sh_degree) {
   const size_t values = 3 * static_cast<size_t>((sh_degree + 1) * (sh_degree + 1));
-  const size_t groups = (count() + kPack - 1) / kPack;
+  const size_t groups = groups_of(count());
   colors_.assign(groups * values * kPack, 0.0f);
   for (size_t slot = 0; slot < count(); ++slot) {
     float* pack = colors_.data() + slot / kPack * values * kPack + slot % kPack;

@@ -56,8 +56,8 @@ class StudentRgbConfig(StudentConfig):
 
 @dataclass
 class PilotRgbConfig(StudentRgbConfig):
-    """A student that sees colours twice, as they are and in a mirror; by weights of `student_rgb`,
-    of which others ship for it."""
+    """A student that sees colours twice, as they are and in a mirror. Any weights of `student_rgb`
+    fit it; those that ship are its own."""
 
     shipped = "pilot_rgb"
     mirrored = True

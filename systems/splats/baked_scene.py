@@ -91,8 +91,8 @@ class BakedScene:
         self._scene = _native.BakedScene(**arrays, sh_degree=degree_of(scene.sh.shape[1]))
 
     def recolored(self, sh: np.ndarray) -> "BakedScene":
-        """The same Gaussians in other colours, by the same renderer; in a tenth of the time that
-        baking takes, because whatever does not depend on colours is shared.
+        """The same Gaussians in other colours, by the same renderer, without baking anew: what does
+        not depend on colours is shared.
 
         Args:
             sh: (N, K, 3), see `GaussianScene`, in the order of the scene that was baked.
@@ -101,8 +101,11 @@ class BakedScene:
             ValueError: on another shape, or another number of Gaussians.
         """
         sh = np.ascontiguousarray(sh, dtype=np.float32)
-        if sh.ndim != 3 or sh.shape[2] != 3:
-            raise ValueError(f"sh has shape {sh.shape}; it must be (N, K, 3)")
+        if sh.ndim != 3 or len(sh) != self._scene.count or sh.shape[2] != 3:
+            raise ValueError(
+                f"sh has shape {sh.shape}; it must be ({self._scene.count}, K, 3), a row for each "
+                "Gaussian that was baked"
+            )
         seen = object.__new__(BakedScene)
         seen._scene = self._scene.recolored(sh, degree_of(sh.shape[1]))
         seen._renderer = self._renderer

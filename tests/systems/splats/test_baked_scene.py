@@ -84,7 +84,11 @@ def test_other_colours_are_as_if_baked_anew(degree):
 
 @pytest.mark.parametrize(
     ("shape", "message"),
-    [((300, 3), "must be"), ((299, 1, 3), "as many colours"), ((300, 2, 3), "1, 4, 9 or 16")],
+    [
+        ((300, 3), r"\(300, 3\); it must be \(300, K, 3\)"),
+        ((299, 1, 3), r"\(299, 1, 3\); it must be \(300, K, 3\)"),
+        ((300, 2, 3), "1, 4, 9 or 16"),
+    ],
 )
 def test_colours_of_other_gaussians_are_refused(shape, message):
     baked = BakedScene(random_scene(count=300))
