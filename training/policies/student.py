@@ -11,9 +11,8 @@ reach of two seconds and shrinks to nothing at the goal; beside it stands which 
 has a hidden layer, unlike the paper's, unless `head_features` is 0. The encoder's 4x5 cells are
 kept apart, at 64 numbers each, which are as many as the average over all cells has at 1280; depth
 is encoded by its logarithm, as a grey image; the barrier is integrated over the second that is
-predicted. With a `handicap` the first hypothesis is preferred: another learns a state's trajectory
-only where the first is far off. A student that sees depth also learns to keep as clear as its
-expert, unless `clearance_weight` is 0.
+predicted. With a `handicap` others than the first hypothesis learn only what it is far from. A
+student that sees depth also learns to keep as clear as its expert, unless `clearance_weight` is 0.
 """
 
 from pathlib import Path
