@@ -1,6 +1,6 @@
 """Fitting Gaussians to images and depth: the paper's equations 1 and 2, step by step."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -11,7 +11,6 @@ from splatpilot.systems.splats.background import FAR, Background
 from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.splats.rasterization import EPS2D
-from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.event_log import event_log
 from splatpilot.training.reconstruction import mcmc
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
@@ -102,7 +101,7 @@ class Optimization:
             unit="step",
             mininterval=1,
         )
-        with one_torch_thread(), progress, event_log(config.tensorboard) as log:
+        with progress, event_log(config.tensorboard) as log:
             while self.step < config.iterations:
                 self.take_step()
                 progress.update()
@@ -125,7 +124,7 @@ class Optimization:
         k = self._image_of_step(self.step)
         viewmat, K = self._views.camera(k, config.device)
         backdrop = self._backdrop_of_step(self.step)
-        gaussians = self._gaussians()
+        gaussians = self._gaussians(config.device)
         outlines = self._outlined[k] and self.step % 2 == 1
         rendering = render(
             config.representation,
@@ -168,9 +167,8 @@ class Optimization:
         if views is None:
             return None
         found = []
-        for k in range(len(views)):
-            seen = self._render(views, k)
-            images = (image.cpu().numpy() for image in (seen.color, seen.depth, seen.alpha))
+        for k, seen in enumerate(self._renderings(views)):
+            images = (image.numpy() for image in (seen.color, seen.depth, seen.alpha))
             view, frame = RenderedView(*images), views.frame(k)
             found.append(
                 measure_view(view, self._background, frame, views.vignetting, self._seen[k])
@@ -181,33 +179,42 @@ class Optimization:
         bounded = self._config.initialization == "depth"
         self.splats.limit_scales(scale_limits(self.splats["means"], self._views, bounded))
 
-    def _gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _gaussians(self, device: str) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         splats = self.splats
-        return splats["means"], splats["quats"], *splats.shapes(), splats.sh
+        scales, opacities = splats.shapes()
+        return (
+            splats["means"].to(device),
+            splats["quats"].to(device),
+            scales.to(device),
+            opacities.to(device),
+            splats.sh.to(device),
+        )
 
     @torch.no_grad()
     def _fit_gains(self) -> None:
         """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
         views = self._views
         gains = []
-        for k, image in enumerate(views.images):
-            seen = self._render(views, k)
-            color, alpha = seen.color.cpu(), seen.alpha.cpu()[..., None]
-            gains.append(fit_gain(color * views.vignette[..., None], alpha * image / 255))
+        for seen, image in zip(self._renderings(views), views.images, strict=True):
+            color = seen.color * views.vignette[..., None]
+            gains.append(fit_gain(color, seen.alpha[..., None] * image / 255))
         log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
         self.gains = torch.exp(log_gains - log_gains.mean())
 
-    def _render(self, views: ReconstructionViews, k: int) -> Rendering:
-        """Renders the Gaussians as view k sees them, on black, with median depth."""
-        return render(
-            self._config.representation,
-            self._gaussians(),
-            *views.camera(k, self._config.device),
-            views.width,
-            views.height,
-            depth_mode="MD",
-            renderer=self._renderer,
-        )
+    def _renderings(self, views: ReconstructionViews) -> Iterator[Rendering]:
+        """Renders the Gaussians as each view sees them, on black, with median depth; on the CPU,
+        as cameras in flight do, wherever they are optimised."""
+        gaussians = self._gaussians("cpu")
+        for k in range(len(views)):
+            yield render(
+                self._config.representation,
+                gaussians,
+                *views.camera(k, "cpu"),
+                views.width,
+                views.height,
+                depth_mode="MD",
+                renderer=self._renderer,
+            )
 
     def _image_of_step(self, step: int) -> int:
         """All images in random order, then all again in another; it depends on the step alone."""

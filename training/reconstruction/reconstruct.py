@@ -89,6 +89,7 @@ class ReconstructSummary:
         return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
 
 
+@one_torch_thread()
 def reconstruct(
     capture: Capture, out: str | Path, config: ReconstructConfig, *, restart: bool = False
 ) -> ReconstructSummary:
@@ -148,8 +149,7 @@ def reconstruct(
         optimization.run()
         gains[fitted] = optimization.gains
         gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
-        with one_torch_thread():
-            measured = optimization.measure()
+        measured = optimization.measure()
         if measured is not None:
             gains[held_out] = [view.gain for view in measured.views]
         how = f"{config.representation}, {config.iterations} steps"

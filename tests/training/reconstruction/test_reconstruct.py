@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
@@ -70,6 +71,23 @@ def test_same_capture_same_scene(tmp_path, write_room):
         reconstruct(read_capture(room), tmp_path / name, CONFIG)
     for file in ("gaussians.ply", "scene.yaml"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_torch_computes_on_one_thread(tmp_path, write_room):
+    """From the first image that is read on, and as before thereafter."""
+    capture = read_capture(write_room(tmp_path / "room"))
+    threads, used = torch.get_num_threads(), set()
+
+    def load_image(i: int) -> np.ndarray:
+        used.add(torch.get_num_threads())
+        return capture.load_image(i)
+
+    torch.set_num_threads(2)
+    try:
+        reconstruct(replace(capture, load_image=load_image), tmp_path / "scene", CONFIG)
+        assert (used, torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_number_of_gaussians_is_kept(tmp_path, write_room):
