@@ -15,7 +15,7 @@ from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.demonstrations import keep_clear, see_states
 from splatpilot.training.corpus.library import world_source
 from splatpilot.training.corpus.off_path import STATES_A_LOOK, draw_off_path
-from splatpilot.training.corpus.sample import EXPERT, OFF_PATH, SOURCES, Samples
+from splatpilot.training.corpus.sample import EXPERT, OFF_PATH, SOURCES
 from splatpilot.training.corpus.shard import write_shard
 from splatpilot.training.corpus.world_record import WorldSource, record_world
 from splatpilot.training.policies.expert import PLANNER, ExpertFlight, Labeller, fly_policy
@@ -67,7 +67,8 @@ def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) 
         )
     write_shard(
         shard_folder(folder, source.name),
-        Samples.concatenate(parts, config.size),
+        parts,
+        config.size,
         world=source.name,
         source=EXPERT,
         flights=entries,
@@ -103,7 +104,8 @@ def _gather_off_path(
         parts.append(see_states(demonstrations, world, labeller, alone, bound, rng))
     write_shard(
         shard_folder(folder, source.name, OFF_PATH),
-        Samples.concatenate(parts, config.size),
+        parts,
+        config.size,
         world=source.name,
         source=OFF_PATH,
         flights=[{"states": sum(map(len, parts))}],

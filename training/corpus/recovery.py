@@ -22,7 +22,7 @@ from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.demonstrations import keep_clear, see_states
 from splatpilot.training.corpus.ledger import write_ledger
-from splatpilot.training.corpus.sample import RECOVERY, Samples
+from splatpilot.training.corpus.sample import RECOVERY
 from splatpilot.training.corpus.shard import write_shard
 from splatpilot.training.corpus.world_record import WorldRecord
 from splatpilot.training.policies.expert import Labeller
@@ -175,7 +175,8 @@ def _add_world(
         )
     write_shard(
         path,
-        Samples.concatenate(parts, config.size),
+        parts,
+        config.size,
         world=record.name,
         source=RECOVERY,
         flights=entries,

@@ -1,6 +1,6 @@
 """What a corpus holds of one moment: images, how the vehicle moves, where it wants to, and how."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -63,13 +63,6 @@ class Samples:
         types = size.image_types() | {name: label[name] for name in label.names or ()}
         types |= {"world": np.dtype(np.int32), "source": np.dtype(np.uint8)}
         return cls(**{name: np.zeros(count, dtype) for name, dtype in types.items()})
-
-    @classmethod
-    def concatenate(cls, parts: "list[Self]", size: SampleSize) -> Self:
-        """All samples of `parts`, perhaps none, in order."""
-        parts = [cls.zeros(0, size), *parts]
-        names = [field.name for field in fields(cls)]
-        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
     @property
     def size(self) -> SampleSize:

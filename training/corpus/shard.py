@@ -11,14 +11,16 @@ unchanged since 2007, read by every language, and mapped into memory by NumPy it
 
 import json
 import zlib
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
 from splatpilot.systems.files import folder_written_atomically
-from splatpilot.training.corpus.sample import Samples
+from splatpilot.training.corpus.sample import Samples, SampleSize
 
 FORMAT_VERSION = 2
 
@@ -30,7 +32,8 @@ _CHUNK = 1 << 22  # bytes
 
 def write_shard(
     path: Path,
-    samples: Samples,
+    parts: Sequence[Samples],
+    size: SampleSize,
     *,
     world: str,
     source: int,
@@ -41,7 +44,9 @@ def write_shard(
     Writes the folder `path`, whole or not at all; one that is there stays.
 
     Args:
-        samples: what to write, perhaps none; their `world` and `source` are stated once:
+        parts: what to write, one after the other, perhaps none; their `world` and `source` are
+            stated once:
+        size: theirs.
         world: name of the world that all are from.
         source: one of `SOURCES`, of all.
         flights: of each flight that they come from, what JSON can hold.
@@ -50,12 +55,9 @@ def write_shard(
     Raises:
         OSError: if it cannot be written.
     """
-    labels = np.empty(len(samples), samples.size.label_type())
-    for name in labels.dtype.names or ():
-        labels[name] = getattr(samples, name)
     with folder_written_atomically(path) as folder:
-        for name, array in zip(_ARRAYS, (samples.color, samples.depth, labels), strict=True):
-            np.save(folder / name, array)
+        for name, dtype in (size.image_types() | {"labels": size.label_type()}).items():
+            _write_array(folder / f"{name}.npy", dtype, [_column(part, name) for part in parts])
         files = {
             name: {"bytes": (folder / name).stat().st_size, "crc32": _checksum(folder / name)}
             for name in _ARRAYS
@@ -65,7 +67,7 @@ def write_shard(
             "revision": revision,
             "world": world,
             "source": source,
-            "samples": len(samples),
+            "samples": sum(map(len, parts)),
             "files": files,
             "flights": flights,
         }
@@ -124,6 +126,29 @@ class Shard:
         color, depth, labels = (np.load(self.path / name, mmap_mode="r") for name in _ARRAYS)
         fields = {name: labels[name] for name in labels.dtype.names or ()}
         return {"color": color, "depth": depth} | fields
+
+
+def _column(samples: Samples, name: str) -> np.ndarray:
+    """What one file of a shard has of samples."""
+    if name != "labels":
+        return getattr(samples, name)
+    labels = np.empty(len(samples), samples.size.label_type())
+    for field in labels.dtype.names or ():
+        labels[field] = getattr(samples, field)
+    return labels
+
+
+def _write_array(file: Path, dtype: np.dtype, parts: Sequence[np.ndarray]) -> None:
+    """Writes arrays as the one that `np.save` writes of all of them, which is never in memory."""
+    header = {
+        "descr": dtype_to_descr(dtype.base),
+        "fortran_order": False,
+        "shape": (sum(map(len, parts)), *dtype.shape),
+    }
+    with file.open("wb") as stream:
+        write_array_header_1_0(stream, header)
+        for part in parts:
+            part.tofile(stream)
 
 
 def _checksum(file: Path) -> int:

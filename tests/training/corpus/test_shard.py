@@ -21,9 +21,9 @@ def random_samples(count: int, seed: int = 0) -> Samples:
     return samples
 
 
-def write(path, samples, **said):
+def write(path, *parts, **said):
     write_shard(
-        path, samples, **{"world": "w", "source": EXPERT, "flights": [], "revision": "r"} | said
+        path, parts, SIZE, **{"world": "w", "source": EXPERT, "flights": [], "revision": "r"} | said
     )
     return path
 
@@ -43,6 +43,21 @@ def test_round_trip(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_parts_are_written_one_after_the_other(tmp_path):
+    """Files are those that NumPy writes of the whole, however many parts it comes in."""
+    parts = [random_samples(count, seed=count) for count in (3, 0, 2)]
+    path = write(tmp_path / "a", *parts)
+    Shard(path).verify()
+    for name in ("color", "depth"):
+        whole = tmp_path / f"{name}.npy"
+        np.save(whole, np.concatenate([getattr(part, name) for part in parts]))
+        assert (path / f"{name}.npy").read_bytes() == whole.read_bytes()
+    labels = [Shard(write(tmp_path / str(n), part)).arrays for n, part in enumerate(parts)]
+    for name in ("X_WB", "trajectories_B"):
+        expected = np.concatenate([part[name] for part in labels if part])
+        np.testing.assert_array_equal(Shard(path).arrays[name], expected)
+
+
 def test_images_are_mapped_and_cannot_be_written(tmp_path):
     """Images come as read-only maps of the file."""
     color = Shard(write(tmp_path / "a", random_samples(2))).arrays["color"]
@@ -53,7 +68,7 @@ def test_images_are_mapped_and_cannot_be_written(tmp_path):
 
 def test_a_shard_of_nothing_is_one(tmp_path):
     """A world in which no flight succeeded has a shard too, of length zero."""
-    shard = Shard(write(tmp_path / "a", random_samples(0)))
+    shard = Shard(write(tmp_path / "a"))
     shard.verify()
     assert len(shard) == 0
     assert shard.arrays == {}

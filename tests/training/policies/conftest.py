@@ -70,7 +70,8 @@ def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera)
         samples = _seen(rows, shapes, config)
         write_shard(
             shard_folder(folder, source.name),
-            samples,
+            [samples],
+            config.size,
             world=source.name,
             source=EXPERT,
             flights=[],
