@@ -20,6 +20,7 @@ from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.diagrams.flight import Flight, decision_times, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.pilot import goal_of
+from splatpilot.diagrams.policies import POLICIES
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
@@ -60,15 +61,20 @@ class Fault(NamedTuple):
 
 
 def fly_rollouts(
-    flights: list[tuple[RolloutSpec, str]], modules: Sequence[str] = ()
+    flights: list[tuple[RolloutSpec, str]],
+    modules: Sequence[str] = (),
+    policies: Sequence[str] = (),
 ) -> list[Rollout | Fault]:
     """Flies some flights in this process, each with its scenario as YAML, up to the first fault.
-    `modules` are imported first: those of others that register what flies.
+    `modules` are imported first, those of others that register what flies, and `policies` found,
+    those that no module registers: `module:attribute`.
 
     Configurations of Drake's own do not pickle, and so scenarios travel between processes as text;
     as does what went wrong, because exceptions of others may not either.
     """
     import_modules(modules)
+    for policy in policies:
+        POLICIES.find(policy)
     flown: list[Rollout | Fault] = []
     for spec, text in flights:
         try:

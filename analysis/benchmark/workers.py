@@ -42,7 +42,8 @@ def fly_all(
             before is good.
     """
     modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
-    fly = functools.partial(fly_rollouts, modules=modules)
+    found = [name for name in POLICIES.registered() if ":" in name]
+    fly = functools.partial(fly_rollouts, modules=modules, policies=found)
     work = chunks(((spec, dump_config(scenario)) for spec, scenario in flights), _CHUNK)
     if cluster is not None:
         yield from _on_cluster(fly, work, cluster)

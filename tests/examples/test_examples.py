@@ -91,6 +91,18 @@ def test_own_policy(tmp_path):
     assert re.search(r"sidestep +2 +1/1", out)
 
 
+def test_own_policy_that_no_module_registers(tmp_path):
+    """Named as `module:attribute` it flies in worker processes too."""
+    own = (EXAMPLES / "own_policy.py").read_text().replace("sp.register_policy(", "build = (")
+    kind = 'PolicyKind(*build, speed_field="speed")'
+    own += f"\nfrom splatpilot.diagrams.policies import PolicyKind\nKIND = {kind}\n"
+    (tmp_path / "loose_policy.py").write_text(own)
+    (tmp_path / "short.yaml").write_text(SHORT)
+    words = ["benchmark", "--policies", "mine=loose_policy:KIND", "--scenarios", "short.yaml"]
+    out = answer("-c", MAIN, *words, "--seeds", "2", "--jobs", "2", "--out", "study", cwd=tmp_path)
+    assert re.search(r"mine +2 +2/2", out)
+
+
 def test_photographs_to_flight(opengl, tmp_path):
     """A capture of a room becomes a scene in which a flight arrives."""
     room = trimesh.creation.box((7.0, 4.0, 3.0))
