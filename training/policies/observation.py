@@ -50,15 +50,14 @@ def validate_training_noise(noise: ObservationNoise, name: str) -> None:
 
 
 def validate_color_noise(noise: ObservationNoise, name: str) -> None:
-    """Raises ValueError on noise out of range, or such that images of the moment that are sharp do
-    not have, naming the field of `name`."""
+    """Raises ValueError on noise out of range, or such that images of the moment do not have,
+    naming the field of `name`."""
     noise.validate(name)
-    for field in ("latency", "blur"):
-        if getattr(noise, field) > 0.0:
-            raise ValueError(
-                f"{name}.{field} is {getattr(noise, field)}, but training has sharp images of the "
-                "moment; it must be 0"
-            )
+    if noise.latency > 0.0:
+        raise ValueError(
+            f"{name}.latency is {noise.latency}, but training has images of the moment; it must "
+            "be 0"
+        )
 
 
 def noisy_depth(depth: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
@@ -80,19 +79,32 @@ def disturb_depth(
 
 
 def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
-    """Colours (N, H, W, 3), 0 to 255, as a worse camera measures them, each image anew; blur is
-    left out, see `validate_color_noise`."""
+    """Colours (N, H, W, 3), 0 to 255, as a worse camera measures them, each image anew."""
     brighter = torch.empty_like(color[:, 0, 0, 0]).uniform_(-1.0, 1.0, generator=generator)
     grain = torch.empty_like(color).normal_(generator=generator)
     if noise.hue_jitter > 0.0:
         turn = torch.empty_like(brighter).uniform_(-1.0, 1.0, generator=generator)
         turn = math.radians(noise.hue_jitter) * turn[:, None, None, None]
         color = turned_hue(color, turn.cos(), turn.sin())
+    if noise.blur > 0.0:
+        color = blurred(color, noise.blur)
     if noise.changes_light:
         error = torch.empty_like(brighter).uniform_(-1.0, 1.0, generator=generator)
         photons = torch.empty_like(color).normal_(generator=generator)
         color = expose(color, noise, error[:, None, None, None], photons)
     return disturb_color(color, noise, brighter, grain)
+
+
+def blurred(color: Tensor, sigma: float) -> Tensor:
+    """Colours (N, H, W, 3) through a Gaussian of that standard deviation [px], which ends after
+    four of them, as OpenCV's of floats; what lies beyond the image is what it has in a mirror."""
+    reach = (round(8 * sigma + 1) | 1) // 2
+    x = torch.arange(-reach, reach + 1, dtype=color.dtype, device=color.device)
+    weights = torch.exp(-0.5 * (x / sigma) ** 2)
+    across = (weights / weights.sum()).expand(3, 1, 1, -1)
+    images = torch.nn.functional.pad(color.movedim(-1, 1), [reach] * 4, mode="reflect")
+    images = torch.nn.functional.conv2d(images, across, groups=3)
+    return torch.nn.functional.conv2d(images, across.mT, groups=3).movedim(1, -1)
 
 
 def disturb_color(

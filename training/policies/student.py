@@ -29,8 +29,6 @@ from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.pretrained import imagenet_weights
 from splatpilot.training.policies.student_config import StudentTraining
 from splatpilot.training.policies.student_data import StudentData
-from splatpilot.training.policies.student_features import FrozenFeatures
-from splatpilot.training.policies.student_images import clean_images, in_a_mirror, training_images
 from splatpilot.training.policies.student_loss import (
     barrier_along,
     cost_error,
@@ -43,10 +41,13 @@ from splatpilot.training.policies.student_loss import (
     winners,
 )
 from splatpilot.training.policies.student_network import StudentModule, encode_state
+from splatpilot.training.policies.student_views import StudentViews
 from splatpilot.training.policies.vehicles import rotation_matrix
 
 _CLOSE = 0.25
 """[m] Root mean square distance from an expert's trajectory within which one is as good."""
+_PARTS = 1 << 24
+"""That the images are counted in of which some are disturbed."""
 
 
 class StudentTrainer:
@@ -82,21 +83,7 @@ lower penalty, of error and clearance."""
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
         self.network.to(config.device).to(memory_format=torch.channels_last)
-        # Of images as they are, then in a mirror.
-        views = [False, True] if config.mirrored else [False]
-        self._features = [
-            FrozenFeatures(
-                Path(config.features),
-                self._data,
-                self.network,
-                config.frozen,
-                config.draws,
-                config.appearance,
-                config.noise,
-                mirrored,
-            )
-            for mirrored in (views if config.frozen else [])
-        ]
+        self._views = StudentViews(config, self._data, self.network)
         self._generator = torch.Generator(config.device).manual_seed(config.seed)
         self._rank, self._processes = 0, 1
         data, count = self._data.held_out, config.validation_samples
@@ -151,7 +138,7 @@ lower penalty, of error and clearance."""
         for first in range(0, len(self._validation), batch):
             numbers = self._validation[first : first + batch]
             as_they_are = np.zeros(len(numbers), bool)
-            judged = self._judge(numbers, self._clean_images(numbers), as_they_are)
+            judged = self._judge(numbers, self._views.clean(numbers), as_they_are)
             chosen = judged.costs.argmin(1)
             each = torch.arange(len(chosen))
             clear = (judged.distances[each, chosen] > VEHICLE_RADIUS).all(1)
@@ -179,28 +166,17 @@ lower penalty, of error and clearance."""
         return drawn.cpu().numpy()[self._rank :: self._processes]
 
     def _drawn_images(self, numbers: np.ndarray, mirrored: np.ndarray) -> Tensor:
-        """Images of samples to train with, some of them `mirrored` (N,), or what frozen modules
-        made of them."""
+        """What the network takes of images to train with, some of them `mirrored` (N,)."""
         config = self._config
-        if not self._features:
-            pixels = self._data.pixels(numbers, self.spec.pixels)
-            pixels[mirrored] = in_a_mirror(pixels[mirrored])
-            # Of its own: what it draws depends on how many images this process has.
-            seed = int(torch.randint(2**62, (1,), generator=self._generator, device=config.device))
-            disturbing = torch.Generator(config.device).manual_seed(seed + self._rank)
-            return training_images(pixels, config.appearance, config.noise, disturbing)
-        draws = self._drawn(config.draws)
-        images = self._features[0](numbers, draws)
-        if mirrored.any():
-            images[mirrored] = self._features[1](numbers[mirrored], draws[mirrored])
-        return images.to(config.device)
-
-    def _clean_images(self, numbers: np.ndarray) -> Tensor:
-        """Images of held-out samples, or what frozen modules made of them."""
-        device = self._config.device
-        if not self._features:
-            return clean_images(self._data.pixels(numbers, self.spec.pixels), device)
-        return self._features[0](numbers, np.zeros(len(numbers), int)).to(device)
+        disturbed = np.full(len(numbers), config.disturbed > 0.0)
+        if 0.0 < config.disturbed < 1.0:
+            disturbed = self._drawn(_PARTS) < config.disturbed * _PARTS
+        if config.frozen:
+            return self._views.kept(numbers, self._drawn(config.draws), disturbed, mirrored)
+        # Of its own: what it draws depends on how many images this process has.
+        seed = int(torch.randint(2**62, (1,), generator=self._generator, device=config.device))
+        disturbing = torch.Generator(config.device).manual_seed(seed + self._rank)
+        return self._views.anew(numbers, disturbed, mirrored, disturbing)
 
     def _judge(self, numbers: np.ndarray, images: Tensor, mirrored: np.ndarray) -> "_Judged":
         """What the network makes of samples, against their experts and their worlds.

@@ -91,6 +91,8 @@ class StudentTraining:
     # What the images are disturbed by. Where modules are frozen it costs more than it gains: their
     # features of grain and of pixels without depth are unlike those of anything else.
     noise: ObservationNoise = field(default_factory=ObservationNoise)
+    # Part of the images that are relit and disturbed; the others are seen as they are.
+    disturbed: float = 1.0
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
@@ -102,7 +104,12 @@ class StudentTraining:
                 raise ValueError(
                     f"{name} is {getattr(self, name)}; it must be at least 0, which is all"
                 )
-        for name, limit in (("held_out", 0.9), ("epsilon", 0.5), ("recovery_share", 1.0)):
+        for name, limit in (
+            ("held_out", 0.9),
+            ("epsilon", 0.5),
+            ("recovery_share", 1.0),
+            ("disturbed", 1.0),
+        ):
             value = getattr(self, name)
             if not 0.0 <= value <= limit:
                 raise ValueError(f"{name} is {value}; it must be 0 to {limit}")

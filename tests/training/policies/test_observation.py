@@ -1,5 +1,6 @@
 """What policies in training are told, against what those in flight are."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from splatpilot.systems.sensing.time_of_flight import (
 )
 from splatpilot.training.policies.diffaero import DiffAeroTraining
 from splatpilot.training.policies.observation import (
+    blurred,
     disturb_depth,
     noisy_depth,
     proximity_grid,
@@ -39,6 +41,16 @@ def test_training_disturbs_depth_as_flight_does(noise):
     flown = observation_noise.disturb_depth(depth, noise, *draws, 0.0, np.inf)
     trained = disturb_depth(torch.tensor(depth), noise, *(torch.tensor(d) for d in draws))
     np.testing.assert_allclose(trained, flown, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5])
+def test_training_blurs_as_flight_does(sigma):
+    """Torch and OpenCV make the same of colours, up to the edges."""
+    color = np.random.default_rng(0).uniform(0, 255, (2, 24, 31, 3)).astype(np.float32)
+    trained = blurred(torch.tensor(color), sigma)
+    for image, expected in zip(trained, color, strict=True):
+        flown = cv2.GaussianBlur(expected, (0, 0), sigma)
+        np.testing.assert_allclose(image, flown, atol=1e-3)
 
 
 def test_noise_is_drawn_as_asked_for():
@@ -86,8 +98,8 @@ def test_noise_that_training_cannot_have_is_named():
         validate_training_noise(ObservationNoise(brightness_jitter=0.2), "noise")
     with pytest.raises(ValueError, match=r"rollout\.noise\.latency is 2; it must be"):
         validate_training_noise(ObservationNoise(latency=2), "rollout.noise")
-    with pytest.raises(ValueError, match=r"noise\.blur is 2\.0, but training has sharp images"):
-        validate_color_noise(ObservationNoise(blur=2.0), "noise")
+    with pytest.raises(ValueError, match=r"noise\.latency is 0\.1, but training has images of the"):
+        validate_color_noise(ObservationNoise(latency=0.1), "noise")
 
 
 def test_noise_that_does_not_exist_is_named():
