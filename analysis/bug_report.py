@@ -7,6 +7,24 @@ import traceback
 from collections.abc import Sequence
 
 
+def raised_by(error: BaseException, modules: Sequence[str]) -> str:
+    """
+    The file and line of one of others' `modules` that an exception comes from, if not of ours.
+
+    Args:
+        error: what ended the program.
+        modules: by name.
+    """
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        module = frame.f_globals.get("__name__", "")
+        if module in modules:
+            place = f"{frame.f_code.co_filename}, line {line}"
+        elif module.startswith("splatpilot."):
+            place = ""
+    return place
+
+
 def write_report(error: BaseException, arguments: Sequence[str]) -> str:
     """
     Writes what is needed to find a mistake of this program to a file in the folder for temporary

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any, NoReturn
 
-from splatpilot.analysis.bug_report import write_report
+from splatpilot.analysis.bug_report import raised_by, write_report
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.verb import FailureWithResultError, as_json
 from splatpilot.systems.extras import missing_extra
@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
 
         argcomplete.autocomplete(parser)
     logging.getLogger("drake").addFilter(_is_warning)
-    verb = "splatpilot"
+    verb, options = "splatpilot", argparse.Namespace(modules=[])
     try:
         with _ended_by_signals():
             options = parser.parse_args(arguments)
@@ -148,6 +148,8 @@ def main(arguments: list[str] | None = None) -> int:
             return _say(missing, 1)
         report = write_report(error, sys.argv[1:] if arguments is None else arguments)
         kind = type(error).__name__
+        if place := raised_by(error, options.modules):
+            return _say(f"{place}: {kind}: {error}; the traceback is in {report}", 1)
         return _say(f"{verb} met a mistake of the program ({kind}); the report is {report}", 70)
 
 

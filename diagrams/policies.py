@@ -88,8 +88,13 @@ def register_policy(
             asked for one.
 
     Raises:
-        ValueError: if another policy has the name.
+        ValueError: if another policy has the name, or the type has no `validate`.
     """
+    if not callable(getattr(config, "validate", None)):
+        raise ValueError(
+            f"{config.__name__} has no method validate(); give it one that raises ValueError on a "
+            "value out of range"
+        )
     if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
         speed_field = ""
     kind = PolicyKind(config, build, speed_field)

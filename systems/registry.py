@@ -193,6 +193,8 @@ def import_modules(names: Sequence[str]) -> None:
     for name in names:
         try:
             importlib.import_module(name)
+        except SyntaxError as error:
+            raise ValueError(f"the module {name} cannot be imported: {error}") from error
         except ImportError as error:
             raise ValueError(
                 f"the module {name} cannot be imported: {error}; install it, or put its folder "

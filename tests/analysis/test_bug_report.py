@@ -1,12 +1,14 @@
 """What the command line says of exceptions that are no user's fault, and of want of memory."""
 
 import argparse
+import sys
 import tempfile
 
 import pytest
 
 from splatpilot.analysis import cli
 from splatpilot.analysis.cli import main
+from splatpilot.systems.registry import import_modules
 
 
 @pytest.fixture
@@ -40,6 +42,24 @@ def test_mistakes_of_the_program_leave_a_report(failing, tmp_path, capsys):
     text = report.read_text()
     assert "splatpilot fly" in text and "Traceback" in text and "of our own" in text
     assert "numpy " in text and "Python " in text
+
+
+def test_mistakes_of_imported_modules_are_theirs(failing, tmp_path, monkeypatch, capsys):
+    """What a module that --import names raises is told with its file, line and words, however deep
+    in a library; what our own code raises when it calls us is ours."""
+    (tmp_path / "buggy.py").write_text("import json\ndef fail():\n    json.loads(3)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    import_modules(["buggy"])
+    with pytest.raises(TypeError) as raised:
+        sys.modules["buggy"].fail()
+    failing(raised.value)
+    assert main(["--import", "buggy", "fly"]) == 1
+    said = capsys.readouterr().err
+    assert f"splatpilot: {tmp_path / 'buggy.py'}, line 3: TypeError: the JSON object" in said
+    assert "the traceback is in" in said
+    failing(KeyError("of our own"))
+    assert main(["--import", "buggy", "fly"]) == 70
 
 
 @pytest.mark.parametrize(

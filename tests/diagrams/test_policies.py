@@ -31,6 +31,8 @@ from splatpilot.systems.registry import Registry
 class _OneSpeedConfig:
     """Of a policy whose speed nobody sets."""
 
+    def validate(self) -> None: ...
+
 
 @pytest.mark.parametrize(
     ("name", "outcome"), [("straight", Outcome.COLLISION), ("reactive", Outcome.GOAL)]
@@ -76,6 +78,17 @@ def test_unknown_policy_and_speed_are_refused():
         policy_named("Planner")
     with pytest.raises(ValueError, match=r"speed is -1"):
         policy_named("planner", -1.0)
+
+
+def test_a_configuration_without_validate_is_refused():
+    """Where it is registered, not where it is flown."""
+
+    @dataclass
+    class BareConfig:
+        rate: float = 10.0
+
+    with pytest.raises(ValueError, match=r"BareConfig has no method validate\(\); give it one"):
+        register_policy(BareConfig, lambda config, world, vehicle: None)
 
 
 def test_file_of_weights_is_a_policy(tmp_path):

@@ -105,6 +105,9 @@ def test_module_and_attribute_name_a_kind(registry, tmp_path, monkeypatch):
     assert registry.find("loose:LooseConfig") == registry.find("loose")
     with pytest.raises(ValueError, match=r"the module nowhere cannot be imported"):
         import_modules(["nowhere"])
+    package(tmp_path, "unfinished", "def f(:\n")
+    with pytest.raises(ValueError, match=r"cannot be imported: .*unfinished\.py, line 1"):
+        import_modules(["unfinished"])
 
 
 def test_modules_are_those_that_others_must_import(registry):
