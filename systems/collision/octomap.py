@@ -131,6 +131,11 @@ def read_octomap(path: str | Path) -> Octomap:
     content = path.read_bytes()
     header, separator, tree = content.partition(b"\ndata\n")
     lines = header.split(b"\n")
+    if content.startswith(b"version https://git-lfs"):
+        raise ValueError(
+            f"{path}: the pointer of git-LFS to a map, not the map; run `git lfs pull` where it "
+            "comes from"
+        )
     if not separator or not lines[0].startswith(b"# Octomap OcTree binary file"):
         raise ValueError(
             f"{path}: not a binary OctoMap; a .bt file starts with '# Octomap OcTree binary file'."

@@ -117,12 +117,18 @@ def gaussians_from_depth(
         detail: how many.
 
     Raises:
-        ValueError: if even the largest cells make too many and they are not to be optimised.
+        ValueError: if even the largest cells make too many and they are not to be optimised, or no
+            frame has any depth.
     """
     gains = photometry.gains
     # A gain is a rough account of another tone curve, so other images are preferred to odd ones.
     odd = np.flatnonzero(np.abs(np.log(gains / np.median(gains))) > 0.05)
     views = [ThinnedFrame.of(frame) for frame in frames]
+    if not any(view.depth.any() for view in views):
+        raise ValueError(
+            f"no pixel of {len(frames)} frames has a depth that a surface could have; look at the "
+            "depth images and their unit, or set initialization=random"
+        )
     new = find_new_pixels(views, last=odd.tolist())
 
     def gaussians_of(k: int, frame: CaptureFrame) -> tuple[NDArray, NDArray, NDArray]:

@@ -107,7 +107,8 @@ def find_new_pixels(
             finest[seen] = np.minimum(finest[seen], views[j].pixel_size.flat[shown])
         fine.append((view.pixel_size.ravel() < _COARSER * finest).reshape(view.depth.shape))
 
-    far = [float(np.median(view.pixel_size[view.depth > 0])) for view in views]
+    sizes = [view.pixel_size[view.depth > 0] for view in views]
+    far = [float(np.median(size)) if len(size) else np.inf for size in sizes]
     order = sorted(range(len(views)), key=lambda i: (i in last, far[i]))
     new: dict[int, NDArray[np.bool_]] = {}
     for i in tqdm(order, "choosing", unit="frame"):

@@ -104,6 +104,18 @@ def test_number_of_gaussians_is_kept(tmp_path, write_room):
 
 
 @pytest.mark.parametrize("iterations", [0, 2])
+def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterations):
+    """Depth images in which no pixel has a depth are refused before a scene is made of nothing."""
+    room = write_room(tmp_path / "room")
+    for file in (room / "depth_left").iterdir():
+        np.save(file, np.zeros_like(np.load(file)))
+    config = replace(CONFIG, iterations=iterations)
+    with pytest.raises(ValueError, match=r"no pixel of \d+ frames has a depth that a"):
+        reconstruct(read_capture(room), tmp_path / "scene", config)
+    assert list(tmp_path.iterdir()) == [room]
+
+
+@pytest.mark.parametrize("iterations", [0, 2])
 def test_images_are_read_once(tmp_path, write_room, iterations):
     """However often its frames are looked at, each image is decoded once."""
     capture = read_capture(write_room(tmp_path / "room"))
