@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatpilot.systems import git_lfs
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
@@ -131,11 +132,8 @@ def read_octomap(path: str | Path) -> Octomap:
     content = path.read_bytes()
     header, separator, tree = content.partition(b"\ndata\n")
     lines = header.split(b"\n")
-    if content.startswith(b"version https://git-lfs"):
-        raise ValueError(
-            f"{path}: the pointer of git-LFS to a map, not the map; run `git lfs pull` where it "
-            "comes from"
-        )
+    if content.startswith(git_lfs.POINTER):
+        raise ValueError(f"{path}: {git_lfs.REFUSAL}")
     if not separator or not lines[0].startswith(b"# Octomap OcTree binary file"):
         raise ValueError(
             f"{path}: not a binary OctoMap; a .bt file starts with '# Octomap OcTree binary file'."

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatpilot.systems import git_lfs
 from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
@@ -19,9 +20,7 @@ _GZIP = b"\x1f\x8b"
 _CONVERT = "convert it to PLY, for example with PlayCanvas's splat-transform"
 # What files begin with, or end their name with, that are taken for Gaussians and are none we read.
 _OTHERS = {
-    b"version https://git-lfs": (
-        "the pointer of git-LFS to a file, not the file; run `git lfs pull` where it comes from"
-    ),
+    git_lfs.POINTER: git_lfs.REFUSAL,
     b"glTF": f"a binary glTF; {_CONVERT}, or render a mesh with `splatpilot render`",
     b"PK": f"an archive; if it is SOG, {_CONVERT}",
     b"<": "a page or an XML file; a link that was saved in place of the file, perhaps",

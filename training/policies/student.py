@@ -46,8 +46,8 @@ from splatpilot.training.policies.vehicles import rotation_matrix
 
 _CLOSE = 0.25
 """[m] Root mean square distance from an expert's trajectory within which one is as good."""
-_PARTS = 1 << 24
-"""That the images are counted in of which some are disturbed."""
+_LOTS = 1 << 24
+"""Of which an image draws one: those below `disturbed` of them all have it disturbed."""
 
 
 class StudentTrainer:
@@ -170,7 +170,7 @@ lower penalty, of error and clearance."""
         config = self._config
         disturbed = np.full(len(numbers), config.disturbed > 0.0)
         if 0.0 < config.disturbed < 1.0:
-            disturbed = self._drawn(_PARTS) < config.disturbed * _PARTS
+            disturbed = self._drawn(_LOTS) < config.disturbed * _LOTS
         if config.frozen:
             return self._views.kept(numbers, self._drawn(config.draws), disturbed, mirrored)
         # Of its own: what it draws depends on how many images this process has.

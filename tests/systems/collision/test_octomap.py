@@ -115,7 +115,7 @@ def test_boxes_too_large_or_empty_are_refused(tmp_path):
         (lambda c: c[: c.index(b"data\n") + 5], "the octree is empty"),
         (lambda c: b"PK\x03\x04" + c, "not a binary OctoMap"),
         (lambda c: b"", "not a binary OctoMap"),
-        (lambda c: b"version https://git-lfs\n", "the pointer of git-LFS to a map"),
+        (lambda c: b"version https://git-lfs\n", "the pointer of git-LFS to a file"),
     ],
 )
 def test_damaged_and_foreign_files_are_refused(tmp_path, damage, message):
