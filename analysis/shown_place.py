@@ -20,7 +20,7 @@ from splatpilot.diagrams.worlds.scene_metadata import FRONTIER, read_scene_metad
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.splats.gaussian_ply import read_ply
-from splatpilot.systems.splats.splat_files import SUFFIXES, read_splats
+from splatpilot.systems.splats.splat_files import read_splats
 from splatpilot.systems.visualization.drawing import GOAL_COLOR, START_COLOR
 from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace
 from splatpilot.training.captures.capture import Capture
@@ -30,6 +30,7 @@ from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.captures.video import is_video
 
+_SCENARIOS = {".yaml", ".yml"}
 _MAX_IMAGES = 60
 _IMAGE_WIDTH = 480  # [px]
 _HEADROOM = 0.15  # of the place's height, left above what is of interest
@@ -54,8 +55,8 @@ def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownP
         return _generated(scenario)
     if seed is not None:
         raise ValueError(f"--seed {seed}: {what} is no generated world; leave the seed out")
-    scene = path.suffix.lower() in SUFFIXES or (path / "scene.yaml").is_file()
-    if not scene:
+    scene = (path / "scene.yaml").is_file()
+    if not scene and not _may_hold_gaussians(path):
         return _capture(path, overrides)
     if overrides:
         raise ValueError(f"--set {overrides[0]}: a finished scene has no settings; leave it out")
@@ -69,13 +70,19 @@ def generated_scenario(path: Path, seed: int | None, overrides: Sequence[str]) -
     Raises:
         FileNotFoundError, ValueError: see `load_config`.
     """
-    if path.is_dir() or path.suffix.lower() in SUFFIXES or is_video(path):
+    if path.is_dir() or _may_hold_gaussians(path) or is_video(path):
         return None
     if path.suffix.lower() == OCTOMAP:
         scenario = load_config(Scenario(world=place_config(path)), None, list(overrides))
     else:
         scenario = load_config(Scenario(), scenario_file(str(path)), list(overrides))
     return scenario if seed is None else replace(scenario, seed=seed)
+
+
+def _may_hold_gaussians(path: Path) -> bool:
+    """Whether it is no file of any other kind that is shown."""
+    suffix = path.suffix.lower()
+    return path.is_file() and suffix not in _SCENARIOS | {OCTOMAP} and not is_video(path)
 
 
 def _generated(scenario: Scenario) -> ShownPlace:

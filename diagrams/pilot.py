@@ -14,6 +14,7 @@ from splatpilot.systems.messaging.finite_vector import FiniteVector
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
 from splatpilot.systems.policies.velocity_tracker import VelocityTracker
+from splatpilot.systems.ports import connect
 from splatpilot.systems.vehicle.flatness_controller import FlatnessController
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
@@ -33,9 +34,15 @@ def make_policy(scenario: Scenario, world: World) -> System:
     """The scenario's policy.
 
     Raises:
-        ValueError: for a configuration that no policy has.
+        ValueError: for a configuration that no policy has, or of which none is built.
     """
-    return POLICIES.kind_of(scenario.policy).build(scenario.policy, world, scenario.vehicle)
+    policy = POLICIES.kind_of(scenario.policy).build(scenario.policy, world, scenario.vehicle)
+    if not isinstance(policy, System):
+        raise ValueError(
+            f"what builds the policy {POLICIES.name_of(POLICIES.kind_of(scenario.policy))!r} gave "
+            f"{type(policy).__name__}; it must return a Drake system"
+        )
+    return policy
 
 
 def AddPilot(
@@ -62,7 +69,8 @@ def AddPilot(
             instead of decisions that are no numbers, and its command is not exported.
 
     Raises:
-        ValueError: for a configuration that no policy has, and a system without the ports it needs.
+        ValueError: for a configuration that no policy has, and a system without the ports it needs
+            or with one of another size.
     """
     policy = policy or make_policy(scenario, world)
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
@@ -98,7 +106,7 @@ def ConnectObservation(
     Leads to each input of the policy what bears its name.
 
     Raises:
-        ValueError: if there is no such thing.
+        ValueError: if there is no such thing, or it has another size.
     """
     observed = observed | {"goal": builder.GetSubsystemByName("goal").get_output_port(0)}
     for index in range(policy.num_input_ports()):
@@ -109,7 +117,7 @@ def ConnectObservation(
                 f"{type(policy).__name__}; there are {', '.join(observed)}, and the outputs of "
                 "sensors that the scenario names"
             )
-        builder.Connect(observed[port.get_name()], port)
+        connect(builder, observed[port.get_name()], port)
 
 
 def require_ports(what: str, system: System, inputs: list[str], outputs: list[str]) -> None:
@@ -161,13 +169,13 @@ def _ConnectDecision(
         tracker = VelocityTracker()
         builder.AddNamedSystem("velocity_tracker", tracker)
         builder.Connect(state, tracker.state_input_port())
-        builder.Connect(flown, tracker.velocity_input_port())
+        connect(builder, flown, tracker.velocity_input_port())
         flown = tracker.acceleration_output_port()
         kind = "acceleration"
     require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
-    builder.Connect(flown, controller.GetInputPort(kind))
+    connect(builder, flown, controller.GetInputPort(kind))
     if policy.HasOutputPort("heading"):
-        builder.Connect(policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
+        connect(builder, policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
     return decision
 
 

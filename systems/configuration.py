@@ -145,7 +145,10 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
         _require_finite(text)
         tokens = [token for token in yaml.scan(text) if isinstance(token, yaml.TagToken)]
         _resolve_open_fields(config, {token.value[1] for token in tokens})
-        _check_names(config, yaml.load(text, _NamesLoader), "")
+        given = yaml.load(text, _NamesLoader)
+        if given is None:
+            raise ValueError("holds no field; write NAME: VALUE of what is to change, or leave it")
+        _check_names(config, given, "")
         return yaml_load_typed(schema=type(config), data=tagged or text, defaults=config)
     except yaml.YAMLError as error:
         raise ValueError(f"{source} is not YAML: {yaml_problem(error)}") from None

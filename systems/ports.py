@@ -3,7 +3,14 @@
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.framework import Context, InputPort, OutputPort, System
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    InputPort,
+    OutputPort,
+    PortDataType,
+    System,
+)
 
 
 def input_port(name: str) -> Callable[[System], InputPort]:
@@ -30,3 +37,25 @@ def optional_input(system: System, name: str, context: Context) -> np.ndarray | 
     """The vector at the input port of that name; None where nothing is connected."""
     port = system.GetInputPort(name)
     return np.asarray(port.Eval(context)) if port.HasValue(context) else None
+
+
+def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> None:
+    """Connects two ports.
+
+    Raises:
+        ValueError: if one has another size than the other, or holds no vector where that does; the
+            message names both.
+    """
+    if (source.get_data_type(), source.size()) != (target.get_data_type(), target.size()):
+        raise ValueError(
+            f"{_described(source)} and {_described(target)} that it leads to; they must be alike"
+        )
+    builder.Connect(source, target)
+
+
+def _described(port: InputPort | OutputPort) -> str:
+    vector = port.get_data_type() == PortDataType.kVectorValued
+    way = "input" if isinstance(port, InputPort) else "output"
+    what = f"a vector of {port.size()}" if vector else "no vector"
+    system = port.get_system()
+    return f"the {way} {port.get_name()!r} of {type(system).__name__} is {what}"

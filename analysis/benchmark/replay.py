@@ -1,8 +1,9 @@
 """`splatpilot replay`: one flight of a study, flown again."""
 
+import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from splatpilot.diagrams.flight_page import (
 )
 from splatpilot.diagrams.fly import fly_with_bar
 from splatpilot.systems.files import require_unused, require_writable_folder
+from splatpilot.systems.provenance import program
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.visualization.replay_page import ReplayedFlight
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
@@ -63,7 +65,7 @@ def run(
     """
     folder = StudyFolder(study)
     spec = find_flight(folder, id)
-    row, recorded = folder.read(spec)
+    row, recorded = _record(folder, spec)
     if not recorded:
         raise ValueError(f"{id} could not be flown and cannot be compared: {row['reason']}")
     _, scenario = next(kept_flights(folder, [spec]))
@@ -90,8 +92,7 @@ def run(
     else:
         print(
             f"THE REPLAY DIFFERS from the recorded flight ({row['outcome']}) by up to "
-            f"{result.deviation:.3g} m. Another processor or other versions of libraries round "
-            "differently; study.yaml says which program flew it."
+            f"{result.deviation:.3g} m. {_likely_reason(folder, spec)}."
         )
     if filmed:
         files = {"flight.html": meshcat, "flight.mp4": video}
@@ -133,7 +134,7 @@ def overlay(
             )
     flights = []
     for spec in specs:
-        row, arrays = folder.read(spec)
+        row, arrays = _record(folder, spec)
         if not arrays:
             raise ValueError(f"{spec.id} could not be flown and cannot be shown: {row['reason']}")
         times, states, clearances = (
@@ -165,6 +166,35 @@ def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:
             "see rollouts.csv"
         )
     return specs[id]
+
+
+def _record(folder: StudyFolder, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """`StudyFolder.read`, which says what to do about a flight that is not there yet."""
+    try:
+        return folder.read(spec)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"{spec.id} has not been flown yet in {folder.path}; run the study again, it goes on"
+        ) from None
+
+
+def _likely_reason(folder: StudyFolder, spec: RolloutSpec) -> str:
+    """Why a flight came out otherwise than in the study: its program, its processor or its policy,
+    in one sentence without the full stop."""
+    recorded, here = folder.program(), program()
+    for name, version in recorded.items():
+        if here.get(name) != version:
+            return f"It was flown by {name} {version}, this is {here.get(name, 'absent')}"
+    host = folder.read_timing(spec.id).get("host", "a machine that is not known")
+    if host != platform.node():
+        return (
+            f"It was flown on {host}, this is {platform.node()}: another C library, or a processor "
+            "without AVX2, rounds differently"
+        )
+    return (
+        f"Program and machine are those that flew it: {spec.policy} keeps state outside of the "
+        "Context, draws numbers without the seed, or has changed since"
+    )
 
 
 def compare(flight: Flight, recorded: dict[str, np.ndarray], recorded_digest: str) -> Agreement:

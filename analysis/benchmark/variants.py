@@ -68,6 +68,8 @@ def parse_variant(text: str) -> Variant:
         ValueError: if the label is none that a file can bear, or a field has another place.
     """
     label, _, rest = text.partition("=")
+    if text.startswith("="):
+        raise ValueError(f"the policy {text[:100]!r} has no label before its =; give it one")
     if "=" not in text or ":" in label:
         label, rest = "", text
     policy, *overrides = re.split(f":(?={_FIELD})", rest)

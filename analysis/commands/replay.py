@@ -14,7 +14,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         _replay,
         help="fly one flight of a study again, and check it",
         description="Flies one flight of a study again, from the study's folder alone, and "
-        "compares it with its record; of several flights it draws one page.",
+        "compares it with its record, ending with status 1 where they differ; of several flights "
+        "it draws one page.",
         examples=(
             "replay out/study P08-reactive-2-003 --meshcat --video",
             "replay out/study P08-planner-2-003 P08-reactive-2-003 --overwrite",
@@ -42,7 +43,7 @@ def _replay(options: argparse.Namespace) -> None:
             study=options.study, ids=options.ids, out=options.out, overwrite=options.overwrite
         )
         return
-    replay.run(
+    agreement = replay.run(
         study=options.study,
         id=options.ids[0],
         out=options.out,
@@ -50,3 +51,5 @@ def _replay(options: argparse.Namespace) -> None:
         video=options.video,
         overwrite=options.overwrite,
     )
+    if not agreement.exact:
+        raise ValueError(f"{options.ids[0]}: the replay differs from the recorded flight")

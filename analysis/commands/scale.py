@@ -15,17 +15,23 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         _scale,
         help="give a scene its size: by a factor, a measured length, or the cameras' height",
         description="Writes the scene anew with all its lengths times one factor. A scene of "
-        "photographs alone, whose scale is unknown, can be flown in then.",
+        "photographs alone, whose scale is unknown, can be flown in then. Of a file of "
+        "Gaussians it writes a PLY in metres with z up.",
         examples=(
             "scale scenes/room --out scenes/room_metric --height 1.5",
             "scale scenes/room --out scenes/room_metric --between 0,0,1 2,0,1 --distance 3.2",
+            "scale garden.ply --out garden_metric.ply --up -y --factor 1.7",
         ),
     )
-    # Points may begin with a minus sign, which argparse takes for an option unless it is a number.
-    scale._negative_number_matcher = re.compile(r"-[\d.]")  # pyright: ignore
-    scale.add_argument("scene", type=Path, help="scene folder")
-    scale.add_argument("--out", type=Path, required=True, help="scene folder to write")
-    by = scale.add_mutually_exclusive_group(required=True)
+    # Points and axes may begin with a minus sign, which argparse takes for an option unless it is a
+    # number.
+    scale._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")  # pyright: ignore
+    scale.add_argument("scene", type=Path, help="scene folder, or file of Gaussians")
+    scale.add_argument("--out", type=Path, required=True, help="scene folder, or PLY, to write")
+    scale.add_argument(
+        "--up", choices=("x", "-x", "y", "-y", "z", "-z"), help="which way is up in a file (z)"
+    )
+    by = scale.add_mutually_exclusive_group()
     by.add_argument("--factor", type=float, help="what one unit of the scene becomes [m]")
     by.add_argument(
         "--between",
@@ -42,8 +48,10 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _scale(options: argparse.Namespace) -> None:
     if (options.between is None) != (options.distance is None):
         raise ValueError("--between and --distance belong together: two points and the metres")
+    if (options.factor, options.between, options.height, options.up) == (None, None, None, None):
+        raise ValueError("what is its size? Give --factor, --between with --distance, or --height")
     points = [_point(text) for text in options.between or ()]
-    require_existing(options.scene, "a scene folder")
+    require_existing(options.scene, "a scene folder or a file of Gaussians")
     from splatpilot.analysis.reconstruction import rescale
 
     rescale.run(
@@ -53,6 +61,7 @@ def _scale(options: argparse.Namespace) -> None:
         between=points,
         distance=options.distance,
         height=options.height,
+        up=options.up,
     )
 
 

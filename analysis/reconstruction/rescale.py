@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from splatpilot.analysis.reconstruction.rescale_file import FileSummary, rescale_file
 from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
@@ -62,29 +63,43 @@ def run(
     between: Sequence[ArrayLike] = (),
     distance: float | None = None,
     height: float | None = None,
-) -> RescaleSummary:
-    """Writes the scene folder `scene` anew as `out`, see `rescale`, and prints what it is.
+    up: str | None = None,
+) -> RescaleSummary | FileSummary:
+    """Writes a scene folder anew as `out`, see `rescale`, or a file of Gaussians, see
+    `rescale_file`, and prints what it is.
 
     Args:
         factor: of all lengths; or
         between, distance: two points (3,) of the scene, and the metres between them; or
         height: [m], median height of the capture's cameras above the ground.
+        up: which way is up in a file; scene folders have z up.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: see `rescale`; or if the two points are one, a
-            length is not positive, or no height of the cameras can be found in the capture.
+        FileNotFoundError, ValueError, OSError: see `rescale` and `rescale_file`; or if the two
+            points are one, a length is not positive, or no height of the cameras can be found in
+            the capture.
     """
-    metadata = read_scene_metadata(scene)
+    if scene.is_file() and height is not None:
+        raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
+    if scene.is_dir() and up is not None:
+        raise ValueError(f"{scene}: z is up in scene folders; leave up = {up} out")
     if distance is not None:
         a, b = (np.asarray(p, dtype=float) for p in between)
         if not (length := float(np.linalg.norm(a - b))) > 0:
             raise ValueError(f"both points are {a.tolist()}; two places are needed")
         factor = _positive("distance", distance) / length
     elif height is not None:
-        factor = _positive("height", height) / camera_height(read_capture_of(scene, metadata))
+        factor = _positive("height", height) / camera_height(
+            read_capture_of(scene, read_scene_metadata(scene))
+        )
+    elif factor is None and up is not None:
+        factor = 1.0
     if factor is None:
         raise ValueError("give a factor, two points and the distance between them, or a height")
-    summary = rescale(scene, out, factor)
+    if scene.is_file():
+        summary = rescale_file(scene, out, _positive("factor", factor), up or "z")
+    else:
+        summary = rescale(scene, out, factor)
     print(summary)
     return summary
 

@@ -1,5 +1,6 @@
 """From the folder of a capture to a scene folder that has been measured."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction.measure_scene import SHEET, measure_scene
@@ -9,6 +10,7 @@ from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.files import require_unused
 from splatpilot.systems.output_folders import held_folder
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.check import doubts
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
 from splatpilot.training.reconstruction.checkpoint import work_folder
@@ -42,8 +44,12 @@ def run(
     opened = read_capture(capture, config.capture)
     if not _is_unmeasured(Path(out), opened):
         require_unused(Path(out), overwrite)
+    doubted = doubts(opened)
+    for doubt in doubted:  # Said at once, for what follows takes long, and again in the end.
+        print(f"warning: {doubt}", flush=True)
     with held_folder(work_folder(Path(out))):
         summary = reconstruct(opened, out, config, restart=restart)
+        summary = replace(summary, warnings=(*doubted, *summary.warnings))
         print(summary)
         measures = measure_scene(Path(out), opened)
         print(measures)

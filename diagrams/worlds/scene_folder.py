@@ -188,7 +188,7 @@ def _read_bare_gaussians(path: Path) -> World:
         raise ValueError(
             f"{path}: 98 % of the Gaussians span {np.round(upper_W - lower_W, 1).tolist()} m, for "
             f"which voxels of {voxel_size:.2f} m would be needed, more than {_COARSEST} m; crop "
-            "far Gaussians away, and scale the scene if its unit is not the metre"
+            "far Gaussians away, or give it its size with `splatpilot scale`"
         )
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
     p_WS, p_WG, _ = choose_start_and_goal(esdf, VEHICLE_RADIUS)

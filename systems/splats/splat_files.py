@@ -13,9 +13,6 @@ from splatpilot.systems.splats.sound_gaussians import sound_gaussians
 from splatpilot.systems.splats.spherical_harmonics import C0
 from splatpilot.systems.splats.spz import MAGIC, read_spz
 
-SUFFIXES = {".ply", ".splat", ".spz"}
-"""Of files that are read; those of PLY and SPZ may have any."""
-
 _GZIP = b"\x1f\x8b"
 _CONVERT = "convert it to PLY, for example with PlayCanvas's splat-transform"
 # What files begin with, or end their name with, that are taken for Gaussians and are none we read.

@@ -117,6 +117,12 @@ def _read_header(path: Path, start: bytes, versions: tuple[int, ...]) -> _Header
         raise ValueError(f"{path}: the header is cut short; copy it again")
     _, version, count, degree, bits, _, _ = _HEADER.unpack_from(start)
     if version not in versions:
+        if version in (2, 3, 4):
+            how = "are compressed as one gzip, and this is not" if version < 4 else "are no gzip"
+            raise ValueError(
+                f"{path}: says that it is SPZ of version {version}, whose files {how}; export it "
+                "again"
+            )
         raise ValueError(f"{path}: SPZ of version {version}; 2 to 4 are read: convert it to PLY")
     if degree >= len(_COEFFICIENTS) or bits > _LARGEST_BITS or count == 0:
         raise ValueError(

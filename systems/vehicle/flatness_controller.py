@@ -222,6 +222,7 @@ class FlatnessController(LeafSystem):
         if not np.isfinite(value).all():
             raise ValueError(
                 f"FlatnessController '{self.get_name()}': input '{name}' is {value.tolist()} at "
-                f"t = {context.get_time()} s but must be finite; check what feeds it"
+                f"t = {context.get_time()} s but must be finite; look at what "
+                "gives it, in flights the policy"
             )
         return value

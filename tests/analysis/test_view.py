@@ -158,6 +158,8 @@ def test_looking_needs_no_extras():
     ("words", "message"),
     [
         (["nowhere"], "nowhere: there is no such file or folder"),
+        (["room.ksplat"], "room.ksplat: a KSPLAT; convert it to PLY"),
+        (["room.glb"], "room.glb: a binary glTF"),
         (["scene", "--seed", "1"], "no generated world"),
         (["scene", "--set", "world.length=3"], "a finished scene has no settings"),
     ],
@@ -165,6 +167,8 @@ def test_looking_needs_no_extras():
 def test_what_cannot_be_shown_is_refused(place, monkeypatch, capsys, words, message):
     """One sentence says why, and no page is written."""
     place.scene("scene")
+    (place.folder / "room.ksplat").write_bytes(bytes(64))
+    (place.folder / "room.glb").write_bytes(b"glTF\x02\x00\x00\x00")
     monkeypatch.chdir(place.folder)
     assert main(["view", *words]) == 1
     assert message in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """Diagrams of finished systems, and of sensors."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
@@ -7,7 +9,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.diagrams.flight import Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.policies import POLICIES, policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.configuration import dump_config, load_config, parse_config
 from splatpilot.systems.policies.reactive import Reactive
@@ -90,6 +92,51 @@ def test_systems_without_the_ports_they_need_are_named(post_world):
 
     with pytest.raises(ValueError, match=r"nothing gives the input 'wind' of the policy Listener"):
         flown(scenario, post_world, policy=Listener())
+
+
+def test_ports_of_another_size_are_named(post_world):
+    """A policy whose outputs or inputs have another size than what they lead to is an error that
+    names both."""
+
+    class Policy(LeafSystem):
+        def __init__(self, output: str, size: int, goal: int = 3):
+            super().__init__()
+            self.DeclareVectorInputPort("goal", goal)
+            self.DeclareVectorOutputPort(output, size, lambda _, y: None)
+
+    for policy, message in (
+        (
+            Policy("waypoint", 4),
+            "'waypoint' of Policy is a vector of 4 and the input 'waypoint' of",
+        ),
+        (
+            Policy("velocity", 1),
+            "'velocity' of Policy is a vector of 1 and the input 'velocity' of",
+        ),
+        (Policy("waypoint", 3, goal=2), "and the input 'goal' of Policy is a vector of 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            flown(Scenario(timeout=1.0), post_world, policy=policy)
+
+    class Painter(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("color_image", 3)
+            self.DeclareVectorOutputPort("waypoint", 3, lambda _, y: None)
+            self.camera = OnboardCamera()
+
+    with pytest.raises(ValueError, match=r"is no vector and the input 'color_image' of Painter"):
+        flown(Scenario(timeout=1.0), post_world, policy=Painter())
+
+
+def test_what_builds_no_policy_is_named(post_world, monkeypatch):
+    """A registered policy whose function returns nothing is an error that says so."""
+    config = policy_named("straight")
+    kind = dataclasses.replace(POLICIES.kind_of(config), build=lambda *_: None)
+    monkeypatch.setattr(POLICIES, "kind_of", lambda _: kind)
+    monkeypatch.setattr(POLICIES, "name_of", lambda _: "mine")
+    with pytest.raises(ValueError, match=r"the policy 'mine' gave NoneType; it must return a"):
+        flown(Scenario(timeout=1.0, policy=config), post_world)
 
 
 def test_configuration_that_nobody_knows_is_refused(post_world):

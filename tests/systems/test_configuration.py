@@ -78,6 +78,10 @@ def test_bad_file_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"scenario.yaml is not YAML: line 3: expected .*") as said:
         load_config(Scenario(), path)
     assert "\n" not in str(said.value)
+    for nothing in ("", "# seed: 3\n", "---\n"):
+        path.write_text(nothing)
+        with pytest.raises(ValueError, match=r"scenario.yaml: holds no field; write NAME: VALUE"):
+            load_config(Scenario(), path)
 
 
 def test_files_are_not_repeated_in_errors(tmp_path):

@@ -141,7 +141,13 @@ def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
         ValueError: if either makes no sense.
     """
     file = path / CONFIG_FILE
-    completed = load_config(CaptureConfig(), file if file.is_file() else None)
+    completed = CaptureConfig()
+    if file.is_file():
+        completed = load_config(completed, file)
+        try:
+            completed.validate()
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
     for other, default, merged in (
         (config, CaptureConfig(), completed),
         (config and config.scale, ScaleConfig(), completed.scale),

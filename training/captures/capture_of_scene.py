@@ -18,7 +18,9 @@ def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
     file = scene / "scene.yaml"
     if not metadata.capture:
         raise ValueError(
-            f"{file}: names no capture to compare the scene with; reconstruct it again"
+            f"{file}: names no capture to compare the scene with: it came without one, or has "
+            "another size than the depth that its capture measured; measure the scene that "
+            "`splatpilot reconstruct` wrote"
         )
     try:
         config = load_config(CaptureConfig(), overrides=metadata.capture_settings)

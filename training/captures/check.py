@@ -94,6 +94,21 @@ def run(*, capture: str | Path, config: CheckConfig) -> CheckReport:
     return report
 
 
+def doubts(capture: Capture) -> tuple[str, ...]:
+    """Returns, as a warning or none, what `check_capture` holds against a capture with depth."""
+    if not capture.has_depth:
+        return ()
+    try:
+        mistake = check_capture(capture).mistake
+    except ValueError as error:
+        return (f"not checked whether the capture agrees with itself: {error}",)
+    if not mistake:
+        return ()
+    return (
+        f"the capture does not agree with itself, {mistake}; `splatpilot capture check` tells more",
+    )
+
+
 def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     """Measures how well a capture agrees with itself, as it is read and in other readings.
 
@@ -122,7 +137,12 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     best = others[0]
     color = None
     mistake = ""
-    if agreement.error > _NEGLIGIBLE and best.error < _BETTER * agreement.error:
+    if _stands_still(capture):
+        mistake = (
+            f"all {len(capture)} poses are the same; if the camera moved, look at the file that "
+            "they were read from"
+        )
+    elif agreement.error > _NEGLIGIBLE and best.error < _BETTER * agreement.error:
         mistake = (
             f"most likely {best.name}: the median error would be {best.error:.2%} instead of "
             f"{agreement.error:.2%}"
@@ -147,3 +167,8 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
         color=color,
         mistake=mistake,
     )
+
+
+def _stands_still(capture: Capture) -> bool:
+    X_CW = capture.X_WCs[0].inverse()
+    return all((X_CW @ X_WC).IsNearlyIdentity(1e-9) for X_WC in capture.X_WCs)

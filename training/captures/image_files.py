@@ -15,6 +15,9 @@ from splatpilot.training.captures.exr_files import exr_size, read_exr
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
+_DEPTH_IS = "depth is one number a pixel, of integers of more than 8 bits or floats"
+# Pillow's modes of images without depth; four channels may be the bytes of one number.
+_NO_DEPTH = {"1", "L", "P", "LA", "PA", "RGB", "CMYK", "YCbCr"}
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
 
 
@@ -25,10 +28,15 @@ def image_size(file: Path) -> tuple[int, int]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is empty, no image or cut short.
     """
+    return _image_header(file)[0]
+
+
+def _image_header(file: Path) -> tuple[tuple[int, int], str]:
+    """Its size, and Pillow's name for what its pixels are."""
     _require_content(file)
     try:
         with Image.open(file) as image:
-            size, kind = image.size, image.format
+            size, kind, mode = image.size, image.format, image.mode
     except Exception as error:  # Pillow raises anything of damaged files
         raise ValueError(
             f"{file}: not a readable image ({_reason(error)}); copy it again"
@@ -39,7 +47,7 @@ def image_size(file: Path) -> tuple[int, int]:
         stream.seek(max(0, file.stat().st_size - 65536))
         if _ENDS.get(kind or "", b"") not in stream.read():
             raise ValueError(f"{file}: not a readable image (it is cut short); copy it again")
-    return size
+    return size, mode
 
 
 def array_shape(file: Path) -> tuple[int, ...]:
@@ -55,8 +63,8 @@ def array_shape(file: Path) -> tuple[int, ...]:
 def _depth_layout(file: Path) -> tuple[tuple[int, ...], np.dtype]:
     _require_content(file)
     shape, dtype = array_layout(file)
-    if dtype.kind not in "iuf":
-        raise ValueError(f"{file}: an array of {dtype}; depth is integers or floats")
+    if dtype.kind not in "iuf" or dtype.itemsize == 1:
+        raise ValueError(f"{file}: an array of {dtype}; {_DEPTH_IS}")
     return shape, dtype
 
 
@@ -66,7 +74,10 @@ def depth_size(file: Path) -> tuple[int, int]:
         _require_content(file)
         return exr_size(file)
     if file.suffix != ".npy":
-        return image_size(file)
+        size, mode = _image_header(file)
+        if mode in _NO_DEPTH:
+            raise ValueError(f"{file}: pixels of 8 bits or several channels; {_DEPTH_IS}")
+        return size
     shape = array_shape(file)
     if len(shape) != 2:
         raise ValueError(f"{file}: an array of shape {shape}; depth has rows and columns alone")
@@ -97,10 +108,7 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     else:
         raw = _decode(file, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype == np.uint8:
-        raise ValueError(
-            f"{file}: a {raw.dtype} array of shape {raw.shape} is no depth; rows and columns of "
-            "more than 8 bits are needed"
-        )
+        raise ValueError(f"{file}: a {raw.dtype} array of shape {raw.shape}; {_DEPTH_IS}")
     depth = raw.astype(np.float32) / np.float32(unit)
     if raw.dtype == np.uint16:
         depth[raw == 65535] = 0

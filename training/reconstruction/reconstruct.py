@@ -1,5 +1,6 @@
 """From a capture to a scene folder that can be flown in."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +37,9 @@ from splatpilot.training.reconstruction.scene_distance_field import (
     make_distance_field,
 )
 from splatpilot.training.reconstruction.views import ReconstructionViews, ShrunkFrames
+
+_NAMED = 10
+"""Of frames that lack something, how many are named."""
 
 
 @dataclass(frozen=True)
@@ -115,10 +119,10 @@ def reconstruct(
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
     frames = ShrunkFrames(capture, fitted, factor)
-    photometry = estimate_photometry(
-        [ThinnedFrame.of(frame) for frame in tqdm(frames, "comparing brightness", unit="frame")],
-        config.seed,
-    )
+    thinned = [ThinnedFrame.of(f) for f in tqdm(frames, "comparing brightness", unit="frame")]
+    photometry = estimate_photometry(thinned, config.seed)
+    without_depth = _without_depth(capture, fitted, thinned)
+    del thinned
     background = learn_background(frames, photometry)
     gains = np.ones(len(capture))
     checkpoint = None
@@ -192,8 +196,20 @@ def reconstruct(
         geodesic=geodesic,
         held_out=measured,
         field_difference=difference,
-        warnings=(*capture.dropped, *warnings),
+        warnings=(*capture.dropped, *without_depth, *warnings),
     )
+
+
+def _without_depth(
+    capture: Capture, numbers: Sequence[int], frames: Sequence[ThinnedFrame]
+) -> tuple[str, ...]:
+    """A warning that names frames in which no pixel has depth, where others have."""
+    empty = [i for i, frame in zip(numbers, frames, strict=True) if not frame.depth.any()]
+    if not capture.has_depth or not empty:
+        return ()
+    names = [capture.frame_names[i] if capture.frame_names else f"frame {i}" for i in empty]
+    listed = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    return (f"{len(empty)} of {len(frames)} frames have no pixel with depth: {listed}",)
 
 
 def start_and_goal(

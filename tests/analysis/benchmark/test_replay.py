@@ -1,9 +1,11 @@
 """Flights flown again."""
 
+import json
 import shutil
 
 import numpy as np
 import pytest
+import yaml
 
 from splatpilot.analysis.benchmark import replay
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
@@ -32,4 +34,22 @@ def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
     result = replay.run(study=copy, id=spec.id)
     assert not result.exact
     assert result.deviation == pytest.approx(0.001, rel=0.01)
-    assert "THE REPLAY DIFFERS" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "THE REPLAY DIFFERS" in printed
+    assert f"Program and machine are those that flew it: {spec.policy} keeps state" in printed
+    assert main(["replay", str(copy), spec.id]) == 1
+    assert f"{spec.id}: the replay differs" in capsys.readouterr().err
+
+    timing = copy / "timings" / f"{spec.id}.json"
+    timing.write_text(json.dumps(json.loads(timing.read_text()) | {"host": "elsewhere"}))
+    replay.run(study=copy, id=spec.id)
+    assert "It was flown on elsewhere, this is" in capsys.readouterr().out
+    content = yaml.safe_load((copy / "study.yaml").read_text())
+    content["program"]["drake"] = "0.1"
+    (copy / "study.yaml").write_text(yaml.safe_dump(content))
+    replay.run(study=copy, id=spec.id)
+    assert "It was flown by drake 0.1, this is" in capsys.readouterr().out
+
+    file.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{spec.id} has not been flown yet in .*again"):
+        replay.run(study=copy, id=spec.id)

@@ -41,6 +41,7 @@ def test_variants_are_read(text, variant):
     [
         ("a/b=reactive", "labelled 'a/b', but labels name files"),
         (".=reactive", "labelled '.'"),
+        ("=reactive", "'=reactive' has no label before its ="),
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),
         ("a=reactive:speed=3", "say how fast all policies fly"),

@@ -94,6 +94,19 @@ def test_there_is_one_held_out_psnr(folder, config, tmp_path):
     assert summary.held_out.means()["psnr_db"] == pytest.approx(measures.mean("psnr_db"), abs=0.01)
 
 
+def test_what_is_doubtful_about_a_capture_is_said_at_once_and_in_the_end(
+    folder, config, tmp_path, capsys
+):
+    """Depth in the wrong unit makes a scene, with a warning that names the mistake before anything
+    is computed, and again with the result."""
+    config.capture.depth_unit = 2500.0
+    summary, _ = run(capture=folder, out=tmp_path / "scene", config=replace(config, iterations=2))
+    doubt = summary.warnings[0]
+    assert "most likely depth is 5 times too small" in doubt and "`splatpilot capture" in doubt
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"warning: {doubt}\n") and printed.count(doubt) == 2
+
+
 def test_refusals(tmp_path, config, capsys):
     """A folder that holds something else is refused before the capture is opened; one that is no
     capture, or none at all, and steps given in two ways are refused too."""

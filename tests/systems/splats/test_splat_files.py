@@ -114,6 +114,8 @@ def test_records(tmp_path):
         ("a.ksplat", bytes(64), "a KSPLAT; convert it to PLY"),
         ("a.spz", b"NGSP\x04\x00\x00\x00", "the header is cut short"),
         ("a.spz", spz(5, 9)[:16], "SPZ of version 5; 2 to 4"),
+        ("a.spz", spz(2, 9), "says that it is SPZ of version 2, whose files are compressed as one"),
+        ("a.spz", gzip.compress(spz(4, 9)), "says that it is SPZ of version 4, .* are no gzip"),
         ("a.spz", spz(4, 9)[:16], "not readable SPZ"),
         ("a.spz", spz(4, 9), "0 bytes stand where 81 belong"),
         ("a.spz", gzip.compress(b"something else entirely"), "gzip of something that is not SPZ"),

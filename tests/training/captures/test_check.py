@@ -12,7 +12,7 @@ from splatpilot.analysis.cli import main
 from splatpilot.systems.configuration import load_config
 from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.check import check_capture
+from splatpilot.training.captures.check import check_capture, doubts
 from splatpilot.training.captures.read_capture import read_capture
 
 WIDTH, HEIGHT = 160, 120
@@ -159,6 +159,23 @@ def test_inaccurate_poses(room):
     off = [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]
     report = check_capture(room(X_WCs=off))
     assert "no known mistake explains it" in report.mistake
+
+
+def test_poses_that_are_all_the_same(room):
+    """A file of poses that says one pose of all frames is named for that."""
+    capture = room()
+    report = check_capture(room(X_WCs=[capture.X_WCs[0]] * len(capture)))
+    assert not report.agrees
+    assert f"all {len(capture)} poses are the same" in report.mistake
+
+
+def test_doubts(room):
+    """Who only wants to go on is told in one sentence, where there is anything to tell."""
+    assert doubts(room()) == () == doubts(room(load_depth=no_depth))
+    [doubt] = doubts(room(**scaled(5)(room)))
+    assert "does not agree with itself, most likely depth is 5 times too large" in doubt
+    [doubt] = doubts(room(load_depth=lambda i: np.zeros((HEIGHT, WIDTH), np.float32)))
+    assert "not checked" in doubt and "too few pixels have depth" in doubt
 
 
 def test_nothing_to_compare(room):

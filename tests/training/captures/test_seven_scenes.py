@@ -73,9 +73,13 @@ def test_config_file_in_the_folder(write, config):
     (path / "capture.yaml").write_text("intrinsics: [40, 41, 30, 20]\nup: z\n")
     np.testing.assert_array_equal(read_capture(path).K, [[40, 0, 30], [0, 41, 20], [0, 0, 1]])
     np.testing.assert_array_equal(read_capture(path, config()).K[0], [50, 0, 31])
-    (path / "capture.yaml").write_text("intrinsic: [1]\n")
-    with pytest.raises(ValueError, match=r"capture\.yaml.*intrinsic"):
-        read_capture(path)
+    for text, message in (
+        ("intrinsic: [1]\n", "there is no field intrinsic"),
+        ("intrinsics: [0, 1, 2, 3]\n", r"capture.intrinsics is \[0.0.*must be positive"),
+    ):
+        (path / "capture.yaml").write_text(text)
+        with pytest.raises(ValueError, match=rf"capture\.yaml: {message}"):
+            read_capture(path)
 
 
 def test_up_of_level_cameras(write, config):
@@ -141,12 +145,15 @@ def test_too_many_bad_frames(write, config):
         read_capture(path, config())
 
 
-def test_eight_bit_depth(write, config):
-    """A picture of depth is no depth."""
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
+def test_pictures_of_depth(write, config, shape):
+    """A picture of depth is no depth: its frame is left out, and named."""
     path = write()
-    cv2.imwrite(str(path / "frame-000010.depth.png"), np.zeros((48, 64), np.uint8))
-    with pytest.raises(ValueError, match=r"000010\.depth\.png: a uint8 array .* is no depth"):
-        read_capture(path, config()).frame(1)
+    cv2.imwrite(str(path / "frame-000010.depth.png"), np.zeros(shape, np.uint8))
+    capture = read_capture(path, config())
+    assert len(capture) == 9 and "frame-000010.color.png" not in capture.frame_names
+    [message] = capture.dropped
+    assert re.search(r"000010\.depth\.png: pixels of 8 bits .*; depth is one number", message)
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")

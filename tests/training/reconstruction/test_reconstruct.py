@@ -115,6 +115,17 @@ def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterat
     assert list(tmp_path.iterdir()) == [room]
 
 
+def test_frames_without_depth_are_named(tmp_path, write_room):
+    """Frames in which no pixel has depth, among others that have, count and are named."""
+    room = write_room(tmp_path / "room")
+    files = sorted((room / "depth_left").iterdir())
+    for file in files[3:5]:
+        np.save(file, np.zeros_like(np.load(file)))
+    summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
+    names = "000003_left.png, 000004_left.png"
+    assert f"2 of 12 frames have no pixel with depth: {names}" in summary.warnings
+
+
 @pytest.mark.parametrize("iterations", [0, 2])
 def test_images_are_read_once(tmp_path, write_room, iterations):
     """However often its frames are looked at, each image is decoded once."""

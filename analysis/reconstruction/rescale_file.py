@@ -1,0 +1,70 @@
+"""A file of Gaussians in metres and with z up, as flights need it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.systems.files import require_writable_folder
+from splatpilot.systems.splats.gaussian_ply import write_ply
+from splatpilot.systems.splats.splat_files import read_splats
+
+# Rows are W's axes in the file's, by which of those is up; x stays where it can.
+_R_WF = {
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
+    "-x": [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
+}
+UP_AXES = tuple(_R_WF)
+"""Which way can be up in a file."""
+
+
+@dataclass(frozen=True)
+class FileSummary:
+    """What was written."""
+
+    file: Path
+    gaussians: int
+    factor: float
+    size: NDArray[np.float64]  # (3,) [m], of the box of nearly all Gaussians
+
+    def __str__(self) -> str:
+        rows = {
+            "file": self.file,
+            "Gaussians": self.gaussians,
+            "factor": f"{self.factor:.6g}",
+            "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
+        }
+        return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
+
+
+def rescale_file(file: Path, out: Path, factor: float = 1.0, up: str = "z") -> FileSummary:
+    """Writes the Gaussians of a file as PLY, all lengths times `factor`, turned so that z is up.
+
+    Args:
+        file: see `read_splats`.
+        out: the PLY.
+        factor: what one of the file's units is [m].
+        up: which of the file's axes points up, one of `UP_AXES`; the PLYs of 3D Gaussian splatting
+            mostly have -y there.
+
+    Raises:
+        FileNotFoundError, ValueError: for a file that is damaged or none of Gaussians, or `out`
+            that is no name of a PLY or exists.
+        OSError: if it cannot be written.
+    """
+    if out.suffix.lower() != ".ply":
+        raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
+    if out.exists():
+        raise ValueError(f"{out}: exists already; choose another name for the scaled file")
+    require_writable_folder(out.absolute().parent)
+    R_WF = RotationMatrix(np.array(_R_WF[up], dtype=float))
+    gaussians = read_splats(file).transformed_by(RigidTransform(R_WF)).scaled_by(factor)
+    write_ply(gaussians, out)
+    lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
+    return FileSummary(out, len(gaussians), factor, upper_W - lower_W)
