@@ -176,6 +176,7 @@ void bind_fitting(nb::module_& m);
 void bind_shape_worlds(nb::module_& m);
 void bind_descent(nb::module_& m);
 void bind_shape_field(nb::module_& m);
+void bind_grid_field(nb::module_& m);
 void bind_grid_worlds(nb::module_& m);
 
 }  // namespace splatpilot

@@ -166,6 +166,7 @@ NB_MODULE(_native, m) {
   bind_shape_worlds(m);
   bind_descent(m);
   bind_shape_field(m);
+  bind_grid_field(m);
   bind_grid_worlds(m);
   bind_gradients(m);
   bind_surfels(m);

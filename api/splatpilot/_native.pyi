@@ -158,6 +158,12 @@ class ShapeField:
         and the shapes that have them, the first of several, -1 where there is none.
         """
 
+def grid_distances(*, grid: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, occupied_outside: bool, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')]) -> None:
+    """
+    Writes the distances (N,) at N points: between the centres of voxels, those of the grid
+    interpolated trilinearly; outside, minus the way to the box, or NaN.
+    """
+
 class GridWorlds:
     """Regular grids of several worlds, one of each."""
 

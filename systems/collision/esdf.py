@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from splatpilot import _native
 from splatpilot.systems.collision.distance_field import FieldSample, FieldState
 from splatpilot.systems.collision.distance_transform import conservative_distances
 from splatpilot.systems.collision.esdf_file import read_esdf_arrays, write_esdf_arrays
 from splatpilot.systems.collision.trilinear import (
     corner_offsets,
     grid_strides,
-    trilinear,
     trilinear_with_gradient,
 )
 
@@ -121,17 +121,22 @@ class Esdf:
 
         A point that is not finite is outside.
         """
-        p_WQ = np.asarray(p_WQ, dtype=float)
-        p, p_box, inside = self._split(p_WQ)
-        corners, fractions, _ = self._cell(p_box)
-        value = trilinear(corners, *fractions)
-        if inside is not None:
-            value = self._extend(value, p, p_box, inside)
-        return value.reshape(p_WQ.shape[:-1])
+        p_WQ = _points(p_WQ)
+        distances = np.empty(p_WQ.shape[:-1])
+        _native.grid_distances(
+            grid=self.distances,
+            lower_W=self.lower_W,
+            upper_W=self.upper_W,
+            voxel_size=self.voxel_size,
+            occupied_outside=self.occupied_outside,
+            p_WQ=np.ascontiguousarray(p_WQ).reshape(-1, 3),
+            distances=distances.reshape(-1),
+        )
+        return distances
 
     def query(self, p_WQ: ArrayLike) -> FieldSample:
         """Distance, exact gradient of the interpolant and state at the points p_WQ (..., 3) [m]."""
-        p_WQ = np.asarray(p_WQ, dtype=float)
+        p_WQ = _points(p_WQ)
         p, p_box, inside = self._split(p_WQ)
         corners, fractions, cell = self._cell(p_box)
         value, *slopes = trilinear_with_gradient(corners, *fractions)
@@ -207,8 +212,6 @@ class Esdf:
     def _split(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Points (..., 3) as columns (3, N), the same brought into the box, and which of them were
         inside it (N,), None for all."""
-        if p_WQ.shape[-1:] != (3,):
-            raise ValueError(f"Esdf: points have shape {p_WQ.shape}; needed is (..., 3).")
         p = np.ascontiguousarray(p_WQ.reshape(-1, 3).T)
         lower, upper = self.lower_W[:, None], self.upper_W[:, None]
         p_box = np.minimum(np.maximum(p, lower), upper)
@@ -231,3 +234,10 @@ class Esdf:
         if self.occupied_outside:
             return value - np.linalg.norm(p - p_box, axis=0)
         return np.where(inside, value, np.nan)
+
+
+def _points(p_WQ: ArrayLike) -> np.ndarray:
+    p_WQ = np.asarray(p_WQ, dtype=float)
+    if p_WQ.shape[-1:] != (3,):
+        raise ValueError(f"Esdf: points have shape {p_WQ.shape}; needed is (..., 3).")
+    return p_WQ

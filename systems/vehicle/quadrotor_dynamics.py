@@ -81,14 +81,19 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
             params.gravity,
         )
         return torch.stack(torch.broadcast_tensors(*rates), dim=-1)
+    state, command = np.asarray(state), np.asarray(command)
     rates = component_derivatives(
-        np.moveaxis(np.asarray(state), -1, 0),
-        np.moveaxis(np.asarray(command), -1, 0),
+        [state[..., i] for i in range(13)],
+        [command[..., i] for i in range(4)],
         params.drag,
         params.rate_time_constant,
         params.gravity,
     )
-    return np.stack(np.broadcast_arrays(*rates), axis=-1)
+    shape = np.broadcast_shapes(state.shape[:-1], command.shape[:-1])
+    derivatives = np.empty((*shape, 13), np.result_type(state, command))
+    for i, rate in enumerate(rates):
+        derivatives[..., i] = rate
+    return derivatives
 
 
 def component_derivatives(

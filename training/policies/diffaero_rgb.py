@@ -20,6 +20,7 @@ from splatpilot.systems.policies.diffaero_inference import FARTHEST, NEAREST
 from splatpilot.systems.policies.diffaero_rgb_inference import DIFFAERO_RGB_NETWORK
 from splatpilot.systems.policies.monocular_depth import HEIGHT, WIDTH, rays_B, require_view
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.diffaero_rgb_network import DiffAeroRgbModule
 from splatpilot.training.policies.observation import (
@@ -32,7 +33,6 @@ from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import Appearance, relit
 from splatpilot.training.policies.student_network import encode_color
 from splatpilot.training.policies.trainer import Schedule
-from splatpilot.training.policies.vehicles import rotation_matrix
 
 _NEAR = 6.0
 """[m] Nearer than that a cell counts in what is measured."""
@@ -174,7 +174,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         inverse depths (N, 9, 16) of samples."""
         device = self._config.device
         color = self._data.pixels(numbers, "color")[:, self._rows()]
-        R_WB = rotation_matrix(self._data.labels(numbers).X_WB[:, :4])
+        R_WB = rotation_matrices(self._data.labels(numbers).X_WB[:, :4])
         R_WH = heading_frame(torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0]))
         rays = ((R_WH.mT @ R_WB) @ self._rays_B.mT).unflatten(2, (HEIGHT, WIDTH))
         target = inverse_depth(self._targets[torch.from_numpy(numbers)], NEAREST, FARTHEST)

@@ -3,15 +3,21 @@
 from math import ceil
 
 import numpy as np
-import torch
 
 from splatpilot.diagrams.flight import Outcome
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
+from splatpilot.systems.vehicle.flatness import reaching_acceleration
+from splatpilot.systems.vehicle.flatness_batch import flatness_commands
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor_dynamics import (
+    VEHICLE_RADIUS,
+    QuadrotorParams,
+    hover_state,
+    rk4_step,
+)
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.training.policies.expert import ExpertConfig, ExpertFlight, Label, Labeller
-from splatpilot.training.policies.vehicles import BodyRate, reaching_acceleration
 
 GOAL_RADIUS = 0.3  # [m]
 TIMEOUT = 60.0  # [s]
@@ -19,25 +25,23 @@ TIMEOUT = 60.0  # [s]
 _STEP = 0.02  # [s], at most, between two commands
 
 
-@torch.no_grad()
 def fly_planner(
     p_WS: np.ndarray, world: World, config: ExpertConfig, labeller: Labeller
 ) -> list[ExpertFlight]:
     """Flies from each of the starts p_WS (N, 3) [m] to the labeller's goal.
 
-    The vehicles are `BodyRate`, which has the equations of the simulated plant and the law of its
-    controller; a step of many costs as much as one of one. They look along their way, and fly by
-    their labels: a plan every 0.4 s leads to the goal as safely as one every 0.07 s.
+    The vehicles have the equations of the simulated plant and the law of its controller; a step of
+    many costs as much as one of one. They look along their way, and fly by their labels: a plan
+    every 0.4 s leads to the goal as safely as one every 0.07 s.
 
     Raises:
         ValueError: if no way leads to the goal from a state along a flight.
     """
-    control, p_WG = FlatnessControllerConfig(), labeller.toa.p_WG
+    control, params, p_WG = FlatnessControllerConfig(), QuadrotorParams(), labeller.toa.p_WG
     substeps = ceil(config.period / _STEP - 1e-9)
     dt = config.period / substeps
     yaws = np.arctan2(p_WG[1] - p_WS[:, 1], p_WG[0] - p_WS[:, 0])
     states = np.stack([hover_state(p, yaw) for p, yaw in zip(p_WS, yaws, strict=True)])
-    vehicle = BodyRate(torch.from_numpy(states), torch.zeros(len(p_WS), 3, dtype=torch.float64))
     flying = np.arange(len(p_WS))
     outcomes = [Outcome.TIMEOUT] * len(p_WS)
     traces: list[list[np.ndarray]] = [[p] for p in p_WS]
@@ -46,16 +50,18 @@ def fly_planner(
         if not len(flying):
             break
         ways = np.empty((len(flying), NUM_WAYPOINTS + 1, 3))
-        for row, (n, state) in enumerate(zip(flying, vehicle.state.numpy(), strict=True)):
+        for row, (n, state) in enumerate(zip(flying, states, strict=True)):
             plan = labeller.label(number * config.period, state)
             labels[n].append(Label(state, plan))
             ways[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
         for step in range(substeps):
-            p_WR = torch.from_numpy(_along(ways, step * dt + control.lookahead))
-            motion = p_WR - vehicle.p
-            heading = torch.atan2(motion[:, 1], motion[:, 0])
-            vehicle = vehicle.step(reaching_acceleration(p_WR, vehicle), dt, control, heading)
-            p_WB = vehicle.p.numpy()
+            p_WB, v_WB, _, _ = QuadrotorState.of(states)
+            p_WR = _along(ways, step * dt + control.lookahead)
+            a_WB = reaching_acceleration(p_WR, p_WB, v_WB, control.lookahead)
+            heading = np.arctan2(p_WR[:, 1] - p_WB[:, 1], p_WR[:, 0] - p_WB[:, 0])
+            command = flatness_commands(states, a_WB, control, params, heading)
+            states = rk4_step(states, command, params, dt)
+            p_WB = QuadrotorState.of(states).p_WB
             for n, p in zip(flying, p_WB, strict=True):
                 traces[n].append(p)
             arrived = np.linalg.norm(p_WB - p_WG, axis=1) <= GOAL_RADIUS
@@ -65,8 +71,7 @@ def fly_planner(
             for n in flying[touched]:
                 outcomes[n] = Outcome.COLLISION
             going = ~(arrived | touched)
-            flying, ways = flying[going], ways[going]
-            vehicle = BodyRate(*(x[torch.from_numpy(going)] for x in vehicle))
+            flying, ways, states = flying[going], ways[going], states[going]
     return [
         ExpertFlight(outcome, dt * (len(trace) - 1), _least_clearance(np.stack(trace), world), own)
         for outcome, trace, own in zip(outcomes, traces, labels, strict=True)

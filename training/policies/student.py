@@ -24,6 +24,7 @@ from torch import Tensor
 
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.student_spec import StudentSpec
+from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.pretrained import imagenet_weights
@@ -42,7 +43,6 @@ from splatpilot.training.policies.student_loss import (
 )
 from splatpilot.training.policies.student_network import StudentModule, encode_state
 from splatpilot.training.policies.student_views import StudentViews
-from splatpilot.training.policies.vehicles import rotation_matrix
 
 _CLOSE = 0.25
 """[m] Root mean square distance from an expert's trajectory within which one is as good."""
@@ -185,7 +185,7 @@ lower penalty, of error and clearance."""
         its waypoints are mirrored back.
         """
         config, labels = self._config, self._data.labels(numbers)
-        R_WB = rotation_matrix(labels.X_WB[:, :4])
+        R_WB = rotation_matrices(labels.X_WB[:, :4])
         state = encode_state(R_WB, labels.v_B, labels.goal_B, self.spec.reach)
         sides = state.new_ones(len(numbers), 3)
         sides[mirrored, 1] = -1.0

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards
 from splatpilot.training.corpus.sample import RECOVERY
 from splatpilot.training.policies.ray_casting import EsdfGeometry
-from splatpilot.training.policies.vehicles import rotation_matrix
 
 _PARTS = 1 << 20
 """[-] That a chance is counted in."""
@@ -143,7 +143,7 @@ class StudentData:
         """Signed distance (N, M, T) [m] at waypoints (N, M, T, 3) [m] from samples' poses,
         differentiable by the waypoints."""
         N, M, T, _ = waypoints_B.shape
-        R_WB, p_WB = rotation_matrix(labels.X_WB[:, :4]), labels.X_WB[:, None, 4:]
+        R_WB, p_WB = rotation_matrices(labels.X_WB[:, :4]), labels.X_WB[:, None, 4:]
         p_WQ = (waypoints_B.flatten(1, 2) @ R_WB.mT + p_WB).flatten(0, 1)
         world = labels.world.repeat_interleave(M * T)
         distances, gradients = self._fields.interpolate(p_WQ.detach(), world)

@@ -12,6 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from splatpilot.systems.vehicle.flatness_batch import (
+    attitudes_from_thrust,
+    flatness_commands,
+    headings_and_pulls,
+    lengths,
+    rotation_matrices,
+)
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, rk4_step
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
@@ -30,11 +37,12 @@ class PointMass(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3): z along the thrust that this acceleration takes, x where yaw points."""
-        return attitude_from_thrust(self._thrust(), self.yaw)
+        return attitudes_from_thrust(self._thrust(), self.yaw)
 
     def body_z(self) -> Tensor:
         """The z axes (N, 3) of the body in W."""
-        return torch.nn.functional.normalize(self._thrust(), dim=1)
+        thrust = self._thrust()
+        return thrust / lengths(thrust).clip(min=1e-12)
 
     def _thrust(self) -> Tensor:
         params = QuadrotorParams()
@@ -105,7 +113,7 @@ class BodyRate(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3)."""
-        return rotation_matrix(QuadrotorState.of(self.state).q_WB)
+        return rotation_matrices(QuadrotorState.of(self.state).q_WB)
 
     def body_z(self) -> Tensor:
         """The z axes (N, 3) of the body in W."""
@@ -124,7 +132,7 @@ class BodyRate(NamedTuple):
         state, before = self.state, self.state
         for _ in range(count):
             before = state
-            command = flatness_command(state, a_cmd, control, params, heading)
+            command = flatness_commands(state, a_cmd, control, params, heading)
             state = rk4_step(state, command, params, dt / count)
         change = QuadrotorState.of(state).v_WB - QuadrotorState.of(before).v_WB
         return BodyRate(state, change * (count / dt))
@@ -149,84 +157,13 @@ def where_rows(chosen: Tensor, these: Tensor, others: Tensor) -> Tensor:
     return torch.where(chosen.reshape(-1, *[1] * (these.dim() - 1)), these, others)
 
 
-def flatness_command(
-    state: Tensor,
-    a_WB: Tensor,
-    control: FlatnessControllerConfig,
-    params: QuadrotorParams,
-    heading: Tensor | None = None,
-) -> Tensor:
-    """Thrust and body rates (N, 4), the law of `FlatnessController` for accelerations (N, 3)."""
-    _, v, q_WB, _ = QuadrotorState.of(state)
-    f = a_WB + params.drag * v
-    f = f + _up(f, params.gravity)
-    lift = f[:, 2:].clamp(min=control.min_thrust)
-    level = f[:, :2]
-    widest = lift * torch.tan(torch.tensor(control.max_tilt))
-    level = level * (widest / level.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(max=1.0)
-    f = torch.cat([level, lift], 1)
-    f = f * (control.max_thrust / f.norm(dim=1, keepdim=True)).clamp(max=1.0)
-
-    R_WB = rotation_matrix(q_WB)
-    heading, pull = heading_and_pull(v, control, heading)
-    R_BD = R_WB.mT @ attitude_from_thrust(f, heading)
-    # First the shortest turn of the body's z axis, about n in its x-y plane, then yaw.
-    z1, z2, z3 = R_BD[:, :, 2].unbind(1)
-    sine = torch.sqrt(z1 * z1 + z2 * z2 + 1e-12)
-    angle = torch.atan2(sine, z3)
-    n1, n2 = -z2 / sine, z1 / sine
-    rates = control.tilt_gain * torch.stack([angle * n1, angle * n2], 1)
-    rates = rates * (control.max_tilt_rate / rates.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(
-        max=1.0
-    )
-    x1, x2, x3 = R_BD[:, :, 0].unbind(1)
-    cosine, sine = torch.cos(angle), torch.sin(angle)
-    along = (n1 * x1 + n2 * x2) * (1.0 - cosine)
-    ahead = cosine * x1 - sine * n2 * x3 + along * n1
-    left = cosine * x2 + sine * n1 * x3 + along * n2
-    yaw = control.yaw_gain * pull * torch.atan2(left, ahead)
-    yaw = yaw.clamp(-control.max_yaw_rate, control.max_yaw_rate)
-    thrust = (f * R_WB[:, :, 2]).sum(1).clamp(control.min_thrust, control.max_thrust)
-    return torch.cat([thrust[:, None], rates, yaw[:, None]], 1)
-
-
-def heading_and_pull(
-    v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Where to look (N,) [rad], `heading` or along the velocity, and how strongly (N,), 0 to 1."""
-    if heading is not None:
-        return heading, torch.ones_like(heading)
-    pull = (v[:, :2].norm(dim=1) / control.yaw_speed).clamp(max=1.0).square()
-    return torch.atan2(v[:, 1], v[:, 0]), pull
-
-
 def yaw_rate(
     yaw: Tensor, v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
 ) -> Tensor:
     """The controller's yaw rate (N,) [rad/s] of level vehicles at `yaw` (N,) [rad]."""
-    heading, pull = heading_and_pull(v, control, heading)
-    error = torch.remainder(heading - yaw + torch.pi, 2 * torch.pi) - torch.pi
+    towards, pull = headings_and_pulls(v, control, heading)
+    error = torch.remainder(towards - yaw + torch.pi, 2 * torch.pi) - torch.pi
     return (control.yaw_gain * pull * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
-
-
-def attitude_from_thrust(f: Tensor, yaw: Tensor) -> Tensor:
-    """R_WB (N, 3, 3) with z along f (N, 3), upwards, and x above the direction of yaw (N,)."""
-    z = torch.nn.functional.normalize(f, dim=1)
-    cos, sin = torch.cos(yaw), torch.sin(yaw)
-    x = torch.stack([cos * z[:, 2], sin * z[:, 2], -sin * z[:, 1] - cos * z[:, 0]], 1)
-    x = torch.nn.functional.normalize(x, dim=1)
-    return torch.stack([x, torch.linalg.cross(z, x), z], 2)
-
-
-def rotation_matrix(q: Tensor) -> Tensor:
-    """The rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any length."""
-    w, x, y, z = torch.nn.functional.normalize(q, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).reshape(-1, 3, 3)
 
 
 def _up(like: Tensor, size: float) -> Tensor:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.worlds.plot import Plot
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.vehicle.flatness import cross
 
 COVERAGE = 0.62
 """Standard deviation over spacing at which a single layer of splats leaves no holes: midway between
@@ -174,7 +175,7 @@ def tube(
     s = np.clip((j + 0.5 + offset + jitter[1]) / rows, 0, 1).ravel()
     width = 1 + (taper - 1) * s
     e_1 = perpendicular(axis)
-    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(axis, e_1))
+    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), cross(axis, e_1))
     across = COVERAGE * 2 * np.pi * radius / columns
     return Surfels(
         p=p_A + np.outer(s * length, axis) + (radius * width)[:, None] * normal,

@@ -1,5 +1,7 @@
 """Queries of the distance field on a grid."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -85,6 +87,28 @@ def test_query_and_distance_agree_bit_for_bit():
     np.testing.assert_array_equal(sample.distance[1, 2, 3], field.distance(p[1, 2, 3]))
     assert field.distance(np.zeros((0, 3))).shape == (0,)
     assert field.query(p[0, 0, 0]).state.shape == ()
+
+
+@pytest.mark.parametrize("occupied_outside", [False, True])
+def test_query_and_distance_agree_anywhere(occupied_outside):
+    """Both have the same bits in, on the faces of and around the box, and where numbers are none;
+    whatever the points' memory looks like."""
+    field = replace(random_field(), occupied_outside=occupied_outside)
+    margin = 5 * VOXEL
+    generator = np.random.default_rng(4)
+    p = generator.uniform(field.lower_W - margin, field.upper_W + margin, (5000, 3))
+    p[:8] = np.array([field.lower_W, field.upper_W])[
+        np.indices((2, 2, 2)).reshape(3, -1).T, range(3)
+    ]
+    p[8:40] = LOWER_W + VOXEL * generator.integers(0, 12, (32, 3))
+    p[40], p[41, 1], p[42, 2] = np.nan, np.inf, -np.inf
+    expected = field.query(p).distance
+    np.testing.assert_array_equal(field.distance(p), expected)
+    np.testing.assert_array_equal(field.distance(np.asfortranarray(p)), expected)
+    np.testing.assert_array_equal(field.distance(p[::-2]), expected[::-2])
+    assert np.isfinite(expected[43:]).mean() > (0.99 if occupied_outside else 0.2)
+    with pytest.raises(ValueError, match=r"points have shape \(3, 2\); needed"):
+        field.distance(np.zeros((3, 2)))
 
 
 def test_state_is_that_of_the_voxel_around_the_point():

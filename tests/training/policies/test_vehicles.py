@@ -8,20 +8,15 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from random_scenes import normal_tensor
 
+from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.systems.vehicle.flatness_controller import (
     FlatnessController,
     FlatnessControllerConfig,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
+from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.policies.vehicles import (
-    BodyRate,
-    PointMass,
-    attitude_from_thrust,
-    flatness_command,
-    rotation_matrix,
-)
+from splatpilot.training.policies.vehicles import BodyRate, PointMass
 
 CONTROL = FlatnessControllerConfig()
 
@@ -70,48 +65,6 @@ def test_point_mass_turns_its_nose_along_its_motion():
     assert float(vehicle.yaw) == pytest.approx(np.pi / 2, abs=1e-2)
 
 
-def test_attitude_carries_the_thrust_and_the_yaw():
-    """z lies along the thrust, and x seen from above along the yaw."""
-    f, yaw = torch.tensor([[2.0, -3.0, 9.0]]), torch.tensor([0.7])
-    R = attitude_from_thrust(f, yaw)[0]
-    torch.testing.assert_close(R[:, 2], f[0] / f.norm())
-    assert float(torch.atan2(R[1, 0], R[0, 0])) == pytest.approx(0.7, abs=1e-5)
-    torch.testing.assert_close(R.T @ R, torch.eye(3), rtol=0, atol=1e-6)
-
-
-def controller_command(state: np.ndarray, a_WB: np.ndarray, heading: float | None) -> np.ndarray:
-    builder = DiagramBuilder()
-    controller = builder.AddSystem(FlatnessController())
-    values = {"state": state, "acceleration": a_WB}
-    if heading is not None:
-        values["heading"] = np.array([heading])
-    for name, value in values.items():
-        source = builder.AddSystem(ConstantVectorSource(value))
-        builder.Connect(source.get_output_port(), controller.GetInputPort(name))
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    simulator.AdvanceTo(0.001)
-    context = controller.GetMyContextFromRoot(simulator.get_context())
-    return np.array(controller.GetOutputPort("command").Eval(context))
-
-
-@pytest.mark.parametrize("heading", [None, 0.4])
-def test_commands_are_the_controllers(heading):
-    """Thrust and rates equal `FlatnessController`'s, level and tilted."""
-    rng = np.random.default_rng(3)
-    for tilt in (0.0, 0.3):
-        state = hover_state(rng.normal(size=3), yaw=0.2)
-        state[3:6] = [1.5, 0.4, -0.3]
-        q = state[6:10] + tilt * np.array([0.0, 0.3, -0.2, 0.0])
-        state[6:10] = q / np.linalg.norm(q)
-        a_WB = np.array([2.0, -1.0, 0.5])
-        expected = controller_command(state, a_WB, heading)
-        batch = torch.tensor(state)[None]
-        at = None if heading is None else torch.tensor([heading], dtype=torch.float64)
-        found = flatness_command(batch, torch.tensor(a_WB)[None], CONTROL, QuadrotorParams(), at)
-        np.testing.assert_allclose(found[0], expected, atol=1e-6)
-
-
 def test_body_rate_vehicle_flies_as_plant_and_controller_do():
     """Two seconds of a turn end within 5 cm of where the Drake diagram ends."""
     a_WB = np.array([1.0, 0.8, 0.2])
@@ -134,7 +87,7 @@ def test_body_rate_vehicle_flies_as_plant_and_controller_do():
     np.testing.assert_allclose(vehicle.p[0], expected[:3], atol=0.05)
     np.testing.assert_allclose(vehicle.v[0], expected[3:6], atol=0.05)
     R_WB = pose_from_state(vehicle.state[0].double().numpy()).rotation().matrix()
-    np.testing.assert_allclose(rotation_matrix(vehicle.state[:, 6:10])[0], R_WB, atol=1e-5)
+    np.testing.assert_allclose(rotation_matrices(vehicle.state[:, 6:10])[0], R_WB, atol=1e-5)
 
 
 def test_gradients_flow_through_the_body_rate_vehicle():
