@@ -26,6 +26,7 @@ _MOTTLE = 0.15  # relative, of brightness over space
 _SHORTEST, _LONGEST = 0.5, 5.0  # [m], wavelengths of the mottling
 _WAVES = 5
 _SKY = 0.7  # part of another colour in the background
+_AT_ONCE = 16384  # Gaussians: what they take meanwhile stays in the cache
 _LOOKS = 7  # tells the looks of flights from what else a flight's seed draws
 
 _GREY = np.full((3, 3), 1 / 3)
@@ -99,10 +100,14 @@ def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
     Each is one piece of paint: its colour without view dependence is repainted and relit, and the
     view dependence grows or shrinks with its brightness.
     """
-    before = scene.base_colors  # (N, 3)
-    painted = np.clip(before + _paint(before, look), 0, 1)
-    linear = painted**GAMMA * (look.exposure * _light(scene, look))[:, None]
-    after = _developed(linear @ look.mixing.T)
+    before, normals = scene.base_colors, scene.normals  # (N, 3)
+    after = np.empty_like(before)
+    for first in range(0, len(before), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        painted = np.clip(before[some] + _paint(before[some], look), 0, 1)
+        light = _light(scene.means[some], normals[some], look)
+        linear = painted**GAMMA * (look.exposure * light)[:, None]
+        after[some] = _developed(linear @ look.mixing.T)
     sh = scene.sh.copy()
     sh[:, 0] = (after - 0.5) / C0
     if scene.sh_degree > 0:
@@ -135,11 +140,12 @@ def _paint(colors: Array, look: Appearance) -> Array:
     return np.stack([trilinear(grid.take(corners), *fractions) for grid in channels], axis=1)
 
 
-def _light(scene: GaussianScene, look: Appearance) -> Array:
-    """The light (N,) on the Gaussians, 1 in the mean over all directions and places."""
+def _light(means: Array, normals: Array, look: Appearance) -> Array:
+    """The light (N,) on Gaussians at `means` (N, 3) [m], 1 in the mean over all directions and
+    places."""
     # A Gaussian has no outside: it is lit alike from both sides. |cos| is 1/2 in the mean.
-    facing = 2 * np.abs(scene.normals @ look.light_W)
-    phases = look.waves[:, :3] @ scene.means.T + look.waves[:, 3:]  # (5, N)
+    facing = 2 * np.abs(normals @ look.light_W)
+    phases = look.waves[:, :3] @ means.T + look.waves[:, 3:]  # (5, N)
     mottled = np.cos(phases).sum(axis=0)
     return (1 - look.relief + look.relief * facing) * (1 + look.mottle * mottled / np.sqrt(_WAVES))
 
