@@ -54,6 +54,7 @@ def load_config[Config](
         name, equals, value = override.partition("=")
         if not equals:
             raise ValueError(f"override {override!r} has no value; write FIELD=VALUE")
+        _resolve_open_fields(config, set())  # of which `_tag_of` asks which types there are
         *parents, field = name.split(".")
         text = tagged = f"{field}: {value}"
         for depth in reversed(range(len(parents))):
@@ -221,7 +222,10 @@ def _check_names(config: Any, given: Any, prefix: str) -> None:
             raise ValueError(f"there is no field {prefix}{name}; {hint if close else listed}")
         if value is None and _may_be_null(config, name):
             continue
-        _check_names(getattr(config, name), value, f"{prefix}{name}.")
+        held = getattr(config, name)
+        if isinstance(held, list) and isinstance(value, str):  # whose letters would be taken
+            raise ValueError(f"{prefix}{name} is {_shown(value)}; write it as a list, [{value}]")
+        _check_names(held, value, f"{prefix}{name}.")
 
 
 def _may_be_null(config: Any, name: str) -> bool:

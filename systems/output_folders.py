@@ -35,10 +35,13 @@ def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
     if overwrite:
         pass
     elif file.exists():
-        if dump_config(load_config(type(config)(), file)) != text:
+        there = dump_config(load_config(type(config)(), file))
+        if there != text:
+            own = text.splitlines()
+            other = next((line for line in there.splitlines() if line not in own), "").strip()
             raise ValueError(
-                f"{file} holds another configuration; choose another --out, or the same "
-                "configuration to go on there"
+                f"{file} holds another configuration{f', with {other}' if other else ''}; choose "
+                "another --out, or the same configuration to go on there"
             )
     elif there := sorted(p.name for p in file.parent.iterdir() if not p.name.startswith(".")):
         raise ValueError(

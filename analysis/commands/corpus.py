@@ -96,7 +96,6 @@ def _inspect(options: argparse.Namespace) -> None:
     from splatpilot.training.corpus.corpus import Corpus
 
     corpus = Corpus(options.corpus)
-    for shard in corpus.shards:
-        shard.verify()
+    corpus.verify()
     draw_sheet(corpus, options.out, options.samples, options.seed)
     print(f"{corpus}; drew {options.out}")

@@ -1,5 +1,7 @@
 """Configurations from YAML and from the command line."""
 
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import pytest
@@ -9,6 +11,7 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
 from splatpilot.diagrams.worlds.make_world import SceneConfig, make_world, register_world
 from splatpilot.systems.configuration import dump_config, load_config, parse_config
+from splatpilot.training.corpus.library import LibraryConfig
 
 
 def test_file_and_overrides_set_only_what_they_name(tmp_path):
@@ -64,6 +67,28 @@ def test_bad_override_is_named(override, message):
     """An unknown field, a value of another type and broken YAML name the override and the field."""
     with pytest.raises(ValueError, match=message):
         load_config(Scenario(), overrides=[override])
+
+
+def test_letters_are_no_list():
+    """A string where a list belongs is not taken apart."""
+    with pytest.raises(ValueError, match=r"kinds is P02; write it as a list, \[P02\]"):
+        load_config(LibraryConfig(), overrides=["kinds=P02"])
+    assert load_config(LibraryConfig(), overrides=["kinds=[P02]"]).kinds == ["P02"]
+
+
+def test_a_field_of_the_type_that_is_there_first_of_all():
+    """In a fresh process the first override of a field in what another type than the default's
+    holds leaves that type."""
+    program = (
+        "from splatpilot.diagrams.scenario import Scenario\n"
+        "from splatpilot.systems.configuration import load_config\n"
+        "from splatpilot.systems.policies.reactive_planner import ReactiveConfig\n"
+        "scenario = Scenario(policy=ReactiveConfig())\n"
+        "config = load_config(scenario, overrides=['policy.rate=9', 'policy.margin=0.3']).policy\n"
+        "assert isinstance(config, ReactiveConfig), config\n"
+        "assert (config.rate, config.margin) == (9, 0.3), config\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_bad_file_is_named(tmp_path):

@@ -19,7 +19,7 @@ def test_a_folder_is_of_one_configuration(tmp_path):
     (tmp_path / "mine" / ".flight.1.partial.yaml").touch()
     text = claim_folder(file, Scenario(seed=1))
     assert claim_folder(file, Scenario(seed=1)) == text == file.read_text()
-    with pytest.raises(ValueError, match=r"flight.yaml holds another configuration; choose"):
+    with pytest.raises(ValueError, match=r"holds another configuration, with seed: 1; choose"):
         claim_folder(file, Scenario(seed=2))
     assert file.read_text() == text
     claim_folder(file, Scenario(seed=2), overwrite=True)

@@ -6,6 +6,7 @@ shards/NAME/     samples of one world, see `splatpilot.training.corpus.shard`
 ledger.csv       where everything comes from, a row for each flight
 """
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.corpus.world_record import WorldRecord
 
 CONFIG = "corpus.yaml"
+LEDGER = "ledger.csv"
 
 
 class Corpus:
@@ -36,6 +38,7 @@ class Corpus:
             raise FileNotFoundError(
                 f"{folder} holds no corpus; gather one with `splatpilot corpus make --out {folder}`"
             )
+        self.folder = folder
         self.config = load_config(CorpusConfig(), folder / CONFIG)
         self.shards = [Shard(path) for path in entries(folder / "shards")]
         self.worlds: Sequence[WorldRecord] = [
@@ -66,6 +69,33 @@ class Corpus:
             f"{len(self)} samples of {states} states, {shown} of {len(flights)} flights and "
             f"{len(self.worlds)} worlds"
         )
+
+    def verify(self) -> None:
+        """Reads all of it.
+
+        Raises:
+            FileNotFoundError, ValueError: if what is there is not what was written, or the ledger
+                names a shard that is not there.
+        """
+        for shard in self.shards:
+            shard.verify()
+            for name, dtype in self.config.size.image_types().items():
+                if len(shard) and shard.arrays[name].shape[1:] != dtype.shape:
+                    raise ValueError(
+                        f"{shard.path} has images of {shard.arrays[name].shape[1:]} pixels, but "
+                        f"{self.folder / CONFIG} says {dtype.shape}; restore that file"
+                    )
+        for world in self.worlds:
+            world.esdf()
+        ledger = self.folder / LEDGER
+        if ledger.is_file():
+            with ledger.open(newline="") as file:
+                told = {row["shard"] for row in csv.DictReader(file)}
+            if lacking := sorted(told - {shard.path.name for shard in self.shards}):
+                raise ValueError(
+                    f"{self.folder / 'shards'} lacks {lacking[0]}, of which {LEDGER} tells; run "
+                    "the command that gathered it again"
+                )
 
     def samples(self, indices: np.ndarray) -> Samples:
         """Copies of the samples of `indices` (N,), in their order.

@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.systems.files import written_atomically
-from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus.corpus import LEDGER, Corpus
 from splatpilot.training.corpus.sample import SOURCES
-
-LEDGER = "ledger.csv"
 
 
 def write_ledger(folder: Path, corpus: Corpus) -> None:

@@ -18,7 +18,7 @@ from splatpilot.training.corpus.gather import gather_world, shard_folder
 from splatpilot.training.corpus.ledger import write_ledger
 from splatpilot.training.corpus.library import world_source
 from splatpilot.training.corpus.sample import OFF_PATH
-from splatpilot.training.corpus.shard import Shard
+from splatpilot.training.corpus.shard import OtherVersionError, Shard
 from splatpilot.training.corpus.world_record import WorldRecord
 
 
@@ -40,8 +40,8 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
         The corpus.
 
     Raises:
-        FileNotFoundError, ValueError: on a config out of range, another corpus in `out`, or if
-            nothing was gathered.
+        FileNotFoundError, ValueError: on a config out of range, another corpus in `out`, a shard
+            of another version, or if nothing was gathered.
         OSError: if `out` cannot be written, or a worker process dies.
     """
     config.validate()
@@ -74,11 +74,13 @@ def _is_there(out: Path, world: str, config: CorpusConfig) -> bool:
     if not shard.exists():
         return False
     try:
-        WorldRecord(record)
+        WorldRecord(record).esdf()
         Shard(shard).verify()
         if config.off_path:
             Shard(off_path).verify()
-    except (ValueError, OSError) as error:
+    except OtherVersionError:
+        raise
+    except (ValueError, FileNotFoundError) as error:
         tqdm.write(f"{error}: {world} is gathered again")
         shutil.rmtree(record, ignore_errors=True)
         shutil.rmtree(shard)

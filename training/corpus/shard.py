@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.files import folder_written_atomically
-from splatpilot.training.corpus.sample import Samples, SampleSize
+from splatpilot.training.corpus.sample import SOURCES, Samples, SampleSize
 
 FORMAT_VERSION = 2
 
@@ -74,11 +75,16 @@ def write_shard(
         (folder / _ABOUT).write_text(json.dumps(about, indent=1) + "\n")
 
 
+class OtherVersionError(ValueError):
+    """A shard is whole, and of a version that this program does not know."""
+
+
 class Shard:
     """A shard that is there. Its arrays are mapped when first asked for, and read as they are used.
 
     Raises:
-        ValueError: if it is of another version, or a file is missing or cut short.
+        OtherVersionError: if it is of another version.
+        ValueError: if a file is missing, damaged or cut short.
     """
 
     def __init__(self, path: Path) -> None:
@@ -86,19 +92,27 @@ class Shard:
         try:
             about = json.loads((path / _ABOUT).read_text())
             version = about["format_version"]
+            if version != FORMAT_VERSION:
+                raise OtherVersionError(
+                    f"{path}: a shard of format version {version}, this program knows "
+                    f"{FORMAT_VERSION}; use the version of the program that gathered it, or gather "
+                    "anew in another folder"
+                )
+            self.revision: str = about["revision"]
+            self.world: str = about["world"]
+            self.source: int = about["source"]
+            self.flights: list[dict[str, Any]] = about["flights"]
+            self._files: dict[str, dict[str, int]] = {
+                name: {key: about["files"][name][key] for key in ("bytes", "crc32")}
+                for name in _ARRAYS
+            }
+            self._count: int = about["samples"]
+            _check_types(self)
+        except OtherVersionError:
+            raise
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path / _ABOUT} describes no shard ({error}); {_REMEDY}") from None
-        if version != FORMAT_VERSION:
-            raise ValueError(
-                f"{path}: a shard of format version {version}, this program knows {FORMAT_VERSION};"
-                " use the version of the program that gathered it, or gather anew in another folder"
-            )
-        self.revision: str = about["revision"]
-        self.world: str = about["world"]
-        self.source: int = about["source"]
-        self.flights: list[dict[str, Any]] = about["flights"]
-        self._files: dict[str, dict[str, int]] = about["files"]
-        self._count: int = about["samples"]
+            wrong = f"it lacks {error}" if isinstance(error, KeyError) else reason_of(error)
+            raise ValueError(f"{path / _ABOUT} describes no shard ({wrong}); {_REMEDY}") from None
         for name, said in self._files.items():
             file = path / name
             found = file.stat().st_size if file.is_file() else 0
@@ -117,6 +131,12 @@ class Shard:
         for name, said in self._files.items():
             if _checksum(self.path / name) != said["crc32"]:
                 raise ValueError(f"{self.path / name} is damaged (wrong checksum); {_REMEDY}")
+        for name, array in self.arrays.items():
+            if len(array) != len(self):
+                raise ValueError(
+                    f"{self.path / _ABOUT} says that there are {len(self)} samples, where "
+                    f"{name} has {len(array)}; {_REMEDY}"
+                )
 
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
@@ -126,6 +146,19 @@ class Shard:
         color, depth, labels = (np.load(self.path / name, mmap_mode="r") for name in _ARRAYS)
         fields = {name: labels[name] for name in labels.dtype.names or ()}
         return {"color": color, "depth": depth} | fields
+
+
+def _check_types(shard: Shard) -> None:
+    """Raises ValueError unless what a shard's description says can be."""
+    count, flights = shard._count, shard.flights
+    if not isinstance(count, int) or count < 0:
+        raise ValueError(f"samples is {count!r}")
+    if not isinstance(shard.source, int) or not 0 <= shard.source < len(SOURCES):
+        raise ValueError(f"source is {shard.source!r}")
+    if not isinstance(shard.world, str):
+        raise ValueError(f"world is {shard.world!r}")
+    if not all(isinstance(flight.get("states", 0), int) for flight in flights):
+        raise ValueError("a flight's number of states is no integer")
 
 
 def _column(samples: Samples, name: str) -> np.ndarray:

@@ -109,6 +109,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         self.network.load_policy(config.policy)
         if config.begin:
             self.network.load_sight(config.begin)
+        self.learns_from = self._data.digest(config.policy, config.begin)
         self._rays_B = torch.from_numpy(rays_B()).flatten(0, 1).to(config.device)
         self._targets = torch.from_numpy(self._nearest()).to(config.device)
         self._generator = torch.Generator(config.device).manual_seed(config.seed)

@@ -8,12 +8,11 @@ policy's flights may take the place of the first stage, as those of the round be
 """
 
 import json
-import os
-import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -25,7 +24,8 @@ from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.files import folder_written_atomically, written_atomically
+from splatpilot.systems.array_files import read_archive
+from splatpilot.systems.files import written_atomically
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
@@ -33,6 +33,7 @@ from splatpilot.systems.policies.student import StudentConfig
 from splatpilot.systems.processes import map_processes
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards
+from splatpilot.training.corpus.linked_corpus import link_corpus
 from splatpilot.training.corpus.recovery import StudentFlight, add_recovery
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
 from splatpilot.training.corpus.shard import Shard
@@ -77,6 +78,11 @@ class RecoveryFlights:
     flights: int = 6
     # Policy, or file of weights, that flies; the first stage's where left empty.
     flown_by: str = ""
+    # What tells the content of that file from what it may have later.
+    flown_by_digest: str = ""
+    # Folders of the corpora, and the part of their worlds that is not trained with.
+    corpora: list[str] = field(default_factory=list)
+    held_out: float = 0.0
 
 
 @holds_folder("out")
@@ -97,7 +103,7 @@ def run[Config: CorpusTraining](
 
     Leaves in `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
     `corpora`, links to those of `config` with the recovery samples beside them; `flights`, what the
-    student flew, a file a world; `recovery.yaml`, how many they may be and whose;
+    student flew, a file a world; `recovery.yaml`, how many they may be, whose and where;
     `recovery.json`, how many of what there are.
 
     Args:
@@ -119,16 +125,21 @@ def run[Config: CorpusTraining](
     for name, value in (("flights", flights), ("jobs", jobs)):
         if value < 1:
             raise ValueError(f"--{name} is {value}; it must be at least 1")
+    # What is not there is refused before anything is written.
     if flown_by:
-        policy_named(flown_by)  # refused, if there is no such policy, before anything is written
-    claim_folder(out / "recovery.yaml", RecoveryFlights(flights, flown_by))
+        policy_named(flown_by)
+    for source in config.corpora:
+        Corpus(Path(source))
+    digest = _digest(Path(flown_by)) if flown_by.endswith(".npz") else ""
+    decisive = RecoveryFlights(flights, flown_by, digest, list(config.corpora), config.held_out)
+    claim_folder(out / "recovery.yaml", decisive)
     pilot, first = flown_by, {}
     if not flown_by:
         first = train.run(config=config, out=out / "stage_1", make=make)
         pilot = str(out / "stage_1" / f"{first['policy']}.npz")
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
     for source, folder in zip(config.corpora, folders, strict=True):
-        _link_corpus(Path(source), folder)
+        link_corpus(Path(source), folder)
     corpora = [Corpus(folder) for folder in folders]
     names = sorted({world.name for corpus in corpora for world in corpus.worlds})
     held_out = held_out_names(names, config.held_out)
@@ -148,22 +159,8 @@ def run[Config: CorpusTraining](
     return ledger
 
 
-def _link_corpus(source: Path, folder: Path) -> None:
-    """Makes `folder` a corpus of the same files, which take no room twice, to add others to."""
-    if folder.exists():
-        return
-    Corpus(source)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder_written_atomically(folder) as partial_folder:
-        for path in sorted(source.rglob("*")):
-            target = partial_folder / path.relative_to(source)
-            if path.is_dir():
-                target.mkdir()
-                continue
-            try:
-                os.link(path, target)
-            except OSError:  # on another disk
-                shutil.copyfile(path, target)
+def _digest(file: Path) -> str:
+    return blake2b(file.read_bytes(), digest_size=16).hexdigest()
 
 
 def _tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
@@ -189,7 +186,7 @@ def _fly_worlds(
         for record in corpus.worlds
         if record.name in tasks
     ]
-    missing = [piece for piece in work if not piece[2].exists()]
+    missing = [piece for piece in work if not _is_whole(piece[2])]
     fly_world = partial(_fly_world, pilot, corpus.config)
     with tqdm(
         total=len(work), initial=len(work) - len(missing), desc="flights", unit="world"
@@ -204,6 +201,19 @@ def _fly_worlds(
                 parts = {name: arrays[f"{name}_{n}"] for name in _ARRAYS}
                 flown.append(StudentFlight(record.name, **parts))
     return flown, outcomes
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether a file of flights is there; one that is damaged goes, to be flown again."""
+    if not file.exists():
+        return False
+    try:
+        read_archive(file)
+    except ValueError as error:
+        tqdm.write(f"{error}: it is flown again")
+        file.unlink()
+        return False
+    return True
 
 
 def _fly_world(

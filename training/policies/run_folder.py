@@ -15,6 +15,8 @@ from splatpilot.systems.output_folders import claim_folder
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 from splatpilot.systems.provenance import revision
 
+CONFIG = "config.yaml"
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -34,7 +36,12 @@ class RunFolder:
             ValueError: if it is of a run of another configuration.
             OSError: if it cannot be written.
         """
-        return cls(path, claim_folder(path / "config.yaml", config), revision())
+        return cls(path, claim_folder(path / CONFIG, config), revision())
+
+    def give_up(self) -> None:
+        """Makes the folder nobody's again, where there is nothing but a run's configuration."""
+        if {file.name for file in self.path.iterdir()} == {CONFIG}:
+            (self.path / CONFIG).unlink()
 
     def write_weights(
         self, policy: str, spec: Any, network: torch.nn.Module, best: dict[str, Any]

@@ -80,6 +80,7 @@ lower penalty, of error and clearance."""
             self._load(config.begin)
         elif config.pretrained:
             self.network.load_encoder(imagenet_weights(config.encoder))
+        self.learns_from = self._data.digest(config.begin)
         self.network.freeze(config.frozen)
         # Convolutions on a CPU take a third less time with the channels last.
         self.network.to(config.device).to(memory_format=torch.channels_last)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -107,6 +108,16 @@ class StudentData:
             world=torch.from_numpy(world).to(device),
         )
         self._records = records
+
+    def digest(self, *files: str) -> str:
+        """What tells these samples, and the content of the `files` that are named, from others."""
+        what = blake2b(digest_size=16)
+        for shard in self.shards:  # each states the checksums of all that it has
+            what.update(shard.path.name.encode() + (shard.path / "shard.json").read_bytes())
+        what.update(" ".join(self.held_out_worlds).encode())
+        for file in filter(None, files):
+            what.update(Path(file).read_bytes())
+        return what.hexdigest()
 
     def drawn(self, draw: Callable[[int], np.ndarray], recovery_share: float = 0.0) -> np.ndarray:
         """Numbers (N,) of samples to train with.

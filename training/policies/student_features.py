@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.corpus.shard import Shard
@@ -88,7 +89,7 @@ class FrozenFeatures:
             # It states the checksums of the images.
             digest.update((shard.path / "shard.json").read_bytes() + bytes([outside]))
             files.append(folder / f"{digest.hexdigest()[:32]}.npy")
-            if not files[-1].exists():
+            if _opened(files[-1]) is None:
                 seed = int.from_bytes(digest.digest()[:7])
                 if below is None:
                     batches = self._images(shard, 0 if outside else draws, seed)
@@ -97,7 +98,7 @@ class FrozenFeatures:
                 features = self._features(batches, _FIRST if below else 0)
                 with written_atomically(files[-1]) as path:
                     np.save(path, features.reshape(-1, len(shard), *features.shape[1:]))
-        self._files = [np.load(file, mmap_mode="r") for file in files]
+        self._files = [opened for file in files if (opened := _opened(file)) is not None]
 
     def __call__(self, numbers: np.ndarray, draw: np.ndarray) -> Tensor:
         """Features (N, ...) of the samples of `numbers` (N,), of the draws `draw` (N,); samples
@@ -129,6 +130,19 @@ class FrozenFeatures:
                     yield training_images(batch, self._appearance, self._noise, generator)
                 else:
                     yield clean_images(batch, str(device))
+
+
+def _opened(file: Path) -> np.ndarray | None:
+    """A file's features, mapped; None where it is not there. One that is damaged goes, to be made
+    anew."""
+    try:
+        return np.load(file, mmap_mode="r")
+    except FileNotFoundError:
+        return None
+    except (ValueError, EOFError) as error:
+        tqdm.write(f"{file} is damaged ({reason_of(error)}): it is made anew")
+        file.unlink()
+        return None
 
 
 def _in_batches(features: np.ndarray) -> Iterator[Tensor]:

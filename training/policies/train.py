@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.output_folders import held_folder
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.device import keep_freed_memory, require_device
@@ -17,7 +18,7 @@ from splatpilot.training.event_log import event_log
 from splatpilot.training.policies.run_folder import RunFolder
 from splatpilot.training.policies.torchrun import Processes, torchrun_processes
 from splatpilot.training.policies.trainer import FLIGHTS, Trainer, TrainingConfig
-from splatpilot.training.tensor_files import save_tensors
+from splatpilot.training.tensor_files import load_tensors, save_tensors
 
 
 @dataclass
@@ -59,9 +60,10 @@ def run[Config: TrainingConfig](
         What `summary.json` says.
 
     Raises:
-        ValueError: on a config out of range; if `out` holds a run of another configuration or a
-            damaged checkpoint; if torchrun started several and the trainer's batches have no parts;
-            if a term of the loss is not finite, naming it: the best weights so far stay in `out`.
+        ValueError: on a config out of range; if `out` holds a run of another configuration, one
+            that learned from other files, or a damaged checkpoint; if torchrun started several and
+            the trainer's batches have no parts; if a term of the loss is not finite, naming it: the
+            best weights so far stay in `out`.
         OSError: if `out` cannot be written.
     """
     config.validate()
@@ -86,7 +88,11 @@ def _run[Config: TrainingConfig](
     schedule = config.schedule
     started = time.process_time()
     torch.manual_seed(config.seed)
-    trainer = make(config)
+    try:
+        trainer = make(config)
+    except (ValueError, OSError):  # of what it names, which can be put right in the same folder
+        folder.give_up()
+        raise
     if processes.first:
         processes.wait()
     processes.share_batches(trainer)
@@ -98,6 +104,8 @@ def _run[Config: TrainingConfig](
     checkpoint = out / "checkpoint.pt"
     if checkpoint.exists():
         progress = _resume(checkpoint, trainer, optimizer)
+        if processes.first:
+            folder.write_curves(progress.curves)  # which a kill may have left a row behind
     spent_before = progress.cpu_seconds
 
     def save() -> None:
@@ -108,6 +116,7 @@ def _run[Config: TrainingConfig](
                 "network": network.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "trainer": trainer.state_dict(),
+                "learns_from": _learns_from(trainer),
             },
             checkpoint,
         )
@@ -127,9 +136,10 @@ def _run[Config: TrainingConfig](
             try:
                 terms = step_optimizer(trainer.losses, network, optimizer, schedule.clip, processes)
             except NotFiniteError as error:
+                kept = f"the best weights so far are kept in {out}; " if progress.best else ""
                 raise ValueError(
-                    f"training stopped at update {progress.update}: {error}; the best weights so "
-                    f"far are kept in {out}; lower schedule.learning_rate"
+                    f"training stopped at update {progress.update}: {error}; {kept}lower "
+                    "schedule.learning_rate"
                 ) from None
             progress.update += 1
             bar.update()
@@ -207,13 +217,30 @@ def step_optimizer(
 
 def _resume(path: Path, trainer: Trainer, optimizer: torch.optim.Optimizer) -> _Progress:
     try:
-        saved = torch.load(path, weights_only=True)
+        saved = load_tensors(path)
+        learns_from = saved["learns_from"]
         trainer.network.load_state_dict(saved["network"])
         optimizer.load_state_dict(saved["optimizer"])
         trainer.load_state_dict(saved["trainer"])
-        return _Progress(**saved["progress"])
+        progress = _Progress(**saved["progress"])
     except Exception as error:
-        reason = str(error).partition("\n")[0]
         raise ValueError(
-            f"{path} is no checkpoint to go on from ({reason}); delete it to begin anew"
+            f"{path} is no checkpoint to go on from ({type(error).__name__}: {reason_of(error)}); "
+            "delete it to begin anew"
         ) from None
+    if learns_from != _learns_from(trainer):
+        raise ValueError(
+            f"{path} is of a run that learned from other files: corpora, or the weights that it "
+            "began with, have changed since; choose another --out, or bring them back to go on"
+        )
+    weights = path.parent / f"{trainer.policy}.npz"
+    if progress.best and not weights.is_file():
+        raise ValueError(
+            f"{weights} is missing, which the run kept as its best; bring it back, or delete "
+            f"{path} to begin anew"
+        )
+    return progress
+
+
+def _learns_from(trainer: Trainer) -> str:
+    return getattr(trainer, "learns_from", "")

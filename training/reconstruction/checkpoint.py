@@ -6,11 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
-from splatpilot.training.tensor_files import save_tensors
+from splatpilot.training.tensor_files import load_tensors, save_tensors
 
 VERSION = 2
 _REMEDY = "start anew with --restart, which discards it"
@@ -105,10 +103,9 @@ def _read(file: Path, config: dict[str, Any]) -> dict[str, Any] | None:
     if not file.exists():
         return None
     try:
-        content = torch.load(file, weights_only=True)
-    except Exception as error:  # of a damaged file, the unpickler may raise anything
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise ValueError(f"{file}: not a readable checkpoint ({reason}); {_REMEDY}") from None
+        content = load_tensors(file)
+    except ValueError as error:
+        raise ValueError(f"{file}: not a readable checkpoint ({error}); {_REMEDY}") from None
     if content.get("version") != VERSION:
         raise ValueError(f"{file}: written by another version of the program; {_REMEDY}")
     for name, value in config.items():

@@ -84,3 +84,18 @@ def test_what_is_missing_is_named(folder, tmp_path):
         shutil.rmtree(shard)
     with pytest.raises(ValueError, match="no samples yet"):
         Corpus(folder)
+
+
+def test_every_byte_is_checked(folder):
+    """Sound as gathered; a shard that the ledger tells of and that is gone is named, and so are
+    images of another size than the configuration's."""
+    Corpus(folder).verify()
+    config = (folder / "corpus.yaml").read_text()
+    (folder / "corpus.yaml").write_text(config.replace("width: 32", "width: 80"))
+    with pytest.raises(ValueError, match=r"images of \(24, 32, 3\) pixels, but .*corpus"):
+        Corpus(folder).verify()
+    (folder / "corpus.yaml").write_text(config)
+    [first, *_] = sorted((folder / "shards").iterdir())
+    shutil.rmtree(first)
+    with pytest.raises(ValueError, match=rf"lacks {first.name}, of which ledger.csv tells"):
+        Corpus(folder).verify()

@@ -12,6 +12,7 @@ from splatpilot.systems.configuration import load_config
 from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.seeds import TRAINING_SEEDS
 from splatpilot.training.corpus import make
+from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.sample import EXPERT, OFF_PATH
 
 
@@ -55,6 +56,31 @@ def test_what_is_damaged_is_gathered_again(small, gathered, tmp_path, monkeypatc
     (out / "worlds" / gathered.worlds[0].name / "esdf.npz").unlink()
     make.run(config=small, out=out, worlds=2, jobs=1)
     assert asked == [0, 1]
+    assert all_bytes(out) == all_bytes(folder)
+
+
+def test_what_another_version_gathered_stays(small, gathered, tmp_path):
+    """It is refused, and nothing of it goes; what cannot be read just now stays too."""
+    out = shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
+    about = out / "shards" / gathered.shards[0].path.name / "shard.json"
+    about.write_text(about.read_text().replace('"format_version": 2', '"format_version": 3'))
+    before = all_bytes(out)
+    with pytest.raises(ValueError, match="format version 3, this program knows 2; use the version"):
+        make.run(config=small, out=out, worlds=2, jobs=1)
+    assert all_bytes(out) == before
+
+
+def test_distances_that_are_damaged_are_recorded_again(small, gathered, tmp_path):
+    """A byte that has changed in a world's distances is found, as in a shard."""
+    folder = gathered.shards[0].path.parents[1]
+    out = shutil.copytree(folder, tmp_path / "corpus")
+    esdf = out / "worlds" / gathered.worlds[0].name / "esdf.npz"
+    content = bytearray(esdf.read_bytes())
+    content[len(content) // 2] ^= 1
+    esdf.write_bytes(content)
+    with pytest.raises(ValueError, match="esdf"):
+        Corpus(out).verify()
+    make.run(config=small, out=out, worlds=2, jobs=1)
     assert all_bytes(out) == all_bytes(folder)
 
 

@@ -117,3 +117,32 @@ def test_other_versions_are_refused(tmp_path):
     (path / "shard.json").write_text(json.dumps(about)[:40])
     with pytest.raises(ValueError, match="describes no shard"):
         Shard(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"world": None}, "it lacks 'world'"),
+        ({"files": {}}, r"it lacks 'color\.npy'"),
+        ({"source": 17}, "source is 17"),
+        ({"samples": -1}, "samples is -1"),
+        ({"flights": [{"states": "x"}]}, "number of states"),
+    ],
+)
+def test_descriptions_that_cannot_be(tmp_path, change, message):
+    """A description without a part, or with one that cannot be, is named with the remedy."""
+    path = write(tmp_path / "a", random_samples(1))
+    about = json.loads((path / "shard.json").read_text()) | change
+    about = {name: value for name, value in about.items() if value is not None}
+    (path / "shard.json").write_text(json.dumps(about))
+    with pytest.raises(ValueError, match=rf"describes no shard \(.*{message}.*; delete"):
+        Shard(path)
+
+
+def test_a_description_of_more_than_there_is(tmp_path):
+    """The number of samples that is said must be that of the arrays."""
+    path = write(tmp_path / "a", random_samples(3))
+    about = json.loads((path / "shard.json").read_text())
+    (path / "shard.json").write_text(json.dumps(about | {"samples": 5}))
+    with pytest.raises(ValueError, match=r"says that there are 5 samples, where color has 3"):
+        Shard(path).verify()

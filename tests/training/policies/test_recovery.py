@@ -117,9 +117,36 @@ def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_pat
     assert ledger["recovery_samples"] > earlier > 0
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
         recovery.run(**round_of)
+    others = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    with pytest.raises(ValueError, match=r"holds another configuration, with .*first/corpora/0"):
+        recovery.run(**round_of | {"config": others}, flown_by=pilot)
+    with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
+        nowhere = load_config(StudentDepthTraining(), overrides=["corpora=[nowhere]", *TINY])
+        recovery.run(**round_of | {"config": nowhere, "out": tmp_path / "fourth"}, flown_by=pilot)
+    assert not (tmp_path / "fourth").exists()
     with pytest.raises(ValueError, match="nobody"):
         recovery.run(**round_of | {"out": tmp_path / "third"}, flown_by="nobody")
     assert not (tmp_path / "third").exists()
+
+
+def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
+    """Of a run that ended, a linked shard that has gone is linked and a damaged file of flights
+    flown again, with the same result; a corpus that was gathered anew meanwhile is refused."""
+    source = tmp_path / "source"
+    shutil.copytree(expert, source)
+    ledger = both_stages(source, tmp_path / "out")
+    expected = weights(tmp_path / "out")
+    [flights] = (tmp_path / "out" / "flights" / "0").iterdir()
+    flights.write_bytes(flights.read_bytes()[:-50])
+    lost = sorted((tmp_path / "out" / "corpora" / "0" / "shards").glob("expert-*"))[0]
+    shutil.rmtree(lost)
+    assert both_stages(source, tmp_path / "out") == ledger
+    assert lost.exists() and "flown again" in capsys.readouterr().out
+    assert all(np.array_equal(expected[k], v) for k, v in weights(tmp_path / "out").items())
+    about = source / "shards" / lost.name / "shard.json"
+    about.write_text(about.read_text().replace('"revision": "', '"revision": "0'))
+    with pytest.raises(ValueError, match=r"learned from other files|is another than when"):
+        both_stages(source, tmp_path / "out")
 
 
 def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):

@@ -80,3 +80,14 @@ def test_files_are_made_once_for_all_that_they_depend_on(data, network, tmp_path
     features(tmp_path, data, network, noise=0.1)
     features(tmp_path, data, network, draws=1)
     assert len(list(tmp_path.iterdir())) == 4 * len(made)
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", None])
+def test_damaged_files_are_made_anew(data, network, tmp_path, content):
+    """Of a file that is empty, none or cut short the features are computed again, and are the
+    same."""
+    expected = features(tmp_path, data, network)(data.training[[5]], np.zeros(1, int))
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:-100] if content is None else content)
+    found = features(tmp_path, data, network)(data.training[[5]], np.zeros(1, int))
+    torch.testing.assert_close(found, expected, atol=0, rtol=0)

@@ -1,0 +1,99 @@
+"""What a run goes on from, and what it does not."""
+
+import zipfile
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+
+from splatpilot.systems.configuration import load_config
+from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+from splatpilot.training.policies.network import TrainableNetwork
+from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer import Schedule
+
+
+@dataclass
+class TinyTraining:
+    """Of four updates."""
+
+    seed: int = 0
+    device: str = "cpu"
+    schedule: Schedule = field(
+        default_factory=lambda: Schedule(updates=4, validate_every=2, checkpoint_every=2)
+    )
+
+    def validate(self) -> None:
+        self.schedule.validate()
+
+
+class Reader:
+    """Makes its head smaller, and says that it learns from a corpus."""
+
+    policy, spec = "diffaero", DIFFAERO_NETWORK
+    learns_from = "one corpus"
+
+    def __init__(self, config: TinyTraining) -> None:
+        self.network = TrainableNetwork(self.spec)
+
+    def begin_update(self, update: int) -> None:
+        pass
+
+    def losses(self) -> dict[str, torch.Tensor]:
+        return {"size": self.network.head.weight.square().sum()}
+
+    def evaluate(self) -> dict[str, float]:
+        return {"success": 0.5}
+
+    def state_dict(self) -> dict:
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:
+        pass
+
+
+class OtherReader(Reader):
+    """Learns from something else."""
+
+    learns_from = "another"
+
+
+def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
+    """Files that the trainer learns from and that have changed since are refused, as are a flipped
+    byte in the checkpoint and weights that are gone; curves that a kill left behind are mended."""
+
+    config = TinyTraining()
+    summary = run(config=config, out=tmp_path, make=Reader)
+    curves = (tmp_path / "curves.csv").read_text()
+    (tmp_path / "curves.csv").write_text(curves.splitlines()[0])
+    assert run(config=config, out=tmp_path, make=Reader) == summary
+    assert (tmp_path / "curves.csv").read_text() == curves
+    with pytest.raises(ValueError, match="learned from other files: corpora, or the weights"):
+        run(config=config, out=tmp_path, make=OtherReader)
+    weights = (tmp_path / "diffaero.npz").read_bytes()
+    (tmp_path / "diffaero.npz").unlink()
+    with pytest.raises(ValueError, match=r"diffaero\.npz is missing, .* delete .*checkpoint"):
+        run(config=config, out=tmp_path, make=Reader)
+    (tmp_path / "diffaero.npz").write_bytes(weights)
+    with zipfile.ZipFile(tmp_path / "checkpoint.pt") as archive:
+        largest = max(archive.infolist(), key=lambda entry: entry.file_size)
+    content = bytearray((tmp_path / "checkpoint.pt").read_bytes())
+    content[largest.header_offset + 500] ^= 1
+    (tmp_path / "checkpoint.pt").write_bytes(content)
+    with pytest.raises(ValueError, match=r"no checkpoint to go on from .*; delete it to begin"):
+        run(config=config, out=tmp_path, make=Reader)
+
+
+def test_a_mistake_in_what_a_run_names_leaves_its_folder_free(student_corpus, tmp_path):
+    """Put right, the same command works in the same folder."""
+    trainer = TRAINERS.find("student_depth")
+    tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.34"]
+    tiny_student += ["schedule.updates=1", "schedule.checkpoint_every=1", "validation_samples=2"]
+    wrong = load_config(trainer.config(), overrides=["corpora=[nowhere]", *tiny_student])
+    with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
+        run(config=wrong, out=tmp_path / "out", make=trainer.make)
+    right = load_config(trainer.config(), overrides=[f"corpora=[{student_corpus}]", *tiny_student])
+    run(config=right, out=tmp_path / "out", make=trainer.make)
+    with pytest.raises(ValueError, match=r"another configuration, with corpora: .*; choose"):
+        run(config=wrong, out=tmp_path / "out", make=trainer.make)
