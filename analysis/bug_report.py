@@ -4,23 +4,23 @@ import platform
 import shlex
 import tempfile
 import traceback
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 
-def raised_by(error: BaseException, modules: Sequence[str]) -> str:
+def raised_by(error: BaseException, packages: Collection[str]) -> str:
     """
-    The file and line of one of others' `modules` that an exception comes from, if not of ours.
+    The file and line in one of others' `packages` that an exception comes from, if not of ours.
 
     Args:
         error: what ended the program.
-        modules: by name.
+        packages: by name, or modules outside of any.
     """
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
-        module = frame.f_globals.get("__name__", "")
-        if module in modules:
+        package = frame.f_globals.get("__name__", "").partition(".")[0]
+        if package in packages:
             place = f"{frame.f_code.co_filename}, line {line}"
-        elif module.startswith("splatpilot."):
+        elif package == "splatpilot":
             place = ""
     return place
 

@@ -129,7 +129,8 @@ def main(arguments: list[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _say("what it prints was not read to its end", 1)
     except (ValueError, OSError) as error:
-        return _say(str(error), 1)
+        place = _place_of(error)
+        return _say(f"{error} ({place})" if place else str(error), 1)
     except MemoryError as error:
         needed = f" ({error})" if str(error) else ""
         return _say(
@@ -148,9 +149,15 @@ def main(arguments: list[str] | None = None) -> int:
             return _say(missing, 1)
         report = write_report(error, sys.argv[1:] if arguments is None else arguments)
         kind = type(error).__name__
-        if place := raised_by(error, options.modules):
+        if place := _place_of(error):
             return _say(f"{place}: {kind}: {error}; the traceback is in {report}", 1)
         return _say(f"{verb} met a mistake of the program ({kind}); the report is {report}", 70)
+
+
+def _place_of(error: Exception) -> str:
+    """Where in code of others an exception comes from, if not from ours."""
+    registry = sys.modules.get("splatpilot.systems.registry")  # else nothing of theirs is there
+    return raised_by(error, registry.packages_of_others()) if registry is not None else ""
 
 
 def _heeded() -> list[int]:

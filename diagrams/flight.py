@@ -122,6 +122,7 @@ def flight_simulator(
         diagram, scenario, world: as built.
         progress: called with the simulated time [s] now and then.
     """
+    scenario.validate()
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
     p_WG = goal_of(scenario, world)

@@ -94,6 +94,7 @@ def BuildFlightDiagram(
             f"camera is False, but {'video' if video else 'meshcat'} shows its images; leave "
             "camera out"
         )
+    scenario.validate()
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
     sensors = sensors_of(scenario, policy)

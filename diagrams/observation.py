@@ -133,13 +133,20 @@ def AddSensors(
         Their outputs: `p` of the sensor `s` as `s_p`.
 
     Raises:
-        ValueError: for a configuration that no sensor has, and a name that is taken.
+        ValueError: for a configuration that no sensor has, or of which none is built, and a name
+            that is taken.
     """
     measured = {}
     for name, config in sensors.items():
         if name in _TAKEN:
             raise ValueError(f"a sensor is named {name!r}, as a part of the flight; rename it")
-        sensor = builder.AddNamedSystem(name, SENSORS.kind_of(config).build(config, world))
+        sensor = SENSORS.kind_of(config).build(config, world)
+        if not isinstance(sensor, System):
+            raise ValueError(
+                f"what builds the sensor {name!r} gave {type(sensor).__name__}; it must return a "
+                "Drake system"
+            )
+        builder.AddNamedSystem(name, sensor)
         for port, source in (("state", state), ("body_pose", pose)):
             if sensor.HasInputPort(port):
                 builder.Connect(source, sensor.GetInputPort(port))

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Protocol
 from pydrake.systems.framework import System
 
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.configuration import require_configuration
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
@@ -88,13 +89,9 @@ def register_policy(
             asked for one.
 
     Raises:
-        ValueError: if another policy has the name, or the type has no `validate`.
+        ValueError: if another policy has the name, or the type is none of configurations.
     """
-    if not callable(getattr(config, "validate", None)):
-        raise ValueError(
-            f"{config.__name__} has no method validate(); give it one that raises ValueError on a "
-            "value out of range"
-        )
+    require_configuration(config)
     if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
         speed_field = ""
     kind = PolicyKind(config, build, speed_field)

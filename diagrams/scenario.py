@@ -105,10 +105,10 @@ class Scenario:
             point = getattr(self, name)
             valid = point is None or (len(point) == 3 and np.isfinite(point).all())
             _check(name, point, valid, "three finite numbers x, y, z in metres")
-        self.world.validate()
-        self.policy.validate()
-        for sensor in self.sensors.values():
-            sensor.validate()
+        parts = [(WORLDS, self.world), (POLICIES, self.policy)]
+        for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
+            registry.kind_of(part)
+            part.validate()
         self.observation.validate()
         _check_camera(self.camera)
         _check_simulator(self.simulator)

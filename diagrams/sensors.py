@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Protocol
 from pydrake.systems.framework import System
 
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.configuration import require_configuration
 from splatpilot.systems.registry import Registry
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -49,8 +50,9 @@ def register_sensor(config: type, build: Callable[[Any, World], System]) -> None
         build: see `SensorKind.build`.
 
     Raises:
-        ValueError: if another sensor has the name.
+        ValueError: if another sensor has the name, or the type is none of configurations.
     """
+    require_configuration(config)
     SENSORS.add(config.__name__, SensorKind(config, build))
 
 

@@ -74,6 +74,31 @@ def parse_config[Config](defaults: Config, text: str, source: str) -> Config:
     return _updated(defaults, text, source)
 
 
+def require_configuration(config: type) -> None:
+    """
+    Checks that a type can be that of configurations: a dataclass whose fields have defaults, which
+    YAML can hold, with a method `validate`.
+
+    Raises:
+        ValueError: if it cannot; the message says what it lacks.
+    """
+    name = getattr(config, "__name__", repr(config))
+    if not (isinstance(config, type) and dataclasses.is_dataclass(config)):
+        raise ValueError(f"{name} is no dataclass; decorate it with @dataclass")
+    if not callable(getattr(config, "validate", None)):
+        raise ValueError(
+            f"{name} has no method validate(); give it one that raises ValueError on a value out "
+            "of range"
+        )
+    try:
+        dump_config(config())
+    except Exception as error:  # of fields without defaults, and of types that Drake cannot write
+        raise ValueError(
+            f"{name} makes no YAML ({type(error).__name__}: {reason_of(error)}); give all fields "
+            "defaults, and types of bool, int, float, str, list, dict or other dataclasses"
+        ) from None
+
+
 def dump_config(config: Any) -> str:
     """The configuration as YAML, every field written out."""
     _resolve_open_fields(config, set())

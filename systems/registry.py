@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 _OURS = "splatpilot."
+_others: set[str] = set()
 _ATTRIBUTE = re.compile(r"[\w.]+:[\w.]+")
 
 
@@ -133,6 +134,7 @@ class Registry[Kind]:
         yield from _installed(self.group, tuple(sys.path))
 
     def _load(self, point: EntryPoint) -> Kind:
+        _others.add(point.module.partition(".")[0])
         try:
             value = point.load()
         except (ImportError, AttributeError) as error:
@@ -191,6 +193,7 @@ def import_modules(names: Sequence[str]) -> None:
     """
     _look_here_too()
     for name in names:
+        _others.add(name.partition(".")[0])
         try:
             importlib.import_module(name)
         except SyntaxError as error:
@@ -200,6 +203,11 @@ def import_modules(names: Sequence[str]) -> None:
                 f"the module {name} cannot be imported: {error}; install it, or put its folder "
                 "into PYTHONPATH"
             ) from error
+
+
+def packages_of_others() -> set[str]:
+    """The packages, or modules outside of any, that were imported for what they register."""
+    return set(_others)
 
 
 def _look_here_too() -> None:

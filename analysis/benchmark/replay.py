@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from splatpilot.analysis.benchmark.foreign_code import foreign_code
 from splatpilot.analysis.benchmark.rollout import digest, study_world
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
@@ -19,6 +20,7 @@ from splatpilot.diagrams.flight_page import (
     write_flight_page,
 )
 from splatpilot.diagrams.fly import fly_with_bar
+from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.files import require_unused, require_writable_folder
 from splatpilot.systems.provenance import program
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
@@ -92,7 +94,7 @@ def run(
     else:
         print(
             f"THE REPLAY DIFFERS from the recorded flight ({row['outcome']}) by up to "
-            f"{result.deviation:.3g} m. {_likely_reason(folder, spec)}."
+            f"{result.deviation:.3g} m. {_likely_reason(folder, spec, scenario)}."
         )
     if filmed:
         files = {"flight.html": meshcat, "flight.mp4": video}
@@ -178,13 +180,13 @@ def _record(folder: StudyFolder, spec: RolloutSpec) -> tuple[dict[str, Any], dic
         ) from None
 
 
-def _likely_reason(folder: StudyFolder, spec: RolloutSpec) -> str:
+def _likely_reason(folder: StudyFolder, spec: RolloutSpec, scenario: Scenario) -> str:
     """Why a flight came out otherwise than in the study: its program, its processor or its policy,
     in one sentence without the full stop."""
-    recorded, here = folder.program(), program()
-    for name, version in recorded.items():
-        if here.get(name) != version:
-            return f"It was flown by {name} {version}, this is {here.get(name, 'absent')}"
+    recorded = folder.program()
+    for name, version in (program() | foreign_code([scenario])).items():
+        if recorded.get(name) != version:
+            return f"It was flown by {name} {recorded.get(name, 'unknown')}, this is {version}"
     host = folder.read_timing(spec.id).get("host", "a machine that is not known")
     if host != platform.node():
         return (
@@ -193,7 +195,7 @@ def _likely_reason(folder: StudyFolder, spec: RolloutSpec) -> str:
         )
     return (
         f"Program and machine are those that flew it: {spec.policy} keeps state outside of the "
-        "Context, draws numbers without the seed, or has changed since"
+        "Context, or draws numbers without the seed"
     )
 
 

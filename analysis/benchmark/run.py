@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from splatpilot.analysis.benchmark.external import external_table, format_external
+from splatpilot.analysis.benchmark.foreign_code import foreign_code
 from splatpilot.analysis.benchmark.report import write_report
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout
 from splatpilot.analysis.benchmark.shard import Shard
@@ -69,7 +71,7 @@ def run(
     specs = [spec for spec in share if spec.scenario not in absent]
     if not specs and shard is None:
         raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
-    folder, flown_by = StudyFolder(out), program()
+    folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
     folder.claim(config, flown_by, shard)
     flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
     keep_inputs(folder, config, flyable)
@@ -85,7 +87,9 @@ def run(
     for problem in damaged:
         print(f"{problem}; this flight is flown again")
     missing = [spec for spec in specs if spec.id not in rows]
-    if rows and missing:
+    if not rows:
+        folder.keep_program(flown_by)
+    elif missing:
         _check_program(folder, flown_by)
         print(f"{len(rows)} of {len(specs)} flights are there already.")
     flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
@@ -162,6 +166,14 @@ def flights_there(
     return rows, damaged
 
 
+def _complete(config: StudyConfig, scenarios: dict[str, Scenario]) -> Iterator[Scenario]:
+    """The scenarios with each policy that flies in them."""
+    for scenario in scenarios.values():
+        for variant in config.variants:
+            for speed in config.speeds:
+                yield replace(scenario, policy=variant.config(speed, scenario.policy))
+
+
 def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
     """Raises ValueError if the flights in the folder come from another program."""
     for name, version in folder.program().items():
@@ -187,7 +199,7 @@ def _keep(
                 raise ValueError(
                     f"flight {flown.id} was ended by an exception that is no failure of a flight, "
                     f"{flown.reason} (traceback in {folder.write_fault(flown)}); mend it and run "
-                    "the same command again"
+                    "the same command again, with another --out where code that flies has changed"
                 )
             folder.write(flown)
             rows[flown.row["id"]] = flown.row

@@ -62,7 +62,7 @@ class StudyFolder:
 
         Args:
             config: what is flown.
-            program: `provenance.program()`.
+            program: `provenance.program()` and `foreign_code`.
             shard: which part of the study is flown here; all of it by default.
 
         Raises:
@@ -85,12 +85,20 @@ class StudyFolder:
                     f"{self.path} is not empty and holds no study; choose another folder with --out"
                 )
             # Before all else: it makes the folder that of this study.
-            with written_atomically(self.path / "study.yaml") as path:
-                path.write_text(yaml.safe_dump(described, sort_keys=False))
+            self._describe(described)
         require_writable_folder(self.path)
         for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
             require_writable_folder(self.path / folder)
         shutil.rmtree(self.path / "errors", ignore_errors=True)
+
+    def keep_program(self, program: dict[str, str]) -> None:
+        """States another program than `claim` was told of, in a folder without flights."""
+        if self.program() != program:
+            self._describe(self._described() | {"program": program})
+
+    def _describe(self, described: dict[str, Any]) -> None:
+        with written_atomically(self.path / "study.yaml") as path:
+            path.write_text(yaml.safe_dump(described, sort_keys=False))
 
     def _check_same(self, described: dict[str, Any]) -> None:
         there = self._described()
@@ -151,7 +159,7 @@ class StudyFolder:
         return config
 
     def program(self) -> dict[str, str]:
-        """What `claim` was told of the program."""
+        """What `claim` or `keep_program` was told of the program."""
         return self._described()["program"]
 
     def shard(self) -> Shard | None:

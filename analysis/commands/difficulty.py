@@ -30,6 +30,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _difficulty(options: argparse.Namespace) -> None:
     for scenario in options.scenarios:
         check_scenario(scenario)
+    if options.seeds < 1:
+        raise ValueError(f"--seeds is {options.seeds}; it must be at least 1")
     from splatpilot.analysis import difficulty
 
     difficulty.run(scenarios=options.scenarios, seeds=options.seeds)

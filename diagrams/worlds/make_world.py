@@ -20,6 +20,7 @@ from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.build import build
 from splatpilot.diagrams.worlds.walls import WallsConfig, walls_blueprint
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.configuration import require_configuration
 from splatpilot.systems.registry import Registry
 
 
@@ -62,13 +63,15 @@ def register_world(
         make_blueprint: see `WorldKind.make_blueprint`; needed to train and render captures in it.
 
     Raises:
-        ValueError: if another world has the name, or neither function is given.
+        ValueError: if another world has the name, the type is none of configurations, or neither
+            function is given.
     """
     if make is None:
         if make_blueprint is None:
             raise ValueError(f"{config.__name__}: give make or make_blueprint")
         plan = make_blueprint
         make = lambda config, seed: build(plan(config, seed))  # noqa: E731
+    require_configuration(config)
     WORLDS.add(config.__name__, WorldKind(config, make, make_blueprint))
 
 
@@ -86,7 +89,11 @@ def make_world(config: WorldConfig, seed: int) -> World:
             of, and damaged scenes.
         FileNotFoundError: for a scene that is not there.
     """
-    return WORLDS.kind_of(config).make(config, seed)
+    world = WORLDS.kind_of(config).make(config, seed)
+    if not isinstance(world, World):
+        kinds = type(config).__name__, type(world).__name__
+        raise ValueError("what makes {} gave {}; it must return a World".format(*kinds))
+    return world
 
 
 def place_config(path: Path) -> SceneConfig | OctomapConfig:

@@ -81,3 +81,26 @@ def test_what_users_can_do_is_one_line(failing, error, message, tmp_path, capsys
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_errors_of_packages_of_others_are_told_with_their_place(
+    failing, tmp_path, monkeypatch, capsys
+):
+    """A ValueError says no less than others do, in whichever module of their package it is."""
+    package = tmp_path / "faulty"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "parts.py").write_text(
+        "import numpy as np\ndef fail():\n    np.ones(3) + np.ones(2)\n"
+    )
+    (package / "policy.py").write_text("from faulty.parts import fail\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    import_modules(["faulty.policy"])
+    with pytest.raises(ValueError, match="operands") as raised:
+        sys.modules["faulty.policy"].fail()
+    failing(raised.value)
+    assert main(["fly"]) == 1
+    said = capsys.readouterr().err
+    assert "operands could not be broadcast" in said
+    assert said.endswith(f"({package / 'parts.py'}, line 3)\n")

@@ -326,7 +326,7 @@ def test_signal_while_modules_are_taken_apart(number):
     ("how", "status", "message"),
     [
         (f"signal.raise_signal({int(signal.SIGTERM)})", 143, "terminated"),
-        ("raise ValueError('no')", 1, "no"),
+        ("raise ValueError('no')", 1, "no (FILE, line 4)"),
     ],
 )
 def test_what_is_said_stands_below_progress_bars(how, status, message, tmp_path):
@@ -341,7 +341,8 @@ def test_what_is_said_stands_below_progress_bars(how, status, message, tmp_path)
     words = [sys.executable, "-c", script]
     ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert ended.returncode == status
-    assert ended.stderr.replace("\r", "\n").splitlines()[-1] == f"splatpilot: {message}"
+    last = ended.stderr.replace("\r", "\n").splitlines()[-1]
+    assert last == f"splatpilot: {message}".replace("FILE", str(tmp_path / "working.py"))
     assert "/3" in ended.stderr
 
 

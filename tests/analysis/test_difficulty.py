@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from splatpilot.analysis.cli import main
 from splatpilot.analysis.difficulty import (
     angle_over_length,
     bottleneck,
@@ -121,3 +122,10 @@ def test_table_says_what_was_not_run(tmp_path, monkeypatch, capsys):
     lines = run(scenarios=[str(small), "R13"], seeds=1)
     assert "1/1" in lines[1]
     assert "not run" in lines[2] and "TartanAir" in lines[2] and str(tmp_path) in lines[2]
+
+
+@pytest.mark.parametrize("seeds", ["0", "-1"])
+def test_no_seeds_are_refused(seeds, capsys):
+    """There is nothing to measure in no world."""
+    assert main(["difficulty", "P10", "--seeds", seeds]) == 1
+    assert f"--seeds is {seeds}; it must be at least 1" in capsys.readouterr().err

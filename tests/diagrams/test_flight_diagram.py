@@ -11,6 +11,8 @@ from splatpilot.diagrams.flight import Outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.policies import POLICIES, policy_named
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.sensors import SENSORS
+from splatpilot.diagrams.worlds.make_world import WORLDS, make_world
 from splatpilot.systems.configuration import dump_config, load_config, parse_config
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -127,6 +129,40 @@ def test_ports_of_another_size_are_named(post_world):
 
     with pytest.raises(ValueError, match=r"is no vector and the input 'color_image' of Painter"):
         flown(Scenario(timeout=1.0), post_world, policy=Painter())
+
+
+def test_scenarios_out_of_range_are_refused(post_world):
+    """By who builds the diagram, and by who flies it: Drake would end the process."""
+    for wrong, message in (
+        ({"timeout": -1.0}, "timeout is -1.0"),
+        ({"timeout": np.nan}, "timeout is nan"),
+        ({"goal_radius": -1.0}, "goal_radius is -1.0"),
+        ({"goal": [1.0, 2.0]}, r"goal is \[1.0, 2.0\]; it must be three"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            BuildFlightDiagram(Scenario(**wrong), post_world, camera=False)
+    diagram = BuildFlightDiagram(Scenario(), post_world, camera=False)
+    with pytest.raises(ValueError, match=r"timeout is -1\.0"):
+        fly(diagram, Scenario(timeout=-1.0), post_world)
+
+
+@pytest.mark.parametrize(
+    ("registry", "field", "message"),
+    [
+        (SENSORS, {"sensors": {"down": OnboardCamera()}}, "builds the sensor 'down' gave NoneType"),
+        (WORLDS, {}, "what makes ForestConfig gave NoneType; it must return a World"),
+    ],
+)
+def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, message):
+    """A registered sensor or world whose function returns nothing is an error that says so."""
+    kind = next(iter(registry._kinds.values()))
+    function = "make" if registry is WORLDS else "build"
+    kind = dataclasses.replace(kind, **{function: lambda *_: None})
+    monkeypatch.setattr(registry, "kind_of", lambda _: kind)
+    with pytest.raises(ValueError, match=message):
+        if registry is WORLDS:
+            make_world(Scenario().world, 0)
+        flown(Scenario(timeout=1.0, **field), post_world)
 
 
 def test_what_builds_no_policy_is_named(post_world, monkeypatch):

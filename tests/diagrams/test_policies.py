@@ -1,6 +1,6 @@
 """Every policy flies, and is found by its name."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -80,15 +80,32 @@ def test_unknown_policy_and_speed_are_refused():
         policy_named("planner", -1.0)
 
 
-def test_a_configuration_without_validate_is_refused():
-    """Where it is registered, not where it is flown."""
+def test_types_that_can_be_no_configuration_are_refused():
+    """Where they are registered, not where they are flown."""
 
     @dataclass
     class BareConfig:
         rate: float = 10.0
 
-    with pytest.raises(ValueError, match=r"BareConfig has no method validate\(\); give it one"):
-        register_policy(BareConfig, lambda config, world, vehicle: None)
+    class PlainConfig:
+        def validate(self) -> None: ...
+
+    @dataclass
+    class SetConfig(PlainConfig):
+        names: set = field(default_factory=set)
+
+    @dataclass
+    class OpenConfig(PlainConfig):
+        rate: float
+
+    for config, message in (
+        (BareConfig, r"BareConfig has no method validate\(\); give it one"),
+        (PlainConfig, "PlainConfig is no dataclass; decorate it"),
+        (SetConfig, r"SetConfig makes no YAML \(NotImplementedError: .*'set'.*; give all fields"),
+        (OpenConfig, r"OpenConfig makes no YAML \(TypeError: .*'rate'.*; give all fields defaults"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            register_policy(config, lambda config, world, vehicle: None)
 
 
 def test_file_of_weights_is_a_policy(tmp_path):

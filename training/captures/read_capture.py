@@ -142,6 +142,10 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     config = complete_config(path, said)
     kind = CAPTURES.find(config.kind) if config.kind else _recognize(path)
     capture = kind.read(path, config)
+    if not isinstance(capture, Capture):
+        raise ValueError(
+            f"{path}: what reads its kind gave {type(capture).__name__}; it must return a Capture"
+        )
     if config.refine_poses:
         capture = refined_capture(capture, path, config)
     return replace(capture, folder=str(path.absolute()), config=said)
