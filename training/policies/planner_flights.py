@@ -8,7 +8,7 @@ from splatpilot.diagrams.flight import Outcome
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.vehicle.flatness import reaching_acceleration
-from splatpilot.systems.vehicle.flatness_batch import flatness_commands
+from splatpilot.systems.vehicle.flatness_batch import flatness_commands, lengths
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import (
     VEHICLE_RADIUS,
@@ -64,7 +64,7 @@ def fly_planner(
             p_WB = QuadrotorState.of(states).p_WB
             for n, p in zip(flying, p_WB, strict=True):
                 traces[n].append(p)
-            arrived = np.linalg.norm(p_WB - p_WG, axis=1) <= GOAL_RADIUS
+            arrived = lengths(p_WB - p_WG)[:, 0] <= GOAL_RADIUS
             touched = labeller.field.distance(p_WB) < VEHICLE_RADIUS
             for n in flying[arrived]:
                 outcomes[n] = Outcome.GOAL

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Self
@@ -80,6 +81,13 @@ def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
     helper = np.where(np.abs(d[..., 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     v = np.cross(helper, d)
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _perpendicular_to_one(d: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`perpendicular` of a single vector (3,), a tenth of the time."""
+    v = cross(np.array((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)), d)
+    x, y, z = v.tolist()
+    return v / math.sqrt(x * x + y * y + z * z)
 
 
 def rectangle(
@@ -174,7 +182,7 @@ def tube(
     angle = ((i + jitter[0]) * (2 * np.pi / columns)).ravel()
     s = np.clip((j + 0.5 + offset + jitter[1]) / rows, 0, 1).ravel()
     width = 1 + (taper - 1) * s
-    e_1 = perpendicular(axis)
+    e_1 = _perpendicular_to_one(axis)
     normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), cross(axis, e_1))
     across = COVERAGE * 2 * np.pi * radius / columns
     return Surfels(
