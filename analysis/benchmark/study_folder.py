@@ -82,7 +82,7 @@ class StudyFolder:
             require_writable_folder(self.path)
             if any(self.path.iterdir()):
                 raise ValueError(
-                    f"{self.path} is not empty and holds no study; choose another folder with --out"
+                    f"{self.path} is not empty and holds no study; choose another folder"
                 )
             # Before all else: it makes the folder that of this study.
             self._describe(described)
@@ -107,13 +107,13 @@ class StudyFolder:
             if begun[name] != value:
                 raise ValueError(
                     f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
-                    "another folder with --out, or ask for the same study"
+                    "another folder, or ask for the same study"
                 )
         parts = [f"shard {d['shard']}" if "shard" in d else "all" for d in (there, described)]
         if parts[0] != parts[1]:
             raise ValueError(
                 f"{self.path} holds {parts[0]} of this study, not {parts[1]}; choose another "
-                "folder with --out"
+                "folder"
             )
 
     def _described(self) -> dict[str, Any]:

@@ -52,6 +52,12 @@ def check_policy(variant: Variant) -> None:
     if variant.weights is not None:
         require_existing(variant.weights, "a file of weights")
     elif variant.policy != SCENARIO:
+        name, colon, field = variant.policy.partition(":")
+        if colon and name in POLICIES:
+            raise ValueError(
+                f"the policy {variant.policy!r} names a field of {name} without a value; write "
+                f"{name}:{field}=VALUE"
+            )
         registry = "splatpilot.diagrams.policies"
         _check_name("policy", "splatpilot.policies", variant.policy, POLICIES, registry)
 

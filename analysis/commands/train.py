@@ -78,6 +78,9 @@ def _train(options: argparse.Namespace) -> None:
         check_scenario(name)  # before the training, not after it
     for policy in options.policies:
         check_trainer(policy)
+    for what, given in (("policy", options.policies), ("seed", options.seeds or [])):
+        if twice := [one for k, one in enumerate(given) if one in given[:k]]:
+            raise ValueError(f"the {what} {twice[0]} is given twice; leave one out")
     check_config(options.config)
     from splatpilot.analysis.benchmark import run as benchmark
     from splatpilot.analysis.benchmark.study import StudyConfig

@@ -148,6 +148,7 @@ def fails(arguments: list[str], capsys) -> str:
         (["--scenario", "nowhere.yaml"], "nowhere.yaml: there is no such"),
         (["--scene", "nowhere"], "nowhere"),
         (["--policy", "nobody"], "there is no policy 'nobody'"),
+        (["--policy", "reactive:margin"], "without a value; write reactive:margin=VALUE"),
         (["--scenario", "P99"], "there is no scenario 'P99'"),
         (["--seed", "-1"], "seed"),
     ],
@@ -170,6 +171,19 @@ def make_scene(xs) -> GaussianScene:
         np.full(count, 0.9),
         np.full((count, 3), 0.5),
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["depthnav", "--seeds", "0", "1", "0"], "the seed 0 is given twice"),
+        (["depthnav", "diffaero", "depthnav"], "the policy depthnav is given twice"),
+    ],
+)
+def test_nothing_is_trained_twice(words, message, tmp_path, capsys):
+    """Two runs would write to one folder."""
+    assert message in fails(["train", *words, "--out", str(tmp_path / "out")], capsys)
+    assert not (tmp_path / "out").exists()
 
 
 def test_scene_of_another_unit_is_refused(tmp_path, capsys):
