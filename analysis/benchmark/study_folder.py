@@ -112,8 +112,7 @@ class StudyFolder:
         parts = [f"shard {d['shard']}" if "shard" in d else "all" for d in (there, described)]
         if parts[0] != parts[1]:
             raise ValueError(
-                f"{self.path} holds {parts[0]} of this study, not {parts[1]}; choose another "
-                "folder"
+                f"{self.path} holds {parts[0]} of this study, not {parts[1]}; choose another folder"
             )
 
     def _described(self) -> dict[str, Any]:

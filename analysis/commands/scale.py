@@ -20,7 +20,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         examples=(
             "scale scenes/room --out scenes/room_metric --height 1.5",
             "scale scenes/room --out scenes/room_metric --between 0,0,1 2,0,1 --distance 3.2",
-            "scale garden.ply --out garden_metric.ply --up -y --factor 1.7",
+            "scale garden.ply --out level.ply --up -y --floor 0,1.1,2 1,1.2,2 0,0.9,3",
         ),
     )
     # Points and axes may begin with a minus sign, which argparse takes for an option unless it is a
@@ -30,6 +30,12 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     scale.add_argument("--out", type=Path, required=True, help="scene folder, or PLY, to write")
     scale.add_argument(
         "--up", choices=("x", "-x", "y", "-y", "z", "-z"), help="which way is up in a file (z)"
+    )
+    scale.add_argument(
+        "--floor",
+        nargs=3,
+        metavar="X,Y,Z",
+        help="three points of the floor in a file, which is tilted: it becomes level, at z = 0",
     )
     by = scale.add_mutually_exclusive_group()
     by.add_argument("--factor", type=float, help="what one unit of the scene becomes [m]")
@@ -48,9 +54,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _scale(options: argparse.Namespace) -> None:
     if (options.between is None) != (options.distance is None):
         raise ValueError("--between and --distance belong together: two points and the metres")
-    if (options.factor, options.between, options.height, options.up) == (None, None, None, None):
+    given = options.factor, options.between, options.height, options.up, options.floor
+    if all(each is None for each in given):
         raise ValueError("what is its size? Give --factor, --between with --distance, or --height")
-    points = [_point(text) for text in options.between or ()]
+    points = [_point("--between", text) for text in options.between or ()]
+    floor = [_point("--floor", text) for text in options.floor or ()]
     require_existing(options.scene, "a scene folder or a file of Gaussians")
     from splatpilot.analysis.reconstruction import rescale
 
@@ -62,12 +70,13 @@ def _scale(options: argparse.Namespace) -> None:
         distance=options.distance,
         height=options.height,
         up=options.up,
+        floor=floor,
     )
 
 
-def _point(text: str) -> list[float]:
+def _point(option: str, text: str) -> list[float]:
     try:
         x, y, z = (float(each) for each in text.split(","))
     except ValueError:
-        raise ValueError(f"--between {text!r}: a point X,Y,Z is needed") from None
+        raise ValueError(f"{option} {text!r}: a point X,Y,Z is needed") from None
     return [x, y, z]

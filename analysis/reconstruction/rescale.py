@@ -64,6 +64,7 @@ def run(
     distance: float | None = None,
     height: float | None = None,
     up: str | None = None,
+    floor: Sequence[ArrayLike] = (),
 ) -> RescaleSummary | FileSummary:
     """Writes a scene folder anew as `out`, see `rescale`, or a file of Gaussians, see
     `rescale_file`, and prints what it is.
@@ -72,7 +73,7 @@ def run(
         factor: of all lengths; or
         between, distance: two points (3,) of the scene, and the metres between them; or
         height: [m], median height of the capture's cameras above the ground.
-        up: which way is up in a file; scene folders have z up.
+        up, floor: which way is up in a file, see `rescale_file`; scene folders have z up.
 
     Raises:
         FileNotFoundError, ValueError, OSError: see `rescale` and `rescale_file`; or if the two
@@ -81,8 +82,8 @@ def run(
     """
     if scene.is_file() and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
-    if scene.is_dir() and up is not None:
-        raise ValueError(f"{scene}: z is up in scene folders; leave up = {up} out")
+    if scene.is_dir() and (up is not None or len(floor)):
+        raise ValueError(f"{scene}: z is up in scene folders; leave --up and --floor out")
     if distance is not None:
         a, b = (np.asarray(p, dtype=float) for p in between)
         if not (length := float(np.linalg.norm(a - b))) > 0:
@@ -92,12 +93,12 @@ def run(
         factor = _positive("height", height) / camera_height(
             read_capture_of(scene, read_scene_metadata(scene))
         )
-    elif factor is None and up is not None:
+    elif factor is None and (up is not None or len(floor)):
         factor = 1.0
     if factor is None:
         raise ValueError("give a factor, two points and the distance between them, or a height")
     if scene.is_file():
-        summary = rescale_file(scene, out, _positive("factor", factor), up or "z")
+        summary = rescale_file(scene, out, _positive("factor", factor), up or "z", floor)
     else:
         summary = rescale(scene, out, factor)
     print(summary)

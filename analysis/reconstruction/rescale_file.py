@@ -1,10 +1,11 @@
 """A file of Gaussians in metres and with z up, as flights need it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.files import require_writable_folder
@@ -22,6 +23,9 @@ _R_WF = {
 }
 UP_AXES = tuple(_R_WF)
 """Which way can be up in a file."""
+
+_FLATTEST = 0.05  # of a triangle on the floor, twice its area over its longest side squared
+_STEEPEST = 0.5  # cosine between a floor's normal and the axis that points up
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,13 @@ class FileSummary:
         return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
 
 
-def rescale_file(file: Path, out: Path, factor: float = 1.0, up: str = "z") -> FileSummary:
+def rescale_file(
+    file: Path,
+    out: Path,
+    factor: float = 1.0,
+    up: str = "z",
+    floor: Sequence[ArrayLike] = (),
+) -> FileSummary:
     """Writes the Gaussians of a file as PLY, all lengths times `factor`, turned so that z is up.
 
     Args:
@@ -52,10 +62,12 @@ def rescale_file(file: Path, out: Path, factor: float = 1.0, up: str = "z") -> F
         factor: what one of the file's units is [m].
         up: which of the file's axes points up, one of `UP_AXES`; the PLYs of 3D Gaussian splatting
             mostly have -y there.
+        floor: three points (3,) of the file's floor, or of another level surface: it becomes level,
+            at z = 0, and `up` tells only its upper side.
 
     Raises:
-        FileNotFoundError, ValueError: for a file that is damaged or none of Gaussians, or `out`
-            that is no name of a PLY or exists.
+        FileNotFoundError, ValueError: for a file that is damaged or none of Gaussians, three points
+            that are no floor, or `out` that is no name of a PLY or exists.
         OSError: if it cannot be written.
     """
     if out.suffix.lower() != ".ply":
@@ -63,8 +75,35 @@ def rescale_file(file: Path, out: Path, factor: float = 1.0, up: str = "z") -> F
     if out.exists():
         raise ValueError(f"{out}: exists already; choose another name for the scaled file")
     require_writable_folder(out.absolute().parent)
-    R_WF = RotationMatrix(np.array(_R_WF[up], dtype=float))
-    gaussians = read_splats(file).transformed_by(RigidTransform(R_WF)).scaled_by(factor)
+    X_WF = _upright(up, floor)
+    gaussians = read_splats(file).transformed_by(X_WF).scaled_by(factor)
     write_ply(gaussians, out)
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
     return FileSummary(out, len(gaussians), factor, upper_W - lower_W)
+
+
+def _upright(up: str, floor: Sequence[ArrayLike]) -> RigidTransform:
+    """X_WF, from the axis that points up and perhaps three points of the floor."""
+    R_WF = np.array(_R_WF[up], dtype=float)
+    if not len(floor):
+        return RigidTransform(RotationMatrix(R_WF))
+    a, b, c = (np.asarray(point, dtype=float) for point in floor)
+    normal = np.cross(b - a, c - a)
+    area, longest = np.linalg.norm(normal), max(np.linalg.norm(b - a), np.linalg.norm(c - a))
+    if not area > _FLATTEST * longest**2:
+        raise ValueError(
+            f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line, or are one; "
+            "give three corners of a floor"
+        )
+    z_F = normal / area
+    steep = float(z_F @ R_WF[2])
+    if abs(steep) < _STEEPEST:
+        raise ValueError(
+            f"the plane of these points stands at {np.rad2deg(np.arccos(abs(steep))):.0f} degrees "
+            f"to a floor that has {up} up; say which axis points up, or choose other points"
+        )
+    z_F *= np.sign(steep)
+    x_F = R_WF[0] - (R_WF[0] @ z_F) * z_F
+    x_F /= np.linalg.norm(x_F)
+    R = RotationMatrix(np.stack([x_F, np.cross(z_F, x_F), z_F]))
+    return RigidTransform(R, np.array([0.0, 0.0, -(z_F @ a)]))

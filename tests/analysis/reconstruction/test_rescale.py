@@ -203,6 +203,25 @@ def test_file_of_gaussians_in_metres_and_upright(seen_room, tmp_path, up):
     assert np.quantile(np.abs(after.depth / before.depth - 1), 0.95) < 1e-3
 
 
+def test_a_tilted_file_becomes_level(seen_room, tmp_path):
+    """Three points of the floor, in whichever order, make a tilted room level: its floor lies at
+    z = 0 and its heights are what they were, times the factor."""
+    gaussians, _ = seen_room
+    X_FW = RigidTransform(RollPitchYaw(0.3, -0.2, 0.5), [1.0, 2.0, 3.0])
+    file = tmp_path / "file.ply"
+    write_ply(gaussians.transformed_by(X_FW), file)
+    lowest = gaussians.means[:, 2].min()
+    corners = [X_FW @ np.array([x, y, lowest]) for x, y in ((0, 0), (3, 0.5), (0.5, 2))]
+    for k, points in enumerate((corners, corners[::-1])):
+        words = [",".join(str(x) for x in point) for point in points]
+        out = tmp_path / f"{k}.ply"
+        assert (
+            main(["scale", str(file), "--out", str(out), "--floor", *words, "--factor", "2"]) == 0
+        )
+        heights = read_ply(out).means[:, 2]
+        np.testing.assert_allclose(heights, 2 * (gaussians.means[:, 2] - lowest), atol=2e-5)
+
+
 def _turn(before, after) -> float:
     """[rad], about z, from points to the same points turned."""
     a, b = (points[:, 0] + 1j * points[:, 1] for points in (before, after))
@@ -231,7 +250,10 @@ def test_length_in_a_file_of_gaussians(seen_room, tmp_path, capsys):
         (["room.ply", "--out", "room.ply", "--factor", "2"], "room.ply: exists already"),
         (["room.ply", "--out", "out.ply", "--height", "2"], "a file has no cameras"),
         (["room.ply", "--out", "out.ply", "--factor", "0"], "factor is 0.0; it must be positive"),
-        (["unscaled", "--out", "out", "--up", "-y"], "z is up in scene folders; leave up = -y out"),
+        (["unscaled", "--out", "out", "--up", "-y"], "z is up in scene folders; leave --up"),
+        (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0,0", "2,0,0"], "lie in a line"),
+        (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0,0", "0,0,1"], "at 90 degrees"),
+        (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0", "0,0,1"], "--floor '1,0': a"),
         (["a.ksplat", "--out", "out.ply", "--up", "y"], "a.ksplat: a KSPLAT"),
     ],
 )
