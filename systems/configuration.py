@@ -1,20 +1,20 @@
 """Configurations: dataclasses whose fields a YAML file or the command line may set."""
 
 import dataclasses
-import difflib
 import functools
 import operator
 import re
 from collections.abc import Callable
 from pathlib import Path
 from textwrap import indent
-from types import NoneType, UnionType
-from typing import Any, cast, get_args
+from types import UnionType
+from typing import Any, cast
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
 from splatpilot.systems.array_files import reason_of
+from splatpilot.systems.given_fields import check_fields
 from splatpilot.systems.read_limit import read_text, require_shallow
 from splatpilot.systems.registry import Registry
 
@@ -171,10 +171,7 @@ def _updated[Config](config: Config, text: str, source: str, tagged: str = "") -
         _require_finite(text)
         tokens = [token for token in yaml.scan(text) if isinstance(token, yaml.TagToken)]
         _resolve_open_fields(config, {token.value[1] for token in tokens})
-        given = yaml.load(text, _NamesLoader)
-        if given is None:
-            raise ValueError("holds no field; write NAME: VALUE of what is to change, or leave it")
-        _check_names(config, given, "")
+        check_fields(config, text)
         return yaml_load_typed(schema=type(config), data=tagged or text, defaults=config)
     except yaml.YAMLError as error:
         raise ValueError(f"{source} is not YAML: {yaml_problem(error)}") from None
@@ -211,73 +208,3 @@ def _known_tags(refusal: re.Match[str]) -> str:
         f"{field} is !{tag}, which nobody knows; known are {known}, and those of other packages "
         "once they are installed or their modules imported (--import)"
     )
-
-
-_TAGGED = object()
-
-
-class _NamesLoader(yaml.SafeLoader):
-    """Reads only for the names of fields: what tagged values hold is left to Drake's reader."""
-
-
-_NamesLoader.add_multi_constructor("!", lambda loader, tag, node: _TAGGED)
-
-
-def _check_names(config: Any, given: Any, prefix: str) -> None:
-    """Raises ValueError for a field that `config` does not have, and says which it might be."""
-    known = _field_names(config)
-    if given is None and prefix and (known or isinstance(config, dict)):
-        raise ValueError(f"{prefix[:-1]} is null where fields belong; leave it out, or give some")
-    if isinstance(config, dict) and isinstance(given, dict):
-        for name, value in given.items():
-            _check_names({}, value, f"{prefix}{name}.")
-    if not known or given is None or given is _TAGGED:
-        return
-    if not isinstance(given, dict):
-        raise ValueError(
-            f"{prefix[:-1] or 'the file'} is {_shown(given)}; it must be fields, NAME: VALUE each"
-        )
-    for name, value in given.items():
-        if name not in known:
-            close = _nested_fields(config, str(name), prefix) or [
-                prefix + other for other in difflib.get_close_matches(str(name), known)
-            ]
-            hint = f"did you mean {' or '.join(close)}?"
-            listed = f"the fields are {', '.join(sorted(prefix + other for other in known))}"
-            raise ValueError(f"there is no field {prefix}{name}; {hint if close else listed}")
-        if value is None and _may_be_null(config, name):
-            continue
-        held = getattr(config, name)
-        if isinstance(held, list) and isinstance(value, str):  # whose letters would be taken
-            raise ValueError(f"{prefix}{name} is {_shown(value)}; write it as a list, [{value}]")
-        _check_names(held, value, f"{prefix}{name}.")
-
-
-def _may_be_null(config: Any, name: str) -> bool:
-    """Whether a field's type says that it may have no value."""
-    fields = dataclasses.fields(config) if dataclasses.is_dataclass(config) else ()
-    return any(field.name == name and NoneType in get_args(field.type) for field in fields)
-
-
-def _shown(value: Any) -> str:
-    """A value that is not what it should be: enough to know it by, for it may be a whole file."""
-    text = " ".join(str(value).split())
-    return text if len(text) <= 40 else f"{text[:40]}..."
-
-
-def _nested_fields(config: Any, name: str, prefix: str) -> list[str]:
-    """The dotted names of the fields called `name` of the configurations that `config` holds."""
-    found = []
-    for field in sorted(_field_names(config)):
-        held = getattr(config, field)
-        if name in _field_names(held):
-            found.append(f"{prefix}{field}.{name}")
-        found += _nested_fields(held, name, f"{prefix}{field}.")
-    return found
-
-
-def _field_names(config: Any) -> set[str]:
-    """The names of the fields of a configuration, empty for plain values."""
-    if dataclasses.is_dataclass(config):
-        return {field.name for field in dataclasses.fields(config)}
-    return {field.name for field in getattr(config, "__fields__", ())}  # Drake's own.

@@ -91,8 +91,8 @@ def make_world(config: WorldConfig, seed: int) -> World:
     """
     world = WORLDS.kind_of(config).make(config, seed)
     if not isinstance(world, World):
-        kinds = type(config).__name__, type(world).__name__
-        raise ValueError("what makes {} gave {}; it must return a World".format(*kinds))
+        made = type(world).__name__
+        raise ValueError(f"what makes {type(config).__name__} gave {made}; it must return a World")
     return world
 
 

@@ -15,7 +15,7 @@ from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.library import LibraryConfig
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
-from splatpilot.training.policies import recovery
+from splatpilot.training.policies import recovery, student_flights
 from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
 from splatpilot.training.policies.expert import ExpertConfig
 from splatpilot.training.policies.student import StudentTrainer
@@ -80,15 +80,15 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert len(list((whole / "flights" / "0").iterdir())) == 1
     assert json.loads((whole / "recovery.json").read_text()) == ledger
 
-    for step in ("_fly_world", "_ledger"):
+    for module, step in ((student_flights, "_fly_world"), (recovery, "_ledger")):
         with monkeypatch.context() as patch:
-            patch.setattr(recovery, step, interrupt)
+            patch.setattr(module, step, interrupt)
             with pytest.raises(KeyboardInterrupt):
                 both_stages(expert, parts)
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
         recovery.run(config=config, make=StudentTrainer, out=parts, flights=2, jobs=1)
-    monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
+    monkeypatch.setattr(student_flights, "_fly_world", interrupt)  # which has been done
     assert both_stages(expert, parts)["flights"] == ledger["flights"]
     expected, found = weights(whole), weights(parts)
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
@@ -98,13 +98,13 @@ def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_pat
     """No first stage is trained: what flies is the file that is named, through the corpus's camera,
     and its samples join those of the round before. No other round goes on in the same folder."""
     both_stages(expert, tmp_path / "first")
-    flown, fly = [], recovery.fly
+    flown, fly = [], student_flights.fly
 
     def watched(diagram, scenario, world):
         flown.append(scenario.policy)
         return fly(diagram, scenario, world)
 
-    monkeypatch.setattr(recovery, "fly", watched)
+    monkeypatch.setattr(student_flights, "fly", watched)
     corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
     pilot = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
@@ -183,13 +183,13 @@ def test_what_corpora_share_is_flown_once(expert, tmp_path):
 def test_what_sees_in_colours_recovers_too(tmp_path, monkeypatch):
     """DiffAero in colours flies by what it judges, as fast as the expert did, and both its stages
     see images of its corpus."""
-    speeds, fly = [], recovery.fly
+    speeds, fly = [], student_flights.fly
 
     def watched(diagram, scenario, world):
         speeds.append(scenario.policy.speed)
         return fly(diagram, scenario, world)
 
-    monkeypatch.setattr(recovery, "fly", watched)
+    monkeypatch.setattr(student_flights, "fly", watched)
     gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
     overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
