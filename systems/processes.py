@@ -4,7 +4,8 @@ import functools
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+import warnings
+from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
 _WATCH_PERIOD = 0.5  # [s]
@@ -16,7 +17,7 @@ class WorkerEndedError(OSError):
 
 def map_processes[Work, Result](
     function: Callable[[Work], Result], work: Iterable[Work], jobs: int
-) -> Iterator[Result]:
+) -> Generator[Result]:
     """
     Yields `function` of each piece of work as it ends, in any order. The processes end with this
     one, even where it is killed.
@@ -36,14 +37,18 @@ def map_processes[Work, Result](
     parallel: Any = Parallel(jobs, return_as="generator_unordered", pre_dispatch=str(jobs + 1))
     if jobs > 1:
         function = functools.partial(_attended, os.getpid(), function)
+    results = parallel(map(delayed(function), work))
     try:
-        yield from parallel(map(delayed(function), work))
+        for result in results:  # noqa: UP028 (`yield from` would close it, with a warning)
+            yield result
     except TerminatedWorkerError:
         raise WorkerEndedError(
             "a worker process was killed, perhaps for want of memory; what had ended is kept: run "
             "the same command again, with fewer --jobs if it repeats"
         ) from None
     finally:
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            results.close()  # joblib warns that what nobody waits for any more is given up
         if jobs > 1:
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
 

@@ -32,6 +32,20 @@ def test_results_are_those_of_the_function(jobs):
     assert ({pid for _, pid in results} == {os.getpid()}) == (jobs == 1)
 
 
+def _slow(number: int) -> int:
+    time.sleep(0.2 * number)
+    return number
+
+
+def test_who_has_enough_ends_it_without_a_warning(recwarn):
+    """What still works is given up in silence, and the next call works."""
+    results = map_processes(_slow, range(6), jobs=2)
+    assert next(results) == 0
+    results.close()
+    assert not recwarn.list
+    assert sorted(map_processes(_slow, range(2), jobs=2)) == [0, 1]
+
+
 def test_killed_process_is_named_and_the_next_call_works(tmp_path):
     """A process that is killed ends the call with the remedy; the same call again goes on."""
     with pytest.raises(OSError, match=r"was killed.*run the same command again, with fewer --jobs"):
