@@ -76,18 +76,17 @@ def headings_and_pulls(v: Any, control: FlatnessControllerConfig, heading: Any) 
 def attitudes_from_thrust(f: Any, yaw: Any) -> Any:
     """R_WB (N, 3, 3) with z along f (N, 3), upwards, and x above the direction of yaw (N,)."""
     xp = _namespace(f)
-    z = f / lengths(f).clip(min=1e-12)
+    z = unit_vectors(f)
     cos, sin = xp.cos(yaw), xp.sin(yaw)
     x = xp.stack([cos * z[:, 2], sin * z[:, 2], -sin * z[:, 1] - cos * z[:, 0]], 1)
-    x = x / lengths(x).clip(min=1e-12)
+    x = unit_vectors(x)
     return xp.stack([x, _cross(z, x), z], 2)
 
 
 def rotation_matrices(q: Any) -> Any:
     """The rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any length."""
     xp = _namespace(q)
-    q = q / lengths(q).clip(min=1e-12)
-    w, x, y, z = (q[:, i] for i in range(4))
+    w, x, y, z = unit_vectors(q).T
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -102,6 +101,11 @@ def lengths(vectors: Any) -> Any:
     if xp is np:
         return np.sqrt((vectors * vectors).sum(1, keepdims=True))
     return xp.linalg.vector_norm(vectors, dim=1, keepdim=True)
+
+
+def unit_vectors(vectors: Any) -> Any:
+    """Vectors (N, n) at unit length; zero stays zero."""
+    return vectors / lengths(vectors).clip(min=1e-12)
 
 
 def _cross(a: Any, b: Any) -> Any:

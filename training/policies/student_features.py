@@ -75,7 +75,7 @@ class FrozenFeatures:
         modules = network.image_modules(frozen)
         weights = [values.detach().cpu().numpy() for values in modules.parameters()]
         what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
-        files = []
+        self._files: list[np.ndarray] = []
         for number, shard in enumerate(
             tqdm(
                 data.shards,
@@ -88,17 +88,19 @@ class FrozenFeatures:
             digest = what.copy()
             # It states the checksums of the images.
             digest.update((shard.path / "shard.json").read_bytes() + bytes([outside]))
-            files.append(folder / f"{digest.hexdigest()[:32]}.npy")
-            if _opened(files[-1]) is None:
+            file = folder / f"{digest.hexdigest()[:32]}.npy"
+            opened = _opened(file)
+            if opened is None:
                 seed = int.from_bytes(digest.digest()[:7])
                 if below is None:
                     batches = self._images(shard, 0 if outside else draws, seed)
                 else:
                     batches = _in_batches(below._files[number])
                 features = self._features(batches, _FIRST if below else 0)
-                with written_atomically(files[-1]) as path:
+                with written_atomically(file) as path:
                     np.save(path, features.reshape(-1, len(shard), *features.shape[1:]))
-        self._files = [opened for file in files if (opened := _opened(file)) is not None]
+                opened = np.load(file, mmap_mode="r")
+            self._files.append(opened)
 
     def __call__(self, numbers: np.ndarray, draw: np.ndarray) -> Tensor:
         """Features (N, ...) of the samples of `numbers` (N,), of the draws `draw` (N,); samples

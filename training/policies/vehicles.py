@@ -16,8 +16,8 @@ from splatpilot.systems.vehicle.flatness_batch import (
     attitudes_from_thrust,
     flatness_commands,
     headings_and_pulls,
-    lengths,
     rotation_matrices,
+    unit_vectors,
 )
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, rk4_step
@@ -41,8 +41,7 @@ class PointMass(NamedTuple):
 
     def body_z(self) -> Tensor:
         """The z axes (N, 3) of the body in W."""
-        thrust = self._thrust()
-        return thrust / lengths(thrust).clip(min=1e-12)
+        return unit_vectors(self._thrust())
 
     def _thrust(self) -> Tensor:
         params = QuadrotorParams()

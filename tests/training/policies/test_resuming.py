@@ -1,56 +1,19 @@
 """What a run goes on from, and what it does not."""
 
 import zipfile
-from dataclasses import dataclass, field
 
 import pytest
-import torch
+from tiny_trainer import TinyTrainer, TinyTraining
 
 from splatpilot.systems.configuration import load_config
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.train import run
-from splatpilot.training.policies.trainer import Schedule
 
 
-@dataclass
-class TinyTraining:
-    """Of four updates."""
+class Reader(TinyTrainer):
+    """Says that it learns from a corpus."""
 
-    seed: int = 0
-    device: str = "cpu"
-    schedule: Schedule = field(
-        default_factory=lambda: Schedule(updates=4, validate_every=2, checkpoint_every=2)
-    )
-
-    def validate(self) -> None:
-        self.schedule.validate()
-
-
-class Reader:
-    """Makes its head smaller, and says that it learns from a corpus."""
-
-    policy, spec = "diffaero", DIFFAERO_NETWORK
     learns_from = "one corpus"
-
-    def __init__(self, config: TinyTraining) -> None:
-        self.network = TrainableNetwork(self.spec)
-
-    def begin_update(self, update: int) -> None:
-        pass
-
-    def losses(self) -> dict[str, torch.Tensor]:
-        return {"size": self.network.head.weight.square().sum()}
-
-    def evaluate(self) -> dict[str, float]:
-        return {"success": 0.5}
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state: dict) -> None:
-        pass
 
 
 class OtherReader(Reader):

@@ -9,12 +9,12 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tiny_trainer import TinyTrainer, TinyTraining
 
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.policies import policy_named
@@ -27,11 +27,9 @@ from splatpilot.systems.seeds import TRAINING_SEEDS
 from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.evaluation import evaluate_agent
-from splatpilot.training.policies.network import TrainableNetwork
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
 from splatpilot.training.policies.train import run
-from splatpilot.training.policies.trainer import Schedule
 
 CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
 
@@ -171,7 +169,7 @@ def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
     try:
         with pytest.raises(ValueError, match="update 5"):
             run(
-                config=FragileTraining(),
+                config=TinyTraining(),
                 out=tmp_path,
                 make=lambda config: used.append(torch.get_num_threads()) or FragileTrainer(config),
             )
@@ -194,7 +192,7 @@ def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch)
             is_open.pop()
 
     monkeypatch.setattr(train, "event_log", event_log)
-    config = FragileTraining()
+    config = TinyTraining()
     config.schedule.tensorboard = True
     with pytest.raises(ValueError, match="update 5"):
         run(config=config, out=tmp_path, make=FragileTrainer)
@@ -215,50 +213,18 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
         run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
-@dataclass
-class FragileTraining:
-    """Of a trainer whose loss breaks."""
-
-    seed: int = 0
-    device: str = "cpu"
-    schedule: Schedule = field(
-        default_factory=lambda: Schedule(updates=9, validate_every=2, checkpoint_every=2)
-    )
-
-    def validate(self) -> None:
-        self.schedule.validate()
-
-
-class FragileTrainer:
+class FragileTrainer(TinyTrainer):
     """Its term `second` is not a number from the fifth update on."""
 
-    policy, spec = "diffaero", DIFFAERO_NETWORK
-
-    def __init__(self, config: FragileTraining) -> None:
-        self.network = TrainableNetwork(self.spec)
-        self._update = 0
-
-    def begin_update(self, update: int) -> None:
-        self._update = update
-
     def losses(self) -> dict[str, torch.Tensor]:
-        size = self.network.head.weight.square().sum()
-        return {"first": size, "second": size * (torch.nan if self._update >= 5 else 1.0)}
-
-    def evaluate(self) -> dict[str, float]:
-        return {"success": 0.5}
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state: dict) -> None:
-        pass
+        size = super().losses()["size"]
+        return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
 
 
 def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp_path):
     """The error names the term; the last good weights and checkpoint stay and are finite."""
     with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
-        run(config=FragileTraining(), out=tmp_path, make=FragileTrainer)
+        run(config=TinyTraining(), out=tmp_path, make=FragileTrainer)
     checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
     assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
     assert checkpoint.provenance["best"]["update"] == 4
