@@ -235,7 +235,7 @@ def require_messages_for(scenario: Scenario, world: World) -> None:
 def _AddVelocitySetpoint(
     builder: DiagramBuilder, scenario: Scenario, state: OutputPort, pilot: Pilot
 ) -> VelocitySetpoint:
-    setpoint = VelocitySetpoint(scenario.controller.lookahead)
+    setpoint = VelocitySetpoint(scenario.controller)
     builder.AddNamedSystem("velocity_setpoint", setpoint)
     builder.Connect(state, setpoint.state_input_port())
     builder.Connect(pilot.decision, setpoint.GetInputPort(pilot.decision.get_name()))

@@ -85,6 +85,16 @@ def attitude_from_thrust(f_W: np.ndarray, yaw: float) -> np.ndarray:
     return np.column_stack((x_W, cross(z_W, x_W), z_W))
 
 
+def heading_along_motion(motion_W: np.ndarray, full_speed: float) -> tuple[float, float]:
+    """Returns the heading [rad] of a motion (3,) [m/s] and how far to turn to it, from 0 to 1.
+
+    The fraction falls as the square of the horizontal speed below `full_speed` [m/s], so that a
+    hovering vehicle does not turn after noise.
+    """
+    fraction = min(1.0, math.hypot(motion_W[0], motion_W[1]) / full_speed)
+    return math.atan2(motion_W[1], motion_W[0]), fraction**2
+
+
 def attitude_error(R_WB: np.ndarray, R_WD: np.ndarray) -> tuple[np.ndarray, float]:
     """The turn from B to D as ``(tilt_B (2,), yaw)`` [rad].
 

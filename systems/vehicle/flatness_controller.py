@@ -10,6 +10,7 @@ from splatpilot.systems.ports import input_port, optional_input, output_port
 from splatpilot.systems.vehicle.flatness import (
     attitude_error,
     attitude_from_thrust,
+    heading_along_motion,
     limit_norm,
     limit_thrust,
     reaching_acceleration,
@@ -112,8 +113,7 @@ def flatness_command(
     f_W = limit_thrust(f_W, config.min_thrust, config.max_thrust, config.max_tilt)
     pull = 1.0
     if math.isnan(heading):
-        heading = math.atan2(motion_W[1], motion_W[0])
-        pull = min(1.0, math.hypot(motion_W[0], motion_W[1]) / config.yaw_speed) ** 2
+        heading, pull = heading_along_motion(motion_W, config.yaw_speed)
     tilt_B, yaw = attitude_error(R_WB, attitude_from_thrust(f_W, heading))
     yaw *= pull
 

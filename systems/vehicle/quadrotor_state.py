@@ -35,6 +35,12 @@ class QuadrotorState(NamedTuple):
         w, x, y, z = np.moveaxis(self.q_WB, -1, 0)
         return np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))
 
+    @property
+    def heading(self) -> np.ndarray:
+        """(...) [rad], of body x seen from above, of parts that are numpy arrays of float."""
+        w, x, y, z = np.moveaxis(self.q_WB, -1, 0)
+        return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
     def to_vector(self) -> np.ndarray:
         """The states (..., 13) of these parts, numpy arrays."""
         return np.concatenate(self, axis=-1)

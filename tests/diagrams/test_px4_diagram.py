@@ -7,17 +7,22 @@ import numpy as np
 import pytest
 from px4_stand_in import LAND, LOITER, OFFBOARD, POSITION, Px4StandIn
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import LeafSystem
 
+from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.px4_config import Px4Config
 from splatpilot.diagrams.px4_diagram import BuildPx4Diagram
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
+from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
 from splatpilot.systems.px4.px4_commander import Px4CommanderConfig
+from splatpilot.systems.vehicle.flight_limits import FlightLimits
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 START, GOAL = [1.0, 2.0, 2.0], [9.0, 2.0, 2.0]
 ENGAGED = Px4CommanderConfig(engage=True, arm=True)
@@ -26,14 +31,22 @@ ENGAGED = Px4CommanderConfig(engage=True, arm=True)
 class Chain:
     """Bridge, PX4's messages and the stand-in, in step; the test says how far."""
 
-    def __init__(self, world, version: str = "1.16", commander=ENGAGED, body: str = ""):
+    def __init__(
+        self,
+        world,
+        version: str = "1.16",
+        commander=ENGAGED,
+        body: str = "",
+        policy=None,
+        hardware: HardwareConfig | None = None,
+    ):
         self.px4 = Px4StandIn(version, START)
         self.inbox = UdpInbox(UdpConfig(port=0))
         self.px4.peer = ("127.0.0.1", self.inbox.port)
         self.lcm = lcm.LCM("memq://")
         scenario = Scenario(policy=policy_named("straight", 1.0), start=START, goal=GOAL)
         config = Px4Config(vehicle_port=self.px4.port, commander=commander, body=body)
-        self.bridge = BuildHardwareDiagram(scenario, world, self.lcm)
+        self.bridge = BuildHardwareDiagram(scenario, world, self.lcm, hardware, policy=policy)
         self.link = BuildPx4Diagram(config, self.lcm, self.inbox)
         self.simulators = {"bridge": Simulator(self.bridge), "link": Simulator(self.link)}
         self.alive = {"bridge", "link"}
@@ -173,3 +186,38 @@ def test_motion_capture_is_sent_on(chain):
     odometry = flight.px4.odometry
     assert (odometry.x, odometry.y, odometry.z) == (1.0, -2.0, -3.0)
     assert odometry.time_usec == pytest.approx(0.1e6, abs=2)
+
+
+class Circle(LeafSystem):
+    """A policy that flies around the post."""
+
+    def __init__(self, speed: float, decision: str):
+        super().__init__()
+        self.speed = speed
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorOutputPort(decision, 3, self._calc)
+
+    def _calc(self, context, output) -> None:
+        p_WB = self.get_input_port().Eval(context)[:3]
+        from_post = p_WB - [5.0, 0.0, p_WB[2]]
+        distance = np.linalg.norm(from_post)
+        out_W = from_post / distance
+        velocity = self.speed * np.cross(out_W, [0.0, 0.0, 1.0]) + (2.0 - distance) * out_W
+        velocity[2] = 2.0 - p_WB[2]
+        is_waypoint = self.HasOutputPort("waypoint")
+        output.set_value(p_WB + 0.4 * velocity if is_waypoint else velocity)
+
+
+@pytest.mark.parametrize(
+    ("decision", "speed", "max_speed"), [("waypoint", 0.8, 6.0), ("velocity", 1.6, 0.8)]
+)
+def test_over_velocities_the_camera_looks_along_a_curve(chain, decision, speed, max_speed):
+    hardware = HardwareConfig(failsafe=FailsafeConfig(limits=FlightLimits(max_speed=max_speed)))
+    flight = chain(policy=Circle(speed, decision), hardware=hardware)
+    flight.advance(5.0)
+    for _ in range(40):
+        flight.advance(0.2)
+        state = QuadrotorState.of(flight.px4.state)
+        along = np.arctan2(state.v_WB[1], state.v_WB[0])
+        assert np.linalg.norm(state.v_WB[:2]) == pytest.approx(0.8, abs=0.1)
+        assert np.cos(along - state.heading) > np.cos(np.radians(10.0))

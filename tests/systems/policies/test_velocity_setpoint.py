@@ -5,12 +5,18 @@ import pytest
 
 from splatpilot.systems.policies.velocity_setpoint import VelocitySetpoint
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
+from splatpilot.systems.vehicle.flatness_controller import (
+    FlatnessController,
+    FlatnessControllerConfig,
+)
+from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
 
+CONTROLLER = FlatnessControllerConfig(lookahead=0.5)
 STATE = np.array([1.0, 2, 3, 0.5, -0.5, 0.2, 1, 0, 0, 0, 0, 0, 0])
 
 
 def setpoint(**inputs) -> np.ndarray:
-    system = VelocitySetpoint(lookahead=0.5)
+    system = VelocitySetpoint(CONTROLLER)
     context = system.CreateDefaultContext()
     for name, value in {"state": STATE, **inputs}.items():
         system.GetInputPort(name).FixValue(context, value)
@@ -35,7 +41,26 @@ def test_waypoint_is_reached_in_time():
     np.testing.assert_allclose(told, [2.0, 0.0, -2.0, 0.7])
 
 
+@pytest.mark.parametrize("speed", [0.1, 0.3, 0.5, 2.0])
 @pytest.mark.parametrize("decision", ["waypoint", "acceleration"])
-def test_heading_is_free_where_the_policy_says_none(decision):
-    """Without a heading the setpoint's is not a number."""
-    assert np.isnan(setpoint(**{decision: np.zeros(3)})[3])
+@pytest.mark.parametrize("heading", [{}, {"heading": np.array([np.nan])}])
+def test_without_a_heading_the_turn_is_that_of_the_controller(decision, speed, heading):
+    state = hover_state([1.0, 2.0, 3.0], yaw=3.0)
+    state[3:5] = speed * np.cos(-2.8), speed * np.sin(-2.8)
+    inputs = {
+        "waypoint": state[:3] + CONTROLLER.lookahead * state[3:6],
+        "acceleration": np.zeros(3),
+    }
+    told = setpoint(state=state, **{decision: inputs[decision]}, **heading)
+    controller = FlatnessController(CONTROLLER, QuadrotorParams(drag=0.0))
+    context = controller.CreateDefaultContext()
+    for name, value in {"state": state, decision: inputs[decision]}.items():
+        controller.GetInputPort(name).FixValue(context, value)
+    command = controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
+    assert CONTROLLER.yaw_gain * (told[3] - 3.0) == pytest.approx(command[3], abs=1e-9)
+    assert command[3] == pytest.approx(3.0 * (2 * np.pi - 5.8) * min(1.0, speed / 0.5) ** 2)
+
+
+def test_no_speed_asks_for_no_turn():
+    state = hover_state([1.0, 2.0, 3.0], yaw=3.0)
+    assert setpoint(state=state, acceleration=np.array([1.0, 0, 0]))[3] == pytest.approx(3.0)

@@ -47,7 +47,7 @@ class Px4StandIn:
         self.parser = dialect.MAVLink(None)
         self.state = hover_state(p_WB)
         self.armed, self.mode = False, POSITION
-        self.velocity, self.rates = np.zeros(3), None
+        self.velocity, self.heading, self.rates = np.zeros(3), np.nan, None
         self.stream_began = self.last_setpoint = -np.inf
         self.odometry, self.refused, self.answers, self.heard = None, [], [], []
         self.tick = 0
@@ -80,6 +80,7 @@ class Px4StandIn:
             self._streamed(now)
             ned = np.array([message.vx, message.vy, message.vz])
             self.velocity, self.rates = HALF_TURN.apply(ned), None
+            self.heading = -message.yaw if message.type_mask == 2503 else np.nan
         elif kind == "SET_ATTITUDE_TARGET":
             if message.type_mask != 128 or not 0.0 <= message.thrust <= 1.0:
                 self.refused.append(message)
@@ -130,7 +131,8 @@ class Px4StandIn:
         if command is None:
             acceleration = tracking_acceleration(self.state[3:6], wanted)
             law, vehicle = FlatnessControllerConfig(), QuadrotorParams()
-            command = flatness_command(self.state, acceleration, np.zeros(3), np.nan, law, vehicle)
+            heading = self.heading if self.mode == OFFBOARD else np.nan
+            command = flatness_command(self.state, acceleration, np.zeros(3), heading, law, vehicle)
         self.state = rk4_step(self.state, command, QuadrotorParams(), STEP)
 
     def _tell(self, now: float) -> None:
@@ -144,7 +146,7 @@ class Px4StandIn:
             self._send(
                 dialect.MAVLink_attitude_quaternion_message(milliseconds, w, x, y, z, *rates)
             )
-        if self.tick % 50 == 0:
+        if self.tick % 100 == 0:  # PX4's heartbeat has 1 Hz, whatever is asked for.
             base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
             custom = (self.mode[0] << 16) | (self.mode[1] << 24)

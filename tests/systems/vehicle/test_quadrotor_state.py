@@ -5,6 +5,7 @@ import pytest
 import torch
 from pydrake.autodiffutils import InitializeAutoDiff
 from pydrake.symbolic import MakeVectorContinuousVariable, Variable
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
@@ -37,6 +38,15 @@ def test_parts_of_derivatives_and_expressions():
     variables: list[Variable] = MakeVectorContinuousVariable(13, "x").tolist()
     q_WB = QuadrotorState.of(np.array(variables)).q_WB
     assert [str(component) for component in q_WB] == ["x(6)", "x(7)", "x(8)", "x(9)"]
+
+
+def test_heading_is_that_of_body_x_seen_from_above():
+    rotations = Rotation.random(20, random_state=0)
+    states = np.zeros((20, 13))
+    states[:, 6:10] = rotations.as_quat(scalar_first=True)
+    x_W = rotations.apply([1.0, 0.0, 0.0])
+    expected = np.arctan2(x_W[:, 1], x_W[:, 0])
+    np.testing.assert_allclose(QuadrotorState.of(states).heading, expected, atol=1e-12)
 
 
 def test_other_shapes_are_refused():
