@@ -9,7 +9,10 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.systems.messaging.codecs import CommandCodec
 from splatpilot.systems.messaging.generated import lcmt_body_rate_command
-from splatpilot.systems.messaging.message_publisher import MessagePublisher
+from splatpilot.systems.messaging.message_publisher import (
+    MeasurementPublisher,
+    MessagePublisher,
+)
 from splatpilot.systems.messaging.unix_clock import UnixClock
 
 EPOCH = 1_800_000_000.25  # [s]
@@ -98,3 +101,49 @@ def test_period_must_be_positive(period):
         MessagePublisher(lcm.LCM("memq://"), CommandCodec(), period)
     with pytest.raises(ValueError, match=r"BODY_RATE_COMMAND are .* late at most"):
         MessagePublisher(lcm.LCM("memq://"), CommandCodec(), 0.02, tick=period)
+
+
+class Sensor(LeafSystem):
+    """Measures at times, of which it knows each `latency` later."""
+
+    def __init__(self, times: list[float], latency: float):
+        super().__init__()
+        self.times, self.latency = np.array(times), latency
+        self.DeclareVectorOutputPort("command", 4, self._calc)
+        self.DeclareVectorOutputPort("age", 1, self._calc_age)
+
+    def _last(self, context) -> float:
+        known = self.times[self.times + self.latency <= context.get_time()]
+        return known[-1] if len(known) else -np.inf
+
+    def _calc(self, context, output):
+        output.SetFromVector([self._last(context), 0.0, 0.0, 0.0])
+
+    def _calc_age(self, context, output):
+        output[0] = context.get_time() - self._last(context)
+
+
+def test_measurements_are_sent_once_as_they_come_with_their_own_time():
+    transport = lcm.LCM("memq://")
+    heard = []
+    transport.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append((data, root.get_time())))
+    builder = DiagramBuilder()
+    clock = builder.AddSystem(UnixClock())
+    sensor = builder.AddSystem(Sensor([0.1, 0.103, 0.2, 0.3], latency=0.048))
+    publisher = builder.AddSystem(MeasurementPublisher(transport, CommandCodec(), 0.01))
+    builder.Connect(sensor.GetOutputPort("command"), publisher.GetInputPort("command"))
+    builder.Connect(sensor.GetOutputPort("age"), publisher.age_input_port())
+    builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    clock.set_epoch(clock.GetMyMutableContextFromRoot(root), EPOCH)
+    for k in range(1000):
+        simulator.AdvanceTo(0.001 * k)
+        while transport.handle_timeout(0):
+            pass
+    messages = [lcmt_body_rate_command.decode(data) for data, _ in heard]
+    times = [m.header.utime * 1e-6 - EPOCH for m in messages]
+    np.testing.assert_allclose(times, [0.1, 0.103, 0.2, 0.3], atol=2e-6)
+    assert [m.thrust for m in messages] == [0.1, 0.103, 0.2, 0.3]
+    assert [m.header.seq for m in messages] == [0, 1, 2, 3]
+    np.testing.assert_allclose([when for _, when in heard], [0.15, 0.16, 0.25, 0.35], atol=0.0011)
