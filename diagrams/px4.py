@@ -1,5 +1,7 @@
 """`splatpilot px4`: a vehicle that PX4 flies, behind the bridge's messages."""
 
+import time
+
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
@@ -25,7 +27,8 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
     config.validate()
     lcm, inbox = open_lcm(config.url), UdpInbox(config.udp)
     try:
-        diagram = BuildPx4Diagram(config, lcm, inbox)
+        epoch = time.time() - time.monotonic()
+        diagram = BuildPx4Diagram(config, lcm, inbox, now=lambda: epoch + time.monotonic())
         simulator = Simulator(diagram)
         root = simulator.get_context()
         asked = config.commander

@@ -25,8 +25,6 @@ class Px4Config:
     system: int = 1
     # [s] Time between looks at what has come.
     tick: float = 0.005
-    # [Hz] Of states that are sent on to the bridge.
-    state_rate: float = 50.0
     # The body in motion capture whose pose is sent on to PX4; none where empty.
     body: str = ""
     # OptiTrack's stream, which is sent on as that body; LCM's MOTION_CAPTURE_POSE where left out.
@@ -39,13 +37,11 @@ class Px4Config:
         UdpConfig(self.vehicle_port, self.vehicle_host).validate("px4.vehicle")
         if not 1 <= self.system <= 255:
             raise ValueError(f"px4.system is {self.system}; it must be 1 to 255")
-        for name in ("tick", "state_rate"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(
-                    f"px4.{name} is {value}; it must be positive and finite, as "
-                    f"{getattr(type(self), name)}"
-                )
+        if not 0.0 < self.tick < math.inf:
+            raise ValueError(
+                f"px4.tick must be finite and > 0 s, got {self.tick}; by default it is "
+                f"{Px4Config.tick}"
+            )
         self.commander.validate()
         if self.motion_capture is not None:
             self.motion_capture.validate()

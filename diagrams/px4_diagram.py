@@ -1,5 +1,7 @@
 """A vehicle that PX4 flies, behind the messages of the simulated one."""
 
+from collections.abc import Callable
+
 from lcm import LCM
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Demultiplexer
@@ -13,7 +15,7 @@ from splatpilot.systems.messaging.codecs import (
     StatusCodec,
     VelocitySetpointCodec,
 )
-from splatpilot.systems.messaging.message_publisher import MessagePublisher
+from splatpilot.systems.messaging.message_publisher import MeasurementPublisher, MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.messaging.unix_clock import UnixClock
@@ -24,7 +26,9 @@ from splatpilot.systems.px4.px4_telemetry import Px4Telemetry
 from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
 
 
-def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
+def BuildPx4Diagram(
+    config: Px4Config, lcm: LCM, inbox: UdpInbox, now: Callable[[], float] | None = None
+) -> Diagram:
     """
     Builds the diagram that stands between the bridge's messages and PX4: in the place of
     `BuildVehicleDiagram`, but for images, which sensors send themselves.
@@ -48,6 +52,7 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
         config: how.
         lcm: where the bridge is.
         inbox: where PX4 is.
+        now: tells the Unix time [s] in a process that runs with the wall clock.
 
     Raises:
         ValueError: for a configuration out of range.
@@ -56,10 +61,10 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
     config.validate()
     builder = DiagramBuilder()
     mavlink, clock = Mavlink(config.system), UnixClock()
-    telemetry = Px4Telemetry(inbox, mavlink, config.tick)
     address = config.vehicle_host, config.vehicle_port
+    telemetry = Px4Telemetry(inbox, mavlink, address, config.tick, now)
     commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick)
-    publisher = MessagePublisher(lcm, StateCodec(), 1 / config.state_rate)
+    publisher = MeasurementPublisher(lcm, StateCodec(), config.tick)
     for name, system in (
         ("clock", clock),
         ("telemetry", telemetry),
@@ -67,6 +72,8 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
         ("state_publisher", publisher),
     ):
         builder.AddNamedSystem(name, system)
+
+    builder.Connect(clock.get_output_port(), telemetry.unix_time_input_port())
 
     def add_subscriber(name: str, codec: Codec) -> tuple[OutputPort, OutputPort]:
         subscriber = MessageSubscriber(lcm, codec, config.tick)
@@ -99,7 +106,7 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
             eye = MotionCaptureReceiver(config.motion_capture, config.tick)
             builder.AddNamedSystem("motion_capture_receiver", eye)
             pose, age = eye.motion_capture_pose_output_port(), eye.age_output_port()
-            sender = MessagePublisher(lcm, codec, 1 / config.state_rate)
+            sender = MessagePublisher(lcm, codec, 0.02)
             builder.AddNamedSystem("motion_capture_publisher", sender)
             builder.Connect(pose, sender.GetInputPort(codec.port))
             builder.Connect(clock.get_output_port(), sender.unix_time_input_port())
@@ -107,7 +114,7 @@ def BuildPx4Diagram(config: Px4Config, lcm: LCM, inbox: UdpInbox) -> Diagram:
         builder.Connect(age, commander.motion_capture_age_input_port())
 
     builder.Connect(telemetry.state_output_port(), publisher.GetInputPort("state"))
-    builder.Connect(telemetry.is_fresh_output_port(), publisher.enabled_input_port())
+    builder.Connect(telemetry.age_output_port(), publisher.age_input_port())
     builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
     for port, name in (
         ("state", "state"),

@@ -8,13 +8,11 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, LeafSystem, State
 
-from splatpilot.systems.messaging.received import Received
+from splatpilot.systems.messaging.received import RESTART, Received
 from splatpilot.systems.messaging.udp_inbox import Datagrams, UdpConfig, UdpInbox
 from splatpilot.systems.ports import output_port
 from splatpilot.systems.sensing.time_of_flight import TimeOfFlight
 from splatpilot.systems.sensing.time_of_flight_packets import Stream, after_packet
-
-_RESTART = 1.0  # [s], after which a stream that fell silent may be another.
 
 
 @dataclass
@@ -123,7 +121,7 @@ class TimeOfFlightReceiver(LeafSystem):
 
         def after(received: _Received, packet: bytes) -> _Received:
             last = received.stream
-            if now - received.time > _RESTART:  # Its clock may begin anew.
+            if now - received.time > RESTART:  # Its clock may begin anew.
                 last = last.restarted()
             stream = after_packet(last, packet, self._config.sensor)
             time = now if stream.time_ns > last.time_ns else received.time

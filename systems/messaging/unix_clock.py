@@ -1,5 +1,7 @@
 """UnixClock: what time it is in the world outside."""
 
+from collections.abc import Callable
+
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
@@ -33,3 +35,13 @@ class UnixClock(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         output[0] = context.get_numeric_parameter(0)[0] + context.get_time()
+
+
+def time_of_reading(system: LeafSystem, context: Context, now: Callable[[], float] | None) -> float:
+    """Returns the Unix time [s] at which a system has read what came: that of `now`, if any, else
+    of its input `unix_time`.
+
+    A process may be behind the wall clock, also within an update. What it reads then would seem to
+    have come before it was sent. Call it after reading.
+    """
+    return now() if now else float(np.asarray(system.GetInputPort("unix_time").Eval(context))[0])

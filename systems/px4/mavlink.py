@@ -17,6 +17,10 @@ from splatpilot.systems.px4.frames import (
 
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _CUSTOM_MODE, _ARMED = 1, 128  # MAV_MODE_FLAGs
+_ACCEPTED = 0  # MAV_RESULT_ACCEPTED
+
+SET_MODE, ARM = 176, 400
+"""Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM."""
 
 VELOCITY_AND_YAW_RATE, VELOCITY_AND_YAW, BODY_RATES = 1479, 2503, 128
 """What a setpoint ignores: all but what the name says."""
@@ -34,17 +38,35 @@ class Heartbeat(NamedTuple):
 
 
 class Position(NamedTuple):
-    """What PX4 knows of its place."""
+    """Where PX4 estimates that it is."""
 
+    time: float  # [s] since PX4 began.
     p_WB: np.ndarray  # (3,) [m]
     v_WB: np.ndarray  # (3,) [m/s]
 
 
 class Attitude(NamedTuple):
-    """What PX4 knows of its attitude."""
+    """The attitude that PX4 estimates."""
 
+    time: float  # [s] since PX4 began.
     q_WB: np.ndarray  # (4, wxyz)
     w_WB_B: np.ndarray  # (3,) [rad/s]
+
+
+class Timesync(NamedTuple):
+    """A question what time it is, or an answer."""
+
+    answer: int  # [ns] by the clock of the one who answers; 0 in a question.
+    question: int  # [ns] by the clock of the one who asks.
+
+
+class Granted(NamedTuple):
+    """An answer that a command of ours is accepted."""
+
+    command: int
+
+
+Message = Heartbeat | Position | Attitude | Timesync | Granted
 
 
 class Mavlink:
@@ -130,45 +152,36 @@ class Mavlink:
 
     def set_mode(self, mode: tuple[int, int]) -> bytes:
         """Asks for a mode."""
-        return self._command(self._dialect.MAV_CMD_DO_SET_MODE, _CUSTOM_MODE, *mode)
+        return self._command(SET_MODE, _CUSTOM_MODE, *mode)
 
     def arm(self) -> bytes:
         """Asks for the motors to be armed."""
-        return self._command(self._dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+        return self._command(ARM, 1.0)
 
-    def read(self, packet: bytes) -> list[Heartbeat | Position | Attitude]:
+    def timesync(self, timesync: Timesync) -> bytes:
+        """Writes a question what time it is, or an answer."""
+        return self._packed(self._dialect.MAVLink_timesync_message(*timesync))
+
+    def read(self, packet: bytes) -> tuple[list[Message], list[str]]:
         """
-        What a packet says; messages of other kinds and of other systems are left out.
-
-        Raises:
-            ValueError: if it holds anything but whole messages, or numbers that are none.
+        Reads a packet: its messages, and why others in it are refused. Messages of other kinds and
+        of other systems are left out.
         """
         parser = self._dialect.MAVLink(None)
         parser.robust_parsing = True  # Messages that are not known are none of ours, but no error.
-        messages = parser.parse_buffer(packet) or []
-        bad = [message.reason for message in messages if message.get_type() == "BAD_DATA"]
-        if bad:
-            raise ValueError(f"the packet is no MAVLink: {bad[0]}")
-        if sum(len(message.get_msgbuf()) for message in messages) != len(packet):
-            raise ValueError(f"the packet of {len(packet)} bytes holds no whole message")
-        said: list[Heartbeat | Position | Attitude] = []
-        for m in messages:
-            if (m.get_srcSystem(), m.get_srcComponent()) != (self._system, 1):
-                continue
-            kind = m.get_type()
-            if kind == "HEARTBEAT":
-                mode = (m.custom_mode >> 16) & 0xFF, (m.custom_mode >> 24) & 0xFF
-                said.append(Heartbeat(bool(m.base_mode & _ARMED), mode))
-            elif kind == "LOCAL_POSITION_NED":
-                p, v = _finite([m.x, m.y, m.z]), _finite([m.vx, m.vy, m.vz])
-                said.append(Position(from_px4(p), from_px4(v)))
-            elif kind == "ATTITUDE_QUATERNION":
-                q = _finite([m.q1, m.q2, m.q3, m.q4])
-                w = _finite([m.rollspeed, m.pitchspeed, m.yawspeed])
-                if not abs(np.linalg.norm(q) - 1.0) < 0.01:
-                    raise ValueError(f"the attitude {q.tolist()} is no unit quaternion")
-                said.append(Attitude(attitude_from_px4(q), from_px4(w)))
-        return said
+        parsed = parser.parse_buffer(packet) or []
+        bad = [message.reason for message in parsed if message.get_type() == "BAD_DATA"]
+        refused = [f"the packet must be MAVLink, got {bad[0]}"] if bad else []
+        if sum(len(message.get_msgbuf()) for message in parsed) != len(packet):
+            refused.append(f"the packet of {len(packet)} bytes must end with a whole message")
+        messages: list[Message] = []
+        for m in parsed:
+            if (m.get_srcSystem(), m.get_srcComponent()) == (self._system, 1):
+                try:
+                    messages += _message(m)
+                except ValueError as error:
+                    refused.append(f"{m.get_type()}: {error}")
+        return messages, refused
 
     def _command(self, command: int, *parameters: float) -> bytes:
         padded = [*map(float, parameters), *[0.0] * (7 - len(parameters))]
@@ -184,8 +197,34 @@ def _milliseconds(time: float) -> int:
     return round(time * 1e3) & 0xFFFFFFFF
 
 
+def _message(m: Any) -> list[Message]:
+    """
+    Converts a message of PX4's; a message of another kind becomes an empty list.
+
+    Raises:
+        ValueError: if its numbers cannot be used.
+    """
+    kind = m.get_type()
+    if kind == "HEARTBEAT":
+        mode = (m.custom_mode >> 16) & 0xFF, (m.custom_mode >> 24) & 0xFF
+        return [Heartbeat(bool(m.base_mode & _ARMED), mode)]
+    if kind == "LOCAL_POSITION_NED":
+        p, v = _finite([m.x, m.y, m.z]), _finite([m.vx, m.vy, m.vz])
+        return [Position(1e-3 * m.time_boot_ms, from_px4(p), from_px4(v))]
+    if kind == "ATTITUDE_QUATERNION":
+        q = _finite([m.q1, m.q2, m.q3, m.q4])
+        w = _finite([m.rollspeed, m.pitchspeed, m.yawspeed])
+        if not abs(np.linalg.norm(q) - 1.0) < 0.01:
+            raise ValueError(f"the attitude must be a unit quaternion, got {q.tolist()}")
+        return [Attitude(1e-3 * m.time_boot_ms, attitude_from_px4(q), from_px4(w))]
+    if kind == "TIMESYNC":
+        return [Timesync(m.tc1, m.ts1)]
+    is_ours = kind == "COMMAND_ACK" and m.target_component in (0, _ONBOARD_COMPUTER)
+    return [Granted(m.command)] if is_ours and m.result == _ACCEPTED else []
+
+
 def _finite(values: list[float]) -> np.ndarray:
     array = np.array(values, dtype=float)
     if not np.isfinite(array).all():
-        raise ValueError(f"values are {array.tolist()}; they must be finite")
+        raise ValueError(f"values must be finite, got {array.tolist()}")
     return array

@@ -48,6 +48,7 @@ class MavsdkVehicle:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
+        self._began = time.monotonic()
         self._mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.AUTOPILOT))
         result = self._mavsdk.add_any_connection(f"udpin://127.0.0.1:{self.port}")
         assert result == ConnectionResult.SUCCESS
@@ -72,7 +73,7 @@ class MavsdkVehicle:
         place = PositionVelocityNed(PositionNed(x, -y, -z), VelocityNed(0.0, 0.0, 0.0))
         self._telemetry.publish_position_velocity_ned(place)
         fields = dict.fromkeys(("q2", "q3", "q4", "rollspeed", "pitchspeed", "yawspeed"), 0.0)
-        fields |= {"q1": 1.0, "time_boot_ms": 0}
+        fields |= {"q1": 1.0, "time_boot_ms": round(1e3 * (time.monotonic() - self._began))}
         self._direct.send_message(
             MavlinkMessage("ATTITUDE_QUATERNION", 1, 1, 0, 0, json.dumps(fields))
         )

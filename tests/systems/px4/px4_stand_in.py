@@ -25,6 +25,7 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import (
 OFFBOARD, LOITER, LAND, POSITION = (6, 0), (4, 3), (4, 6), (3, 0)
 HALF_TURN = Rotation.from_euler("x", 180, degrees=True)
 STEP = 0.01  # [s]
+BOOT = -123.4  # [s], when it began.
 
 
 class Px4StandIn:
@@ -49,12 +50,15 @@ class Px4StandIn:
         self.armed, self.mode = False, POSITION
         self.velocity, self.heading, self.rates = np.zeros(3), np.nan, None
         self.stream_began = self.last_setpoint = -np.inf
-        self.odometry, self.refused, self.answers, self.heard = None, [], [], []
+        self.odometry, self.refused, self.answers, self.heard = [], [], [], []
+        self.offsets = []  # [s] What is added to our time for its own, by TIMESYNC.
         self.tick = 0
+        self.delay, self.delayed = 0.0, []  # [s] Of states, and when those that wait are due.
+        self.muted: set[str] = set()  # Types of messages that it does not send.
 
     def step(self, now: float) -> None:
         """What happens until `now` [s]."""
-        while self.tick * STEP <= now:
+        while self.tick * STEP <= now + 1e-9:
             self._receive(self.tick * STEP)
             self._fly(self.tick * STEP)
             self._tell(self.tick * STEP)
@@ -89,7 +93,11 @@ class Px4StandIn:
             frd = [message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate]
             self.rates = np.append(message.thrust / 0.5 * GRAVITY, HALF_TURN.apply(frd))
         elif kind == "ODOMETRY":
-            self.odometry = message
+            self.odometry.append(message)
+        elif kind == "TIMESYNC" and message.tc1 == 0:
+            self._send(dialect.MAVLink_timesync_message(round(1e9 * (now - BOOT)), message.ts1))
+        elif kind == "TIMESYNC":
+            self.offsets.append(0.5e-9 * message.ts1 + 0.5 * (now - BOOT) - 1e-9 * message.tc1)
         elif kind == "COMMAND_LONG":
             accepted = self._command(message, now)
             result = dialect.MAV_RESULT_ACCEPTED if accepted else dialect.MAV_RESULT_DENIED
@@ -136,16 +144,24 @@ class Px4StandIn:
         self.state = rk4_step(self.state, command, QuadrotorParams(), STEP)
 
     def _tell(self, now: float) -> None:
-        milliseconds = round(now * 1e3)
+        milliseconds = round((now - BOOT) * 1e3)
         if self.tick % 2 == 0:
             p, v = HALF_TURN.apply(self.state[:3]), HALF_TURN.apply(self.state[3:6])
-            self._send(dialect.MAVLink_local_position_ned_message(milliseconds, *p, *v))
             R_WB = Rotation.from_quat(np.roll(self.state[6:10], -1))
             x, y, z, w = (HALF_TURN * R_WB * HALF_TURN.inv()).as_quat()
             rates = HALF_TURN.apply(self.state[10:13])
-            self._send(
-                dialect.MAVLink_attitude_quaternion_message(milliseconds, w, x, y, z, *rates)
-            )
+            due = now + self.delay
+            self.delayed += [
+                (due, dialect.MAVLink_local_position_ned_message(milliseconds, *p, *v)),
+                (
+                    due,
+                    dialect.MAVLink_attitude_quaternion_message(milliseconds, w, x, y, z, *rates),
+                ),
+            ]
+        while self.delayed and self.delayed[0][0] <= now + 1e-9:
+            self._send(self.delayed.pop(0)[1])
+        if self.tick % 10 == 0:
+            self._send(dialect.MAVLink_timesync_message(0, round(1e9 * (now - BOOT))))
         if self.tick % 100 == 0:  # PX4's heartbeat has 1 Hz, whatever is asked for.
             base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
@@ -159,5 +175,5 @@ class Px4StandIn:
             )
 
     def _send(self, message) -> None:
-        if self.peer is not None:
+        if self.peer is not None and message.get_type() not in self.muted:
             self.socket.sendto(bytes(message.pack(self.link)), self.peer)

@@ -1,12 +1,24 @@
 """Messages to and from PX4, read and written by pymavlink's own end."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from splatpilot.systems.px4.mavlink import HOLD, OFFBOARD, Attitude, Heartbeat, Mavlink, Position
+from splatpilot.systems.px4.mavlink import (
+    ARM,
+    HOLD,
+    OFFBOARD,
+    SET_MODE,
+    Attitude,
+    Granted,
+    Heartbeat,
+    Mavlink,
+    Position,
+    Timesync,
+)
 
 OURS = Mavlink()
 PX4 = dialect.MAVLink(None, 1, 1)
@@ -82,35 +94,67 @@ def test_what_px4_says_is_in_our_frames():
     custom = (6 << 16) | (0 << 24)
     packet = sent(
         d.MAVLink_heartbeat_message(2, 12, 128 | 1, custom, 4, 3),
-        d.MAVLink_local_position_ned_message(0, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125),
-        d.MAVLink_attitude_quaternion_message(0, 0.5, 0.5, -0.5, 0.5, 0.1, 0.2, 0.3),
+        d.MAVLink_local_position_ned_message(2500, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125),
+        d.MAVLink_attitude_quaternion_message(2250, 0.5, 0.5, -0.5, 0.5, 0.1, 0.2, 0.3),
         d.MAVLink_system_time_message(0, 0),
     )
     others = bytes(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(d.MAVLink(None, 255, 190)))
-    heartbeat, position, attitude = OURS.read(packet + others)
+    (heartbeat, position, attitude), refused = OURS.read(packet + others)
     assert heartbeat == Heartbeat(True, OFFBOARD)
     assert isinstance(position, Position) and isinstance(attitude, Attitude)
+    assert (position.time, attitude.time, refused) == (2.5, 2.25, [])
     np.testing.assert_array_equal(position.p_WB, [1, -2, 3])
     np.testing.assert_array_equal(position.v_WB, [0.5, -0.25, 0.125])
     np.testing.assert_array_equal(attitude.q_WB, [0.5, 0.5, 0.5, -0.5])
     np.testing.assert_allclose(attitude.w_WB_B, [0.1, -0.2, -0.3], rtol=1e-6)
 
 
-GOOD = sent(dialect.MAVLink_local_position_ned_message(0, 1.0, 2.0, 3.0, 0, 0, 0))
+def test_only_commands_of_ours_that_are_accepted_are_granted():
+    d, accepted, denied = dialect, dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_DENIED
+    packet = sent(
+        d.MAVLink_command_ack_message(SET_MODE, accepted),
+        d.MAVLink_command_ack_message(ARM, denied),
+        d.MAVLink_command_ack_message(ARM, accepted, 0, 0, 1, 190),
+        d.MAVLink_command_ack_message(ARM, accepted, 0, 0, 1, 191),
+    )
+    assert OURS.read(packet)[0] == [Granted(SET_MODE), Granted(ARM)]
+
+
+def test_the_time_is_asked_for_and_answered():
+    message = received(OURS.timesync(Timesync(1_800_000_000_000_000_000, 5)))
+    assert (message.tc1, message.ts1) == (1_800_000_000_000_000_000, 5)
+    assert OURS.read(sent(dialect.MAVLink_timesync_message(0, 7)))[0] == [Timesync(0, 7)]
+
+
+HEARTBEAT = dialect.MAVLink_heartbeat_message(2, 12, 1, 3 << 16, 4, 3)
+GOOD = sent(HEARTBEAT)
 
 
 @pytest.mark.parametrize(
-    "packet",
+    ("packet", "why"),
     [
-        b"LC02",
-        GOOD[:-1],
-        GOOD[:20] + b"!" + GOOD[21:],
-        sent(dialect.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0)),
-        sent(dialect.MAVLink_attitude_quaternion_message(0, 2.0, 0, 0, 0, 0, 0, 0)),
-        np.random.default_rng(0).bytes(300),
+        (GOOD + b"LC02", "must be MAVLink"),
+        (b"LC02" + GOOD, "must be MAVLink"),
+        (GOOD + GOOD[:-1], "must end with a whole message"),
+        (GOOD + GOOD[:15] + b"!" + GOOD[16:], "must be MAVLink"),
+        (
+            sent(dialect.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0), HEARTBEAT),
+            r"LOCAL_POSITION_NED: values must be finite, got \[nan",
+        ),
+        (
+            sent(HEARTBEAT, dialect.MAVLink_attitude_quaternion_message(0, 2.0, 0, 0, 0, 0, 0, 0)),
+            r"ATTITUDE_QUATERNION: the attitude must be a unit quaternion, got \[2",
+        ),
     ],
 )
-def test_what_is_no_message_is_refused(packet):
-    """Packets that are cut, changed or of something else, and numbers that are none, are errors."""
-    with pytest.raises(ValueError, match=r"the packet|values are|no unit quaternion"):
-        OURS.read(packet)
+def test_what_is_no_message_hides_no_other(packet, why):
+    messages, refused = OURS.read(packet)
+    assert messages == [Heartbeat(False, (3, 0))]
+    assert len(refused) == 1
+    assert re.search(why, refused[0])
+
+
+@pytest.mark.parametrize("packet", [b"LC02", GOOD[:-1], np.random.default_rng(0).bytes(300)])
+def test_a_packet_without_a_message_is_refused(packet):
+    messages, refused = OURS.read(packet)
+    assert not messages and refused
