@@ -15,7 +15,7 @@ from splatpilot.systems.messaging.codecs import (
     StatusCodec,
     VelocitySetpointCodec,
 )
-from splatpilot.systems.messaging.message_publisher import MeasurementPublisher, MessagePublisher
+from splatpilot.systems.messaging.message_publisher import MeasurementPublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.messaging.unix_clock import UnixClock
@@ -103,13 +103,15 @@ def BuildPx4Diagram(
         if config.motion_capture is None:
             pose, age = add_subscriber("motion_capture", codec)
         else:
-            eye = MotionCaptureReceiver(config.motion_capture, config.tick)
+            eye = MotionCaptureReceiver(config.motion_capture, config.tick, now)
             builder.AddNamedSystem("motion_capture_receiver", eye)
             pose, age = eye.motion_capture_pose_output_port(), eye.age_output_port()
-            sender = MessagePublisher(lcm, codec, 0.02)
+            sender = MeasurementPublisher(lcm, codec, config.tick)
             builder.AddNamedSystem("motion_capture_publisher", sender)
             builder.Connect(pose, sender.GetInputPort(codec.port))
+            builder.Connect(age, sender.age_input_port())
             builder.Connect(clock.get_output_port(), sender.unix_time_input_port())
+            builder.Connect(clock.get_output_port(), eye.unix_time_input_port())
         builder.Connect(pose, commander.motion_capture_pose_input_port())
         builder.Connect(age, commander.motion_capture_age_input_port())
 
