@@ -93,8 +93,10 @@ def BuildPx4Diagram(
         (setpoint, "setpoint"),
         (age, "setpoint_age"),
         (first.get_output_port(0), "bridge_mode"),
-        (telemetry.armed_output_port(), "armed"),
-        (telemetry.mode_output_port(), "mode"),
+        *(
+            (telemetry.GetOutputPort(name), name)
+            for name in ("heartbeat_age", "armed", "mode", "granted")
+        ),
         (clock.get_output_port(), "unix_time"),
     ):
         builder.Connect(source, commander.GetInputPort(name))

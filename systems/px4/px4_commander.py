@@ -8,13 +8,17 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
+from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET, SAME_TIME
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.ports import input_port, optional_input
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
+from splatpilot.systems.px4.px4_telemetry import HEARTBEAT_TIMEOUT
 
 _HEARTBEAT_PERIOD = 1.0  # [s], and of commands that are said again until they are obeyed.
 
+_BRAKING = 2.0  # [s] For which PX4 is told to stop when setpoints cease: two of its heartbeats.
+
+_STOP = np.array([0.0, 0.0, 0.0, math.nan])  # A velocity setpoint.
 
 _TAKEN = -1.0  # Someone else flies: nothing is asked for any more.
 
@@ -60,20 +64,22 @@ class _Memory(NamedTuple):
     """The discrete state."""
 
     streaming: float = math.nan  # [s], since when setpoints have been sent.
-    flown: float = 0.0  # Whether offboard mode has been reached.
+    entered: float = 0.0  # Whether offboard mode has been reached or granted.
+    flown: float = 0.0  # Whether it has been reached with motors armed.
+    ceased: float = math.nan  # [s], since when the bridge has been silent or landing.
     left: float = 0.0  # 0, the sub mode that offboard mode is left for, or `_TAKEN`.
     asked: float = -math.inf  # [s], when something was asked for last.
 
 
 class _Arrival(NamedTuple):
-    """Of setpoints, in the discrete state too."""
+    """The last setpoint or pose, in the discrete state too."""
 
-    age: float = math.inf  # [s], at the last look; it falls where a setpoint has come.
-    time: float = -math.inf  # [s], when the last one came.
+    sent: float = -math.inf  # [s] Unix time, when the last one was sent.
+    time: float = -math.inf  # [s] of the Context, when it came.
 
 
 class Px4Commander(LeafSystem):
-    """Streams setpoints to PX4, enters offboard mode where that is asked for, and leaves it.
+    """Streams setpoints to PX4, enters offboard mode where that is configured, and leaves it.
 
     .. pydrake_system::
 
@@ -82,8 +88,10 @@ class Px4Commander(LeafSystem):
         - setpoint
         - setpoint_age
         - bridge_mode
+        - heartbeat_age
         - armed
         - mode
+        - granted
         - motion_capture_pose
         - motion_capture_age
         - unix_time
@@ -91,24 +99,36 @@ class Px4Commander(LeafSystem):
     - ``setpoint`` (4), ``setpoint_age`` (1) [s]: a velocity setpoint or a command of body rates, as
       the configuration says, and its age.
     - ``bridge_mode`` (1), optional: the mode in the bridge's status, see ``lcmt_bridge_status``.
-    - ``armed`` (1), ``mode`` (2): of :class:`~splatpilot.systems.px4.px4_telemetry.Px4Telemetry`.
+    - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of
+      :class:`~splatpilot.systems.px4.px4_telemetry.Px4Telemetry`.
     - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB of
-      the vehicle, sent on as ODOMETRY while it is no older than a setpoint may be.
+      the vehicle.
     - ``unix_time`` (1): [s].
 
-    Every ``period`` from time 0 it sends the setpoint, if it is fresh, and the odometry, and the
-    setpoint also as it comes, for which it looks every ``tick``; every second a heartbeat. After
-    ``streaming`` seconds of setpoints it asks for offboard mode, and in it to arm, each where the
-    configuration says so and the bridge flies, once a second until PX4 does. Where setpoints cease
-    it asks for hold, and where the bridge lands for PX4's own landing, and sends no more setpoints:
-    offboard mode is not entered again. Nor is it where it was left by someone else.
+    Every ``period`` from time 0 it sends the setpoint, if it is fresh, and also as it comes, for
+    which it looks every ``tick``; every second a heartbeat. It sends poses on as ODOMETRY when they
+    come, each once, unless they follow another within 0.9 ``period`` or are older than a setpoint
+    may be.
+
+    After ``streaming`` seconds of setpoints it requests offboard mode, and in it arming, each if
+    the configuration says so and the bridge flies, once a second until PX4 grants it.
+
+    If setpoints cease in flight it has PX4 stop, by setpoints of its own, and requests hold. If the
+    bridge lands it requests PX4's own landing. Then it sends no more setpoints, and does not enter
+    offboard mode again. Nor does it if someone else has left it.
+
+    A pilot may have taken over since PX4's last heartbeat. Therefore it requests nothing until a
+    heartbeat has come since the reason for it arose, and since its last request. Setpoints need no
+    such care: PX4 flies by them in offboard mode only.
     """
 
     setpoint_input_port = input_port("setpoint")
     setpoint_age_input_port = input_port("setpoint_age")
     bridge_mode_input_port = input_port("bridge_mode")
+    heartbeat_age_input_port = input_port("heartbeat_age")
     armed_input_port = input_port("armed")
     mode_input_port = input_port("mode")
+    granted_input_port = input_port("granted")
     motion_capture_pose_input_port = input_port("motion_capture_pose")
     motion_capture_age_input_port = input_port("motion_capture_age")
     unix_time_input_port = input_port("unix_time")
@@ -142,12 +162,17 @@ class Px4Commander(LeafSystem):
         self._config, self._inbox, self._mavlink = config, inbox, mavlink
         self._address, self._gravity, self._period = address, gravity, period
         for name, size in (
-            *(("setpoint", 4), ("setpoint_age", 1), ("bridge_mode", 1), ("armed", 1), ("mode", 2)),
-            *(("motion_capture_pose", 7), ("motion_capture_age", 1), ("unix_time", 1)),
+            *(("setpoint", 4), ("setpoint_age", 1), ("bridge_mode", 1), ("heartbeat_age", 1)),
+            *(("armed", 1), ("mode", 2), ("granted", 2), ("motion_capture_pose", 7)),
+            *(("motion_capture_age", 1), ("unix_time", 1)),
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
-        self._arrival = int(self.DeclareDiscreteState(np.array(_Arrival())))
+        # By the ages of what arrives: the time between two that are sent on [s], and the state.
+        self._arrivals = {
+            name: (apart, int(self.DeclareDiscreteState(np.array(_Arrival()))))
+            for name, apart in (("setpoint_age", SAME_TIME), ("motion_capture_age", 0.9 * period))
+        }
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
@@ -157,19 +182,20 @@ class Px4Commander(LeafSystem):
         age = optional_input(self, name, context)
         return age is not None and bool(age[0] <= self._config.max_age)
 
+    def _read(self, context: Context, name: str) -> np.ndarray:
+        return np.asarray(self.GetInputPort(name).Eval(context))
+
     def _is_in(self, context: Context, mode: tuple[int, int]) -> bool:
-        now = optional_input(self, "mode", context)
-        assert now is not None
+        now = self._read(context, "mode")
         return now[0] == mode[0] and (mode == OFFBOARD or now[1] == mode[1])
 
     def _request(self, context: Context) -> bytes | None:
-        """What PX4 is to be asked for; None where it does it, or nobody asks for it."""
+        """Returns the request that PX4 does not yet fulfill; None if there is none."""
         memory, config = _memory(context), self._config
-        armed = optional_input(self, "armed", context)
-        assert armed is not None
+        armed = bool(self._read(context, "armed")[0])
         if memory.left:
             mode = (HOLD[0], int(memory.left))
-            taken = memory.left == _TAKEN or self._is_in(context, mode) or not armed[0]
+            taken = memory.left == _TAKEN or self._is_in(context, mode) or not armed
             return None if taken else self._mavlink.set_mode(mode)
         streamed = context.get_time() - memory.streaming >= config.streaming
         bridge = optional_input(self, "bridge_mode", context)
@@ -177,54 +203,72 @@ class Px4Commander(LeafSystem):
         if not (config.engage and streamed and flies):
             return None
         if not self._is_in(context, OFFBOARD):
-            return None if memory.flown else self._mavlink.set_mode(OFFBOARD)
-        return self._mavlink.arm() if config.arm and not armed[0] and not memory.flown else None
+            return None if memory.entered else self._mavlink.set_mode(OFFBOARD)
+        may_arm = config.arm and not (memory.flown or self._read(context, "granted")[1])
+        return self._mavlink.arm() if may_arm and not armed else None
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now, memory = context.get_time(), _memory(context)
-        fresh, armed = (
-            self._is_fresh(context, "setpoint_age"),
-            optional_input(self, "armed", context),
-        )
-        assert armed is not None
-        mode = optional_input(self, "bridge_mode", context)
+        age = self._read(context, "heartbeat_age")[0]
+        heard, is_known = now - age, age <= HEARTBEAT_TIMEOUT
+        fresh, offboard = self._is_fresh(context, "setpoint_age"), self._is_in(context, OFFBOARD)
+        bridge = optional_input(self, "bridge_mode", context)
+        landing = bridge is not None and bridge[0] == status.LANDING
         if not fresh:
             memory = memory._replace(streaming=math.nan)
         elif math.isnan(memory.streaming):
             memory = memory._replace(streaming=now)
-        offboard = self._is_in(context, OFFBOARD)
-        if offboard and armed[0]:
+        if fresh and not landing:
+            memory = memory._replace(ceased=math.nan)
+        elif math.isnan(memory.ceased):
+            memory = memory._replace(ceased=now)
+        if offboard or self._read(context, "granted")[0]:
+            memory = memory._replace(entered=1.0)
+        if offboard and self._read(context, "armed")[0]:
             memory = memory._replace(flown=1.0)
-        landing = mode is not None and mode[0] == status.LANDING
-        if memory.flown and not offboard:  # By us, by PX4, or by a pilot, who is not fought.
+        if memory.flown and is_known and not offboard:  # By us, PX4 or a pilot, who is not fought.
             memory = memory._replace(left=_TAKEN)
-        elif memory.flown and memory.left == 0 and (landing or not fresh):
-            left = LAND if landing else HOLD
-            memory = memory._replace(left=float(left[1]), asked=-math.inf)
-        if now - memory.asked >= _HEARTBEAT_PERIOD and self._request(context) is not None:
+        elif memory.flown and memory.left == 0 and heard > memory.ceased:
+            memory = memory._replace(left=float((LAND if landing else HOLD)[1]), asked=-math.inf)
+        may_ask = is_known and heard > memory.asked and now - memory.asked >= _HEARTBEAT_PERIOD
+        if may_ask and self._request(context) is not None:
             memory = memory._replace(asked=now)
         discrete_state.set_value(0, np.array(memory))
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
-        age = optional_input(self, "setpoint_age", context)
-        assert age is not None
-        last = _Arrival(*np.asarray(context.get_discrete_state(self._arrival).value()))
-        time = context.get_time() if age[0] < last.age else last.time
-        discrete_state.set_value(self._arrival, np.array(_Arrival(age[0], time)))
+        unix_time = self._read(context, "unix_time")[0]
+        for name, (apart, index) in self._arrivals.items():
+            age = optional_input(self, name, context)
+            last = _Arrival(*np.asarray(context.get_discrete_state(index).value()))
+            if age is not None and unix_time - age[0] > last.sent + apart:
+                arrival = _Arrival(unix_time - age[0], context.get_time())
+                discrete_state.set_value(index, np.array(arrival))
+
+    def _has_come(self, context: Context, name: str) -> bool:
+        came = context.get_discrete_state(self._arrivals[name][1])[1]
+        return context.get_time() - came < 2.0 * PUBLISH_OFFSET and self._is_fresh(context, name)
 
     def _publish_at_once(self, context: Context) -> None:
         now = context.get_time() - PUBLISH_OFFSET
-        came = context.get_discrete_state(self._arrival)[1]
         is_due = abs(math.remainder(now, self._period)) < PUBLISH_OFFSET  # And is sent anyway.
-        if now - came < PUBLISH_OFFSET and not is_due:
+        if self._has_come(context, "setpoint_age") and not is_due:
             self._publish_setpoint(context)
+        if self._has_come(context, "motion_capture_age"):
+            pose = self._read(context, "motion_capture_pose")
+            unix_time, age = (
+                self._read(context, name)[0] for name in ("unix_time", "motion_capture_age")
+            )
+            self._send(self._mavlink.odometry(pose, round((unix_time - age) * 1e6)))
 
     def _publish_setpoint(self, context: Context) -> None:
-        now = context.get_time() - PUBLISH_OFFSET
-        if not self._is_fresh(context, "setpoint_age") or _memory(context).left:
+        now, memory = context.get_time() - PUBLISH_OFFSET, _memory(context)
+        if memory.left:
             return
-        setpoint = optional_input(self, "setpoint", context)
-        assert setpoint is not None
+        if not self._is_fresh(context, "setpoint_age"):
+            if memory.flown and now - memory.ceased <= _BRAKING:
+                self._send(self._mavlink.velocity_setpoint(_STOP, now))
+            return
+        setpoint = self._read(context, "setpoint")
         if self._config.setpoints == "velocity":
             self._send(self._mavlink.velocity_setpoint(setpoint, now))
         else:
@@ -232,19 +276,12 @@ class Px4Commander(LeafSystem):
             self._send(self._mavlink.body_rates(setpoint, thrust, self._gravity, now))
 
     def _publish(self, context: Context) -> EventStatus:
-        memory, mavlink = _memory(context), self._mavlink
+        memory = _memory(context)
         now = context.get_time() - PUBLISH_OFFSET
         tick = round(now / self._period)
         if tick % round(_HEARTBEAT_PERIOD / self._period) == 0:
-            self._send(mavlink.heartbeat())
+            self._send(self._mavlink.heartbeat())
         self._publish_setpoint(context)
-        pose = optional_input(self, "motion_capture_pose", context)
-        if pose is not None and self._is_fresh(context, "motion_capture_age"):
-            unix_time, age = (
-                optional_input(self, name, context) for name in ("unix_time", "motion_capture_age")
-            )
-            assert unix_time is not None and age is not None
-            self._send(mavlink.odometry(pose, round((unix_time[0] - age[0]) * 1e6)))
         if abs(now - memory.asked) < 0.5 * self._period:
             request = self._request(context)
             if request is not None:

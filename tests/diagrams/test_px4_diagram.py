@@ -1,13 +1,16 @@
 """The bridge flies what PX4 flies: over real MAVLink, with a stand-in for PX4."""
 
 import dataclasses
+import socket
 
 import lcm
 import numpy as np
 import pytest
-from px4_stand_in import LAND, LOITER, OFFBOARD, POSITION, Px4StandIn
+from natnet_frame import natnet_frame
+from px4_stand_in import BOOT, LAND, LOITER, OFFBOARD, POSITION, Px4StandIn
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
+from pymavlink.dialects.v20 import common as dialect
 
 from splatpilot.diagrams.hardware_config import HardwareConfig
 from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
@@ -20,11 +23,13 @@ from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
 from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
+from splatpilot.systems.px4.motion_capture_receiver import MotionCaptureConfig
 from splatpilot.systems.px4.px4_commander import Px4CommanderConfig
 from splatpilot.systems.vehicle.flight_limits import FlightLimits
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
 START, GOAL = [1.0, 2.0, 2.0], [9.0, 2.0, 2.0]
+EPOCH = 1_800_000_000.0  # [s] Unix time when a test begins.
 ENGAGED = Px4CommanderConfig(engage=True, arm=True)
 
 
@@ -39,6 +44,7 @@ class Chain:
         body: str = "",
         policy=None,
         hardware: HardwareConfig | None = None,
+        motion_capture: bool = False,
     ):
         self.px4 = Px4StandIn(version, START)
         self.inbox = UdpInbox(UdpConfig(port=0))
@@ -46,23 +52,48 @@ class Chain:
         self.lcm = lcm.LCM("memq://")
         scenario = Scenario(policy=policy_named("straight", 1.0), start=START, goal=GOAL)
         config = Px4Config(vehicle_port=self.px4.port, commander=commander, body=body)
+        if motion_capture:
+            udp = UdpConfig(port=0)
+            config.motion_capture = MotionCaptureConfig(udp, body_id=3, version=[4, 0])
         self.bridge = BuildHardwareDiagram(scenario, world, self.lcm, hardware, policy=policy)
         self.link = BuildPx4Diagram(config, self.lcm, self.inbox)
         self.simulators = {"bridge": Simulator(self.bridge), "link": Simulator(self.link)}
+        for simulator in self.simulators.values():
+            clock = simulator.get_system().GetSubsystemByName("clock")
+            root = simulator.get_mutable_context()
+            clock.set_epoch(clock.GetMyMutableContextFromRoot(root), EPOCH)
         self.alive = {"bridge", "link"}
         self.now = 0.0
+        self.sees = dict(body=3) if motion_capture else None
+        self.cameras = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def advance(self, duration: float) -> None:
         until = self.now + duration
         while self.now < until - 1e-9:
             self.now += 0.01
+            if self.sees is not None:
+                self._see(**self.sees)
             for name in sorted(self.alive):
                 self.simulators[name].AdvanceTo(self.now)
             self.px4.step(self.now)
 
+    def _see(self, body: int, tracked: bool = True) -> None:
+        """Sends a frame of 100 Hz in which cameras, whose y is up, see PX4's vehicle."""
+        (x, y, z), q = self.px4.state[:3], self.px4.state[6:10]
+        frame = natnet_frame(
+            round(100 * self.now), body, [x, z, -y], [q[1], q[3], -q[2], q[0]], tracked
+        )
+        receiver = self.link.GetSubsystemByName("motion_capture_receiver")
+        self.cameras.sendto(frame, ("127.0.0.1", receiver.port))
+
     def status(self) -> np.ndarray:
         root = self.simulators["bridge"].get_context()
         return self.bridge.GetOutputPort("status").Eval(root)
+
+    def state(self) -> np.ndarray:
+        """Where the bridge predicts that the vehicle is."""
+        root = self.simulators["bridge"].get_context()
+        return self.bridge.GetOutputPort("state").Eval(root)
 
 
 @pytest.fixture
@@ -76,6 +107,7 @@ def chain(post_world):
     yield make
     for each in made:
         each.px4.socket.close()
+        each.cameras.close()
         each.inbox.close()
 
 
@@ -117,11 +149,13 @@ def test_a_stream_that_is_too_young_is_asked_with_again(chain):
 
 
 def test_where_the_bridge_dies_the_vehicle_holds(chain):
-    """When setpoints cease the link leaves offboard mode for hold, before PX4 has to, and does not
-    enter it again when they come back."""
+    """When setpoints cease the link stops the vehicle and leaves offboard mode for hold, before
+    PX4 has to, and does not enter it again when they come back."""
     flight = chain()
     flight.advance(6.0)
     flight.alive.remove("bridge")
+    flight.advance(0.4)
+    assert (flight.px4.mode, np.linalg.norm(flight.px4.velocity)) == (OFFBOARD, 0.0)
     flight.advance(0.8)
     assert flight.px4.mode == LOITER
     flight.advance(2.0)
@@ -143,32 +177,121 @@ def test_where_the_link_dies_px4_holds_by_itself(chain):
     assert np.linalg.norm(flight.px4.state[3:6]) < 0.1
 
 
-def test_a_pilot_who_takes_over_is_not_fought(chain):
-    """When a pilot leaves offboard mode nothing is asked for any more, whatever ceases."""
-    flight = chain()
-    flight.advance(6.0)
+@pytest.mark.parametrize(
+    ("setpoints", "silent"),
+    [("velocity", 0.05), ("velocity", 0.25), ("velocity", 0.6), ("body_rates", 0.35)],
+)
+def test_a_pilot_who_takes_over_keeps_the_vehicle(chain, setpoints, silent):
+    """Between two heartbeats, after the bridge has been silent for some time."""
+    flight = chain(commander=dataclasses.replace(ENGAGED, setpoints=setpoints))
+    flight.advance(6.05)
     asked = len(flight.px4.answers)
-    flight.px4.mode = POSITION
-    flight.advance(2.0)
     flight.alive.remove("bridge")
+    flight.advance(silent)
+    assert flight.px4.mode == OFFBOARD
+    flight.px4.mode = POSITION
+    flight.advance(3.0)
+    flight.alive.add("bridge")
     flight.advance(2.0)
     assert flight.px4.mode == POSITION
     assert len(flight.px4.answers) == asked
 
 
-def test_where_px4_falls_silent_the_bridge_stops(chain):
-    """Without telemetry the bridge notices that the state stands still, has PX4 stop, and when that
-    lasts, land."""
+def test_a_pilot_who_leaves_offboard_mode_at_once_keeps_the_vehicle(chain):
+    """Before any heartbeat says that it was entered."""
+    flight = chain()
+    while (dialect.MAV_CMD_DO_SET_MODE, True) not in flight.px4.answers:
+        flight.advance(0.01)
+    flight.px4.mode = POSITION
+    flight.advance(4.0)
+    assert flight.px4.mode == POSITION
+    assert flight.px4.answers == [(dialect.MAV_CMD_DO_SET_MODE, True)]
+
+
+def test_a_pilot_who_takes_over_from_a_landing_keeps_the_vehicle(chain):
+    """The bridge lands and the pilot takes over, both between two heartbeats."""
+    flight = chain()
+    flight.advance(5.0)
+    flight.px4.muted = STATES
+    while flight.status()[0] != lcmt_bridge_status.LANDING:
+        flight.advance(0.01)
+    flight.advance(0.3)
+    assert flight.px4.mode == OFFBOARD
+    asked = len(flight.px4.answers)
+    flight.px4.mode = POSITION
+    flight.advance(3.0)
+    assert flight.px4.mode == POSITION
+    assert len(flight.px4.answers) == asked
+
+
+STATES = {"LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"}
+
+
+@pytest.mark.parametrize(
+    ("muted", "mode"), [(STATES, LAND), (STATES | {"HEARTBEAT", "TIMESYNC"}, OFFBOARD)]
+)
+def test_where_px4_falls_silent_the_bridge_stops_and_lands(chain, muted, mode):
+    """It has PX4 land where PX4 still says its mode; else setpoints descend, which a pilot may
+    have taken the vehicle from."""
     flight = chain()
     flight.advance(6.0)
-    told, flight.px4._tell = flight.px4._tell, lambda now: None
+    flight.px4.muted = muted
     flight.advance(1.0)
     why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.STATE_OLD]
     np.testing.assert_array_equal(flight.status()[:2], why)
     assert np.linalg.norm(flight.px4.velocity) == 0.0
+    flight.advance(6.0)
+    assert flight.px4.mode == mode
+    np.testing.assert_allclose(flight.px4.state[3:6], [0.0, 0.0, -0.5], atol=0.1)
+
+
+@pytest.mark.parametrize(("setpoints", "delay"), [("velocity", 0.1), ("body_rates", 0.06)])
+def test_states_that_are_late_are_brought_up_to_date(chain, setpoints, delay):
+    """To within 5 cm of the truth, at 2 m/s."""
+    flight = chain(
+        policy=Circle(2.0, "waypoint"), commander=dataclasses.replace(ENGAGED, setpoints=setpoints)
+    )
+    flight.px4.delay = delay
     flight.advance(5.0)
-    assert flight.px4.mode == LAND
-    flight.px4._tell = told
+    for _ in range(200):
+        flight.advance(0.01)
+        assert np.linalg.norm(flight.px4.state[3:6]) == pytest.approx(2.0, abs=0.2)
+        assert np.linalg.norm(flight.state()[:3] - flight.px4.state[:3]) < 0.05
+        assert flight.status()[2] > delay
+
+
+@pytest.mark.parametrize("sees", [None, {"body": 8}, {"body": 3, "tracked": False}])
+def test_where_motion_capture_dies_the_bridge_stops(chain, sees):
+    """Where its stream ends, or does not show the body, in flight: within `max_age` of the last
+    sight, and another two steps of this test."""
+    flight = chain(body="starling", hardware=HardwareConfig(body="starling"), motion_capture=True)
+    flight.advance(6.0)
+    assert flight.status()[0] == lcmt_bridge_status.FLYING
+    sent = len(flight.px4.odometry)
+    assert sent == pytest.approx(300, abs=3)
+    flight.sees = sees
+    flight.advance(0.26)
+    assert flight.status()[0] == lcmt_bridge_status.FLYING
+    flight.advance(0.06)
+    why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.BODY_LOST]
+    np.testing.assert_array_equal(flight.status()[:2], why)
+    flight.advance(0.02)
+    assert np.linalg.norm(flight.px4.velocity) == 0.0
+    flight.advance(2.0)
+    assert np.linalg.norm(flight.px4.state[3:6]) < 0.1
+    assert len(flight.px4.odometry) <= sent + 1
+    assert np.isfinite([[m.x, m.y, m.z, *m.q] for m in flight.px4.odometry]).all()
+
+
+def test_px4_learns_our_clock_and_when_cameras_exposed(chain):
+    """The stamps of ODOMETRY are those of the exposures, and TIMESYNC gives PX4 our clock."""
+    flight = chain(body="starling", motion_capture=True)
+    flight.advance(3.0)
+    assert np.abs(np.array(flight.px4.offsets) + BOOT + EPOCH).max() < 0.01
+    exposed = np.diff([m.time_usec for m in flight.px4.odometry])
+    assert (exposed >= 15_000).all()
+    newest = 1e-6 * flight.px4.odometry[-1].time_usec - EPOCH
+    assert 0.01 <= flight.now - newest <= 0.01 + 0.04
 
 
 def test_motion_capture_is_sent_on(chain):
@@ -180,12 +303,13 @@ def test_motion_capture_is_sent_on(chain):
     publisher.GetInputPort(codec.port).FixValue(context, np.array([1.0, 2, 3, 1, 0, 0, 0]))
     flight.advance(0.1)
     assert not flight.px4.odometry
-    publisher.unix_time_input_port().FixValue(context, [flight.now])
+    publisher.unix_time_input_port().FixValue(context, [EPOCH + flight.now])
     publisher.ForcedPublish(context)
     flight.advance(0.1)
-    odometry = flight.px4.odometry[-1]
+    flight.advance(0.3)
+    (odometry,) = flight.px4.odometry
     assert (odometry.x, odometry.y, odometry.z) == (1.0, -2.0, -3.0)
-    assert odometry.time_usec == pytest.approx(0.1e6, abs=2)
+    assert odometry.time_usec == pytest.approx(1e6 * (EPOCH + 0.1), abs=2)
 
 
 class Circle(LeafSystem):
