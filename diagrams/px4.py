@@ -11,13 +11,18 @@ from splatpilot.diagrams.real_time import run_in_real_time
 from splatpilot.systems.messaging.open_lcm import open_lcm
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.px4.mavlink import OFFBOARD
+from splatpilot.systems.px4.px4_telemetry import HEARTBEAT_TIMEOUT
+
+REMINDER = 10.0
+"""[s] of silence after each of which it says that there is no heartbeat."""
 
 
 def run(*, config: Px4Config, duration: float = np.inf) -> None:
     """
     Stands between the bridge and PX4, for `duration` [s], or until it is interrupted.
 
-    It says when PX4 is heard, armed, and in offboard mode, and when it is not any more.
+    It says when PX4 is heard, armed, and in offboard mode, and when it is not any more; and every
+    ten seconds how long there has been no heartbeat.
 
     Raises:
         ValueError: for a configuration out of range.
@@ -35,24 +40,31 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
         print(f"PX4's packets come to {config.udp.host}:{inbox.port}.", flush=True)
         for what, is_asked in (("Offboard mode", asked.engage), ("Arming", asked.arm)):
             print(f"{what} is {'asked for' if is_asked else 'left to the pilot'}.", flush=True)
-        before = (False, False, False)
+        before, reminders = (False, False, False), 0
 
         def over(now: float) -> bool:
-            nonlocal before
+            nonlocal before, reminders
             age, armed, mode = (
                 np.asarray(diagram.GetOutputPort(name).Eval(root))
-                for name in ("state_age", "armed", "mode")
+                for name in ("heartbeat_age", "armed", "mode")
             )
-            is_so = bool(age[0] <= 1.0), bool(armed[0]), mode[0] == OFFBOARD[0]
+            is_so = bool(age[0] <= HEARTBEAT_TIMEOUT), bool(armed[0]), mode[0] == OFFBOARD[0]
             if is_so != before:
                 heard, armed_so, offboard = is_so
+                what = (
+                    f"heard, {'armed' if armed_so else 'disarmed'}, "
+                    f"{'in' if offboard else 'not in'} offboard mode"
+                )
+                print(f"{now:8.2f} s: PX4 is {what if heard else 'not heard'}", flush=True)
+                before = is_so
+            silences = int(min(age[0], now) / REMINDER)
+            if silences > reminders:
                 print(
-                    f"{now:8.2f} s: PX4 is {'' if heard else 'not '}heard, "
-                    f"{'armed' if armed_so else 'disarmed'}, "
-                    f"{'in' if offboard else 'not in'} offboard mode",
+                    f"{now:8.2f} s: no heartbeat for {silences * REMINDER:g} s at "
+                    f"{config.udp.host}:{inbox.port}",
                     flush=True,
                 )
-                before = is_so
+            reminders = silences
             return now >= duration
 
         run_in_real_time(simulator, diagram, config.tick, over)

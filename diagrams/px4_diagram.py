@@ -43,6 +43,7 @@ def BuildPx4Diagram(
         output_ports:
         - state
         - state_age
+        - heartbeat_age
         - armed
         - mode
 
@@ -123,6 +124,7 @@ def BuildPx4Diagram(
     for port, name in (
         ("state", "state"),
         ("age", "state_age"),
+        ("heartbeat_age", "heartbeat_age"),
         ("armed", "armed"),
         ("mode", "mode"),
     ):

@@ -1,5 +1,7 @@
 """`splatpilot px4`, before anything flies."""
 
+import re
+
 import pytest
 
 from splatpilot.analysis.cli import main
@@ -14,6 +16,15 @@ def test_it_says_what_it_will_not_do(udp_url, capsys):
     said = capsys.readouterr().out
     assert "Offboard mode is left to the pilot." in said
     assert "Arming is left to the pilot." in said
+
+
+def test_it_counts_how_long_there_is_no_heartbeat(udp_url, capsys, monkeypatch):
+    monkeypatch.setattr(px4, "REMINDER", 0.1)
+    px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=0)), duration=0.35)
+    said = re.findall(
+        r"no heartbeat for (\S+) s at 127\.0\.0\.1:\d+$", capsys.readouterr().out, re.M
+    )
+    assert said == ["0.1", "0.2", "0.3"]
 
 
 @pytest.mark.parametrize(
