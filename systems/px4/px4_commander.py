@@ -258,7 +258,8 @@ class Px4Commander(LeafSystem):
             unix_time, age = (
                 self._read(context, name)[0] for name in ("unix_time", "motion_capture_age")
             )
-            self._send(self._mavlink.odometry(pose, round((unix_time - age) * 1e6)))
+            exposed = max(unix_time - age, 0.0)  # MAVLink has no time before its epoch.
+            self._send(self._mavlink.odometry(pose, round(exposed * 1e6)))
 
     def _publish_setpoint(self, context: Context) -> None:
         now, memory = context.get_time() - PUBLISH_OFFSET, _memory(context)
