@@ -127,7 +127,7 @@ def conclude(
     folder.write_table("timings.csv", timings)
     folder.write_table("table.csv", table)
     write_report(folder, config, rows, timings, table, absent, damaged)
-    print(format_table(table))
+    print(format_table(table, config))
     if external := external_table(rows, config):
         folder.write_table("external.csv", external)
         print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
