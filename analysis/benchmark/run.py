@@ -15,7 +15,7 @@ from splatpilot.analysis.benchmark.rollout import Fault, Rollout
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights
+from splatpilot.analysis.benchmark.study_inputs import input_digests, keep_inputs, kept_flights
 from splatpilot.analysis.benchmark.tables import format_table, policy_table
 from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.analysis.benchmark.workers import fly_all
@@ -72,6 +72,7 @@ def run(
     if not specs and shard is None:
         raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
     folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
+    flown_by |= input_digests(config, scenarios)
     folder.claim(config, flown_by, shard)
     flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
     keep_inputs(folder, config, flyable)
@@ -87,11 +88,11 @@ def run(
     for problem in damaged:
         print(f"{problem}; this flight is flown again")
     missing = [spec for spec in specs if spec.id not in rows]
-    if not rows:
-        folder.keep_program(flown_by)
-    elif missing:
+    if rows and missing:
         _check_program(folder, flown_by)
         print(f"{len(rows)} of {len(specs)} flights are there already.")
+    if missing:
+        folder.keep_program(flown_by)
     flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
     with closing(flights):
         _keep(folder, flights, rows, len(specs))
@@ -175,7 +176,8 @@ def _complete(config: StudyConfig, scenarios: dict[str, Scenario]) -> Iterator[S
 
 
 def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
-    """Raises ValueError if the flights in the folder come from another program."""
+    """Raises ValueError if the flights in the folder come from another program, weights or
+    scenes."""
     for name, version in folder.program().items():
         if flown_by.get(name) != version:
             raise ValueError(
