@@ -15,7 +15,12 @@ from splatpilot.analysis.benchmark.rollout import Fault, Rollout
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import input_digests, keep_inputs, kept_flights
+from splatpilot.analysis.benchmark.study_inputs import (
+    input_digests,
+    keep_inputs,
+    kept_flights,
+    require_test_scenes,
+)
 from splatpilot.analysis.benchmark.tables import format_table, policy_table
 from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.analysis.benchmark.workers import fly_all
@@ -71,10 +76,12 @@ def run(
     specs = [spec for spec in share if spec.scenario not in absent]
     if not specs and shard is None:
         raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
+    flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
+    if config.split == "test":
+        require_test_scenes(flyable)
     folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
     flown_by |= input_digests(config, scenarios)
     folder.claim(config, flown_by, shard)
-    flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
     keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")

@@ -13,12 +13,35 @@ from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.diagrams.policies import weights_file
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
-from splatpilot.diagrams.worlds.scene_metadata import ENVIRONMENT, FRONTIER
+from splatpilot.diagrams.worlds.scene_metadata import ENVIRONMENT, FRONTIER, read_scene_metadata
+from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import folder_written_atomically, written_atomically
 
 _FLOWN_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
 """The files of a scene folder that decide flights."""
+
+
+def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
+    """
+    Checks that a test study flies only in scenes from which nothing may be learned.
+
+    Raises:
+        ValueError: for a scene of another split; an OctoMap or a file of Gaussians has none.
+    """
+    for name, scenario in scenarios.items():
+        if not isinstance(scenario.world, SceneSource):
+            continue
+        scene = find_scene(scenario.world)
+        if scene.is_dir():
+            split = read_scene_metadata(scene).split
+        else:
+            split = "test" if find_test_source(part_digests([scene.read_bytes()])) else ""
+        if split != "test":
+            raise ValueError(
+                f"split of {scene}, in which {name} flies, must be test in a test study, got "
+                f"{split!r}; fly it with --split dev"
+            )
 
 
 def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:

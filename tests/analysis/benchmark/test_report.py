@@ -24,3 +24,14 @@ def test_report_says_where_seeds_are_not_environments(place, short_scenario, tmp
     benchmark.run(config=config, out=tmp_path / "out", jobs=1)
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Each of hall is one environment" in page
+
+
+def test_test_study_flies_in_test_scenes_alone(place, tmp_path):
+    hall = tmp_path / "hall.yaml"
+    config = StudyConfig([str(hall)], ["straight"], seeds=1, split="test")
+    hall.write_text(f"world: !SceneConfig {{path: {place.scene('own', split='train')}}}\n")
+    with pytest.raises(ValueError, match=r"split of .*own, in which hall flies, must be test"):
+        benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    hall.write_text(f"world: !SceneConfig {{path: {place.scene('held', split='test')}}}\n")
+    (row,) = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    assert row["flights"] == 1
