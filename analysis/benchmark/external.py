@@ -98,8 +98,8 @@ def format_external(table: list[dict[str, Any]]) -> str:
     return "\n".join([*lines, SOURCES])
 
 
-def external_section(table: list[dict[str, Any]]) -> str:
-    """The external table in HTML; nothing if it is empty."""
+def external_section(table: list[dict[str, Any]], seeds: str) -> str:
+    """Formats the external table in HTML, with its `seeds` in the heading; empty if it is."""
     if not table:
         return ""
     header = ["scenario", "policy", "speed [m/s]", "velocity [m/s]", "success"]
@@ -115,4 +115,4 @@ def external_section(table: list[dict[str, Any]]) -> str:
         for row in table
     ]
     note = f'<p class="note">{escape(SOURCES)}</p>'
-    return "<h2>Beside published figures</h2>" + html_page.table(header, rows) + note
+    return f"<h2>Beside published figures, {seeds}</h2>" + html_page.table(header, rows) + note

@@ -60,7 +60,7 @@ def write_report(
         _warnings(config, rows, absent, damaged),
         f"<h2>Policies, {seeds}</h2>" + _policies(table) + _timing(config, rows, timings),
         f"<h2>Beside the paper's Table I, {seeds}</h2>" + _paper(table, paper) if paper else "",
-        external_section(external_table(rows, config)),
+        external_section(external_table(rows, config), seeds),
         f"<h2>Success against speed, {seeds}</h2>"
         + html_page.image(success_png, "Success rate against velocity, with Wilson's intervals"),
         "<h2>Trajectories through one field</h2>" + trajectories_section(folder, config, rows),

@@ -28,7 +28,7 @@ def source_digest(digests: Collection[str]) -> list[str]:
     Returns the digest of a source: the eight smallest of its parts' digests.
 
     It depends neither on names nor on order. Two sources are taken for one if a part of either is
-    among the eight of the other, so copies are recognized that lack parts or have more of them.
+    among the eight of the other, so copies with parts missing or added are recognized.
     """
     return sorted(digests)[:_KEPT]
 
