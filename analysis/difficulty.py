@@ -9,6 +9,7 @@ a sensing range of 4 m and a field of view of 72 degrees.
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SENSING_RANGE = 4.0
@@ -65,7 +67,7 @@ def difficulty(field: DistanceField, p_WS: NDArray, p_WG: NDArray, seed: int = 0
     """All measures of flights from p_WS to p_WG (3,) [m]; `seed` draws AvoidBench's samples.
 
     Raises:
-        ValueError: if no way is found.
+        InfeasibleFlightError: if no path is found.
     """
     grid = grid_distances(field, SPACING)
     path = shortest_path(field, grid, p_WS, p_WG)
@@ -207,7 +209,8 @@ def _trusted_field(world: World) -> DistanceField:
 
 
 def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
-    """Prints feasibility, time of generation and mean difficulty of scenarios over `seeds` seeds.
+    """Prints how many of `seeds` seeds are feasible, the mean time of generation and the mean
+    difficulty of the feasible ones.
 
     Args:
         scenarios: ids (P01 to P12, R13 to R17), or files; all that come with the program if empty.
@@ -229,16 +232,19 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
         try:
             for seed in tqdm(range(seeds), desc=file.stem, leave=False, disable=None):
                 started = time.process_time()
-                world = make_world(world_config, seed)
-                spent.append(time.process_time() - started)
-                known = _trusted_field(world)
-                measured = difficulty(known, world.p_WS, world.p_WG, seed)
-                rows.append(list(vars(measured).values()))
+                with suppress(InfeasibleFlightError):
+                    try:
+                        world = make_world(world_config, seed)
+                    finally:
+                        spent.append(time.process_time() - started)
+                    known = _trusted_field(world)
+                    measured = difficulty(known, world.p_WS, world.p_WG, seed)
+                    rows.append(list(vars(measured).values()))
         except FileNotFoundError as error:
             lines.append(f"{file.stem:<10} not run: {error}")
             print(lines[-1], flush=True)
             continue
-        means = [np.mean(values) for values in zip(*rows, strict=True)]
+        means = np.mean(rows, axis=0) if rows else np.full(len(names), np.nan)
         feasible = f"{len(rows)}/{seeds}"
         lines.append(
             f"{file.stem:<10}{feasible:>10}{np.mean(spent):>7.2f}"

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.feasibility import cell_of, conservative_distance
 from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SPACING = 0.2
@@ -17,7 +18,7 @@ def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDAr
     equation on the grid of distances, then pulled straight where the exact field allows it.
 
     Raises:
-        ValueError: if there is none on the grid.
+        InfeasibleFlightError: if there is none on the grid.
     """
     shape, goal = grid.shape, cell_of(field, grid, SPACING, p_WG)
     front = np.ones(shape)
@@ -28,7 +29,7 @@ def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDAr
     length = np.where(np.ma.getmaskarray(marched), np.inf, np.ma.getdata(marched))
     cell = cell_of(field, grid, SPACING, p_WS)
     if not np.isfinite(length[cell]):
-        raise ValueError("no way from start to goal was found on a grid of 0.2 m")
+        raise InfeasibleFlightError("no path from start to goal was found on a grid of 0.2 m")
     offsets = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1
     cells = [cell]
     while cells[-1] != goal:

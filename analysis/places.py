@@ -1,7 +1,7 @@
 """The places of the photorealistic scenarios, made from captures, meshes and generated worlds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatpilot.analysis.tour import TourConfig, make_scene
@@ -14,10 +14,13 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 
 @dataclass
 class PlaceConfig:
-    """How a scene is made: rendered, unless it was captured, and reconstructed, as on a tour."""
+    """How a scene to test in is made: rendered, unless it was captured, and reconstructed, as on a
+    tour."""
 
-    render: RenderConfig = field(default_factory=lambda: TourConfig().render)
-    reconstruct: ReconstructConfig = field(default_factory=lambda: TourConfig().reconstruct)
+    render: RenderConfig = field(default_factory=lambda: replace(TourConfig().render, split="test"))
+    reconstruct: ReconstructConfig = field(
+        default_factory=lambda: replace(TourConfig().reconstruct, split="test")
+    )
 
 
 @dataclass(frozen=True)

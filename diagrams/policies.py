@@ -3,6 +3,7 @@
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from pydrake.systems.framework import System
@@ -14,7 +15,7 @@ from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
 from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgb, DiffAeroRgbConfig
 from splatpilot.systems.policies.diffaero_tof import DiffAeroTof, DiffAeroTofConfig
-from splatpilot.systems.policies.policy_checkpoint import policy_of
+from splatpilot.systems.policies.policy_checkpoint import policy_of, shipped_weights
 from splatpilot.systems.policies.privileged_planner import (
     PrivilegedPlanner,
     PrivilegedPlannerConfig,
@@ -194,6 +195,13 @@ def name_of(config: Any) -> str:
         ValueError: if it is of none.
     """
     return POLICIES.name_of(POLICIES.kind_of(config))
+
+
+def weights_file(config: Any) -> Path | None:
+    """Returns the file of weights that a policy flies by; None if it has none."""
+    given = getattr(config, "weights", None)
+    file = Path(given) if given else shipped_weights(name_of(config))
+    return file if given is not None and file.is_file() else None
 
 
 def _with_field(config: Any, field: str, value: float) -> Any:

@@ -11,7 +11,7 @@ from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.seeds import TRAINING_SEEDS
+from splatpilot.systems.seeds import MONTE_CARLO_SEEDS
 
 
 def random_flights(
@@ -26,8 +26,8 @@ def random_flights(
 
         MonteCarloSimulation(random_flights(scenario), clearance, scenario.timeout, 20)
 
-    Each draw is a seed below `TRAINING_SEEDS`, of which the default Context of the diagram is the
-    start. A simulation ends with its flight: reaching the goal, colliding or leaving the volume.
+    Each draw is one of `MONTE_CARLO_SEEDS`; the default Context of the diagram is the start of its
+    flight. A simulation ends with its flight: reaching the goal, colliding or leaving the volume.
 
     Args:
         scenario: what is flown; its own seed does not matter.
@@ -39,7 +39,7 @@ def random_flights(
     """
 
     def make_simulator(generator: RandomGenerator) -> Simulator:
-        drawn = replace(scenario, seed=generator() % TRAINING_SEEDS)
+        drawn = replace(scenario, seed=MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)])
         flown = world or make_world(drawn.world, drawn.seed)
         diagram = BuildFlightDiagram(drawn, flown, camera=False)
         return flight_simulator(diagram, drawn, flown)

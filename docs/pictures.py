@@ -111,12 +111,6 @@ def sheet(picture: Path, out: Path) -> None:
     save(shrunk(load(picture), 1500), out)
 
 
-def report(html: Path, out: Path) -> None:
-    """The whole of a report."""
-    with opened(html, 1000, 800) as tab:
-        tab.screenshot(path=out, full_page=True, type="jpeg", quality=80)
-
-
 def flight(html: Path, out: Path) -> None:
     """The page of a flight 6 s after its start, from above and following the vehicle."""
     scripts = [f"replay.look('{view}'); replay.seek(6)" for view in ("overview", "chase")]
@@ -179,7 +173,6 @@ KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
     "row": (row, ["left", "right"]),
     "column": (column, ["upper", "lower"]),
     "sheet": (sheet, ["picture"]),
-    "report": (report, ["html"]),
     "flight": (flight, ["html"]),
     "place": (place, ["html"]),
 }

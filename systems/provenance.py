@@ -7,13 +7,16 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm"
-_SOURCE = "*.py", "*.yaml", "*.cpp", "*.hpp"
+import cv2
+
+_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm", "torch", "onnx"
+_FOLDERS = "api", "native", "systems", "diagrams", "training", "analysis"
+_SUFFIXES = ".py", ".yaml", ".cpp", ".hpp", ".npz"  # the last are weights that ship
 
 
 def program() -> dict[str, str]:
-    """The revision of this program, and the versions of what its results depend on."""
-    versions = {}
+    """Returns the revision of this program, and the versions of what its results depend on."""
+    versions = {"opencv": cv2.__version__}
     for library in _LIBRARIES:
         try:
             versions[library] = importlib.metadata.version(library)
@@ -24,8 +27,8 @@ def program() -> dict[str, str]:
 
 def revision() -> str:
     """
-    What tells this source from others: flown from its checkout, the git revision and a digest of
-    what was changed in the source since; installed, the version.
+    Identifies this source: in a checkout by the git revision, with a digest of the source files
+    that differ from it or are untracked; installed, by the version.
 
     A checkout of something else around the installation says nothing about it.
     """
@@ -41,9 +44,16 @@ def revision() -> str:
         top_level = Path(git("rev-parse", "--show-toplevel").strip()).resolve()
         if (project["name"], top_level) == ("splatpilot", checkout):
             head = git("rev-parse", "HEAD").strip()
-            changes = git("diff", "HEAD", "--", *_SOURCE)
-            digest = hashlib.sha256(changes.encode()).hexdigest()[:8]
-            return f"{head}+{digest}" if changes else head
+            changed = git("diff", "HEAD", "--name-only", "-z", "--", *_FOLDERS)
+            untracked = git("ls-files", "--others", "--exclude-standard", "-z", "--", *_FOLDERS)
+            named = (changed + untracked).split("\0")
+            names = sorted(name for name in named if Path(name).suffix in _SUFFIXES)
+            digest = hashlib.sha256()
+            for name in names:
+                file = checkout / name
+                digest.update(f"{name}\0".encode())
+                digest.update(file.read_bytes() if file.is_file() else b"")
+            return f"{head}+{digest.hexdigest()[:8]}" if names else head
     except (OSError, KeyError, tomllib.TOMLDecodeError, subprocess.CalledProcessError):
         pass  # No checkout, no git, or a checkout without a commit.
     return importlib.metadata.version("splatpilot")

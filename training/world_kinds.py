@@ -1,6 +1,7 @@
 """Where policies train: in generated worlds of the benchmark's kinds, of seeds it never uses, and
-in captured places that it does not fly in."""
+in scenes that it does not test in."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from splatpilot.diagrams.scenario import Scenario
@@ -9,6 +10,7 @@ from splatpilot.diagrams.worlds.make_world import WorldConfig, is_procedural
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
 from splatpilot.diagrams.worlds.scene import SceneConfig, SceneSource, find_scene
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
 from splatpilot.systems.configuration import load_config
 
 PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
@@ -37,24 +39,58 @@ def check_generated(kind: str) -> None:
         )
 
 
-def place_to_learn_in(scene: str) -> Path:
-    """Where a captured place is: a scene folder, or an OctoMap.
+def place_to_learn_in(scene: str, split: str = "train") -> Path:
+    """Finds a scene that may be learned from: a scene folder, or an OctoMap.
+
+    Args:
+        scene: path of it.
+        split: that it must be of; an OctoMap states none and counts as "train".
 
     Raises:
-        FileNotFoundError: if there is no such place.
-        ValueError: if it is neither, or the benchmark flies there.
+        FileNotFoundError: if there is no such scene.
+        ValueError: if it is neither, shows what the benchmark tests in, whatever it is called, or
+            is of another split.
     """
     place = find_scene(SceneConfig(path=scene))
     if place.suffix.lower() == OCTOMAP:
+        require_untested(part_digests([place.read_bytes()]), str(place))
         return place
     if not place.is_dir():
         raise ValueError(f"{place} is no scene folder; `splatpilot reconstruct` makes one")
-    worlds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
-    flown = {Path(world.path).name for world in worlds if isinstance(world, SceneSource)}
-    flown &= {place.name, read_scene_metadata(place).name}
-    if flown:
+    metadata = read_scene_metadata(place)
+    require_untested(metadata.source_digest, str(place))
+    if metadata.split != split:
         raise ValueError(
-            f"{place}: the benchmark flies in {min(flown)}, so nothing may be learned there; "
-            "leave it out of worlds.scenes"
+            f"split of {place} must be {split}, got {metadata.split!r}; use another scene, or "
+            f"reconstruct one with --set split={split}"
         )
     return place
+
+
+def require_untested(digests: Collection[str], what: str) -> None:
+    """
+    Raises:
+        ValueError: if the benchmark tests in a source with these digests of its parts, by the
+            committed table or as a test scene on this machine; or if there are none.
+    """
+    if not digests:
+        raise ValueError(
+            f"{what} is missing source_digest, which tells what it shows; reconstruct the scene "
+            "again"
+        )
+    name = find_test_source(digests)
+    for file in () if name else benchmark_scenarios().values():
+        world = load_config(Scenario(), file).world
+        if not isinstance(world, SceneSource):
+            continue
+        try:
+            scene = read_scene_metadata(find_scene(world))
+        except (OSError, ValueError):  # a scene that is not there, or cannot be flown in
+            continue
+        if scene.split == "test" and not set(scene.source_digest).isdisjoint(digests):
+            name = world.path
+    if name:
+        raise ValueError(
+            f"{what} shows {name}, in which the benchmark tests, so nothing may be learned from "
+            "it; use another"
+        )

@@ -2,7 +2,6 @@
 
 import math
 from html import escape
-from itertools import combinations
 from typing import Any
 
 from splatpilot.analysis.benchmark import html_page
@@ -13,7 +12,9 @@ from splatpilot.analysis.benchmark.figures import (
 )
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.study_inputs import kept_scenario
 from splatpilot.analysis.benchmark.tables import (
+    IN_DISTRIBUTION,
     PAPER_FLIGHTS,
     PaperRow,
     compare,
@@ -23,7 +24,9 @@ from splatpilot.analysis.benchmark.tables import (
     success_summary,
 )
 from splatpilot.analysis.benchmark.trajectories import trajectories_section
+from splatpilot.diagrams.worlds.scene import SceneSource
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.seeds import SPLIT_NAMES, describe_seeds
 
 _COMPARED = ("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")
 
@@ -48,25 +51,26 @@ def write_report(
         absent: the scenarios that were not flown, and why.
         damaged: files that were flown again in this run.
     """
-    paper = paper_rows(config)
+    paper = paper_rows(config, absent)
+    seeds = SPLIT_NAMES[config.split] + " seeds"
     figure = draw_success_against_speed(table, config.policy_names, paper)
     success_png = save_png(figure, folder.path / "success_against_speed.png")
     sections = [
-        f"<h1>Navigation benchmark</h1><p>{_scope(config, rows)}</p>",
+        f"<h1>Navigation benchmark, {seeds}</h1><p>{_scope(config, rows)}</p>",
         _warnings(config, rows, absent, damaged),
-        "<h2>Policies</h2>" + _policies(table) + _timing(config, rows, timings),
-        "<h2>Beside the paper's Table I</h2>" + _paper(table, paper) if paper else "",
-        external_section(external_table(rows, config)),
-        "<h2>Success against speed</h2>"
-        + html_page.image(success_png, "Success rate against velocity"),
+        f"<h2>Policies, {seeds}</h2>" + _policies(table) + _timing(config, rows, timings),
+        f"<h2>Beside the paper's Table I, {seeds}</h2>" + _paper(table, paper) if paper else "",
+        external_section(external_table(rows, config), seeds),
+        f"<h2>Success against speed, {seeds}</h2>"
+        + html_page.image(success_png, "Success rate against velocity, with Wilson's intervals"),
         "<h2>Trajectories through one field</h2>" + trajectories_section(folder, config, rows),
-        "<h2>Pairs of policies on the same flights</h2>" + _pairs(config, rows),
-        "<h2>Scenarios</h2>" + _scenarios(config, rows, absent),
+        f"<h2>Pairs of policies on the same flights, {seeds}</h2>" + _pairs(config, rows),
+        f"<h2>Scenarios, {seeds}</h2>" + _scenarios(folder, config, rows, absent),
         "<h2>Flights</h2>" + _flights(folder, config, rows),
         "<h2>Program</h2>" + _program(folder),
     ]
     with written_atomically(folder.path / "report.html") as path:
-        path.write_text(html_page.page("Navigation benchmark", sections))
+        path.write_text(html_page.page(f"Navigation benchmark, {seeds}", sections))
 
 
 def _rate(summary: dict[str, Any]) -> str:
@@ -78,6 +82,10 @@ def _rate(summary: dict[str, Any]) -> str:
     )
 
 
+def _clusters(row: dict[str, Any]) -> str:
+    return f"<span class=note>[{row['cluster_lower']:.0%}, {row['cluster_upper']:.0%}]</span>"
+
+
 def _passed(row: dict[str, Any]) -> str:
     return f"{row['scenarios_passed']}/{row['scenarios']}"
 
@@ -86,9 +94,11 @@ def _scope(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
     speeds = ", ".join(f"{speed:g}" for speed in config.speeds)
     return (
         f"{len(rows)} flights: {len(config.scenarios)} scenarios, {len(config.policies)} policies, "
-        f"{config.seeds} seeds from {config.first_seed} on, nominal speeds {speeds} m/s. A flight "
+        f"{describe_seeds(config.split, config.seeds)}, nominal speeds {speeds} m/s. A flight "
         "succeeds when it reaches the goal and its clearance at the vehicle's radius is never "
-        "below zero. Brackets are 95 % Wilson intervals."
+        "below zero. Brackets are 95 % intervals: Wilson's, for these scenarios with new seeds, "
+        "and under “new scenarios” those of a bootstrap over scenarios, for others of the same "
+        "kinds."
     )
 
 
@@ -109,7 +119,8 @@ def _warnings(
 
 
 def _policies(table: list[dict[str, Any]]) -> str:
-    header = ["policy", "speed [m/s]", "flights", "success", "collision", "timeout", "left volume"]
+    header = ["policy", "speed [m/s]", "flights", "success", "new scenarios"]
+    header += ["collision", "timeout", "left volume"]
     header += ["infeasible", "not run", "scenarios passed", "min. clearance [m]"]
     header += ["velocity [m/s]", "path excess"]
     header += ["jerk [m/s³]", "smoothness"]
@@ -119,6 +130,7 @@ def _policies(table: list[dict[str, Any]]) -> str:
             f"{row['speed']:g}",
             str(row["flights"]),
             _rate(row),
+            _clusters(row),
             *(str(row[name]) for name in ("collision", "timeout", "left_volume", "infeasible")),
             str(row["not_run"]),
             _passed(row),
@@ -146,7 +158,7 @@ def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[
 
 
 def _paper(table: list[dict[str, Any]], paper: dict[str, PaperRow]) -> str:
-    header = ["policy", "method in the paper", "success, paper", "success, here"]
+    header = ["policy", "method in the paper", "success, paper", "success, here", "new scenarios"]
     header += [
         "scenarios passed",
         "clearance, paper [m]",
@@ -161,32 +173,46 @@ def _paper(table: list[dict[str, Any]], paper: dict[str, PaperRow]) -> str:
         theirs = paper[row["policy"]]
         name = f"{row['policy']} at {row['speed']:g} m/s"
         there = f"{theirs.successes}/{PAPER_FLIGHTS} ({theirs.successes / PAPER_FLIGHTS:.0%})"
-        cells = [name, theirs.method, there, _rate(row), _passed(row)]
+        cells = [name, theirs.method, there, _rate(row), _clusters(row), _passed(row)]
         for measure, form in _COMPARED:
             cells += [f"{getattr(theirs, measure):{form}}", html_page.number(row[measure], form)]
         rows.append(cells)
     note = (
         '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
-        "the scenarios here are others of the same kinds, passed where most flights succeed.</p>"
+        "the scenarios here are others of the same kinds, passed where most flights succeed. The "
+        "paper's policies were trained in reconstructions of TartanAir. The weights that ship were "
+        f"trained in the generators of {', '.join(IN_DISTRIBUTION)}: these scenarios are in their "
+        "training distribution, with other seeds; the others are not.</p>"
     )
     return html_page.table(header, rows) + note
 
 
 def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
-    lines = []
-    for speed in config.speeds:
-        for first, second in combinations(config.policy_names, 2):
-            result = compare(rows, first, second, speed)
-            p = f"{result.p_value:.3f}" if result.p_value >= 0.001 else f"{result.p_value:.0e}"
-            pair = f"{escape(first)} and {escape(second)}"
-            lines.append([pair, f"{speed:g}", str(result.only_first), str(result.only_second), p])
+    lines = [
+        [
+            f"{escape(pair.first)} and {escape(pair.second)}",
+            f"{pair.speed:g}",
+            str(pair.only_first),
+            str(pair.only_second),
+            *(f"{p:.3f}" if p >= 0.001 else f"{p:.0e}" for p in (pair.p_seeds, pair.p_scenarios)),
+        ]
+        for pair in compare(rows, config)
+    ]
     if not lines:
         return "<p>One policy: nothing to compare.</p>"
-    header = ["policies", "speed [m/s]", "only the first succeeds", "only the second", "p"]
-    return html_page.table(header, lines) + '<p class="note">Exact McNemar tests.</p>'
+    header = ["policies", "speed [m/s]", "only the first succeeds", "only the second"]
+    header += ["p, these scenarios", "p, new scenarios"]
+    note = (
+        '<p class="note">Exact McNemar tests over flights, for these scenarios with new seeds, and '
+        "sign-flip permutation tests over scenarios, for others of the same kinds. Both are "
+        f"corrected by Holm for the {len(lines)} pairs.</p>"
+    )
+    return html_page.table(header, lines) + note
 
 
-def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]) -> str:
+def _scenarios(
+    folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]
+) -> str:
     columns = [(policy, speed) for policy in config.policy_names for speed in config.speeds]
     header = ["scenario", *(f"{escape(policy)}<br>{speed:g} m/s" for policy, speed in columns)]
     names = list(dict.fromkeys(spec.scenario for spec in config.rollouts()))
@@ -197,7 +223,15 @@ def _scenarios(config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str
             flown = select(rows, scenario=name, policy=policy, speed=speed)
             cells.append(_rate(success_summary(flown)))
         lines.append([escape(name) + (" <b>(not run)</b>" if name in absent else ""), *cells])
-    return html_page.table(header, lines)
+    flown = [name for name in names if name not in absent]
+    worlds = {name: kept_scenario(folder, name).world for name in flown}
+    single = [escape(name) for name, world in worlds.items() if isinstance(world, SceneSource)]
+    note = (
+        f'<p class="note">Each of {", ".join(single)} is one environment: other seeds draw other '
+        "starts and goals in it (and other inserted solids), no other environment. Test seeds do "
+        "not make it unseen.</p>"
+    )
+    return html_page.table(header, lines) + (note if single else "")
 
 
 def _flights(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:

@@ -15,7 +15,12 @@ from splatpilot.analysis.benchmark.rollout import Fault, Rollout
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights
+from splatpilot.analysis.benchmark.study_inputs import (
+    input_digests,
+    keep_inputs,
+    kept_flights,
+    require_test_scenes,
+)
 from splatpilot.analysis.benchmark.tables import format_table, policy_table
 from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.analysis.benchmark.workers import fly_all
@@ -71,9 +76,12 @@ def run(
     specs = [spec for spec in share if spec.scenario not in absent]
     if not specs and shard is None:
         raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
-    folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
-    folder.claim(config, flown_by, shard)
     flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
+    if config.split == "test":
+        require_test_scenes(flyable)
+    folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
+    flown_by |= input_digests(config, scenarios)
+    folder.claim(config, flown_by, shard)
     keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")
@@ -87,11 +95,11 @@ def run(
     for problem in damaged:
         print(f"{problem}; this flight is flown again")
     missing = [spec for spec in specs if spec.id not in rows]
-    if not rows:
-        folder.keep_program(flown_by)
-    elif missing:
+    if rows and missing:
         _check_program(folder, flown_by)
         print(f"{len(rows)} of {len(specs)} flights are there already.")
+    if missing:
+        folder.keep_program(flown_by)
     flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
     with closing(flights):
         _keep(folder, flights, rows, len(specs))
@@ -127,7 +135,7 @@ def conclude(
     folder.write_table("timings.csv", timings)
     folder.write_table("table.csv", table)
     write_report(folder, config, rows, timings, table, absent, damaged)
-    print(format_table(table))
+    print(format_table(table, config))
     if external := external_table(rows, config):
         folder.write_table("external.csv", external)
         print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
@@ -175,7 +183,8 @@ def _complete(config: StudyConfig, scenarios: dict[str, Scenario]) -> Iterator[S
 
 
 def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
-    """Raises ValueError if the flights in the folder come from another program."""
+    """Raises ValueError if the flights in the folder come from another program, weights or
+    scenes."""
     for name, version in folder.program().items():
         if flown_by.get(name) != version:
             raise ValueError(

@@ -13,7 +13,7 @@ from splatpilot.diagrams.policies import BENCHMARK_POLICIES, speed_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.systems.configuration import load_config
-from splatpilot.systems.seeds import TRAINING_SEEDS
+from splatpilot.systems.seeds import study_seeds
 
 
 class RolloutSpec(NamedTuple):
@@ -46,12 +46,12 @@ class StudyConfig:
     policies: list[str] = field(default_factory=lambda: list(BENCHMARK_POLICIES))
     # [m/s] Nominal speeds.
     speeds: list[float] = field(default_factory=lambda: [2.0])
-    # Flights of each, with so many seeds.
+    # Flights of each, with the first seeds of the split.
     seeds: int = 20
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
-    # The least seed; by those from `splatpilot.systems.seeds.FRESH_SEEDS` on nothing was chosen.
-    first_seed: int = 0
+    # Whose seeds: "dev", those by which things are chosen, or "test", see `systems/seeds.py`.
+    split: str = "dev"
 
     @property
     def variants(self) -> list[Variant]:
@@ -74,7 +74,7 @@ class StudyConfig:
         return [
             RolloutSpec(Path(scenario).stem, policy, speed, seed)
             for scenario in self.scenarios
-            for seed in range(self.first_seed, self.first_seed + self.seeds)
+            for seed in study_seeds(self.split, self.seeds)
             for speed in self.speeds
             for policy in policies
         ]
@@ -109,13 +109,7 @@ class StudyConfig:
         Raises:
             ValueError: for numbers out of range, anything given twice or not at all.
         """
-        if not 1 <= self.seeds <= TRAINING_SEEDS:
-            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
-        if not 0 <= self.first_seed <= TRAINING_SEEDS - self.seeds:
-            raise ValueError(
-                f"first_seed is {self.first_seed}; it must be 0 to {TRAINING_SEEDS - self.seeds}, "
-                f"so that none of {self.seeds} seeds is one of training"
-            )
+        study_seeds(self.split, self.seeds)
         for speed in self.speeds:
             if not 0.0 < speed < math.inf:
                 raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")

@@ -92,7 +92,8 @@ class StudyFolder:
         shutil.rmtree(self.path / "errors", ignore_errors=True)
 
     def keep_program(self, program: dict[str, str]) -> None:
-        """States another program than `claim` was told of, in a folder without flights."""
+        """States another program than `claim` was told of, in a folder without flights, or what
+        else it consists of."""
         if self.program() != program:
             self._describe(self._described() | {"program": program})
 

@@ -1,5 +1,6 @@
 """What the flights of a study depend on, kept in its folder: scenarios, scenes and weights."""
 
+import hashlib
 import shutil
 import sys
 from collections.abc import Iterable, Iterator
@@ -8,10 +9,39 @@ from pathlib import Path
 
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.variants import SCENARIO
+from splatpilot.diagrams.policies import weights_file
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
+from splatpilot.diagrams.worlds.scene_metadata import ENVIRONMENT, FRONTIER, read_scene_metadata
+from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import folder_written_atomically, written_atomically
+
+_FLOWN_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
+"""The files of a scene folder that decide flights."""
+
+
+def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
+    """
+    Checks that a test study flies only in scenes from which nothing may be learned.
+
+    Raises:
+        ValueError: for a scene of another split; an OctoMap or a file of Gaussians has none.
+    """
+    for name, scenario in scenarios.items():
+        if not isinstance(scenario.world, SceneSource):
+            continue
+        scene = find_scene(scenario.world)
+        if scene.is_dir():
+            split = read_scene_metadata(scene).split
+        else:
+            split = "test" if find_test_source(part_digests([scene.read_bytes()])) else ""
+        if split != "test":
+            raise ValueError(
+                f"split of {scene}, in which {name} flies, must be test in a test study, got "
+                f"{split!r}; fly it with --split dev"
+            )
 
 
 def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:
@@ -39,6 +69,39 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
             kept = _keep_weights(folder, Path(weights), _own(name))
             scenario = replace(scenario, policy=replace(scenario.policy, weights=kept))
         _keep_scenario(folder, name, scenario)
+
+
+def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[str, str]:
+    """
+    Returns digests of the weights and scenes that a study flies with, beside
+    `provenance.program()`: by "weights of LABEL", for a scenario's own policy "weights of LABEL in
+    SCENARIO", and by "scene of SCENARIO". Scenes that are absent have none.
+    """
+    digests = {}
+    for name, scenario in scenarios.items():
+        for variant in config.variants:
+            key = f"weights of {variant.label}"
+            if variant.policy == SCENARIO:
+                key += f" in {name}"
+            if key not in digests:
+                file = weights_file(variant.config(config.speeds[0], scenario.policy))
+                if file is not None:
+                    digests[key] = _digest([file])
+        if isinstance(scenario.world, SceneSource):
+            try:
+                scene = find_scene(scenario.world)
+            except FileNotFoundError:
+                continue
+            files = [scene / flown for flown in _FLOWN_FILES] if scene.is_dir() else [scene]
+            digests[f"scene of {name}"] = _digest([file for file in files if file.is_file()])
+    return digests
+
+
+def _digest(files: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]
 
 
 def kept_scenario(folder: StudyFolder, name: str) -> Scenario:

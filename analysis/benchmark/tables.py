@@ -1,15 +1,26 @@
 """The tables of a study."""
 
 import math
+from collections import Counter
+from collections.abc import Collection
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from splatpilot.analysis.benchmark.rollout import INFEASIBLE
-from splatpilot.analysis.benchmark.statistics import PairedComparison, mcnemar, wilson_interval
+from splatpilot.analysis.benchmark.statistics import (
+    cluster_interval,
+    holm,
+    mcnemar,
+    sign_flip,
+    wilson_interval,
+)
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.diagrams.flight import Outcome
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.systems.seeds import describe_seeds
+from splatpilot.training.world_kinds import PROCEDURAL
 
 MEASURES = (
     "min_clearance_m",
@@ -41,11 +52,14 @@ PAPER = {
 
 PAPER_FLIGHTS = 17
 
+IN_DISTRIBUTION = (*PROCEDURAL, "R17")
+"""Scenarios made by the generators in which the shipped weights were trained, of other seeds."""
 
-def paper_rows(config: StudyConfig) -> dict[str, PaperRow]:
-    """The rows of the paper's table that a study has beside it: of the policies that fly as they
-    ship, in the benchmark's scenarios as they are, all of them."""
-    if config.overrides or set(config.scenarios) != set(benchmark_scenarios()):
+
+def paper_rows(config: StudyConfig, absent: Collection[str] = ()) -> dict[str, PaperRow]:
+    """Returns the rows of the paper's table that a study is compared with: of policies that fly as
+    they ship, if all of the benchmark's scenarios were flown as they are and none is `absent`."""
+    if absent or config.overrides or set(config.scenarios) != set(benchmark_scenarios()):
         return {}
     return {policy: PAPER[policy] for policy in config.policies if policy in PAPER}
 
@@ -56,15 +70,21 @@ def select(rows: list[dict[str, Any]], **values: object) -> list[dict[str, Any]]
 
 
 def success_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Flights, successes, their rate and its 95 % Wilson interval, and how the others ended."""
+    """Counts flights, successes and how the others ended, and gives the success rate with its 95 %
+    intervals: Wilson's for these scenarios, and by clusters for new ones of the same kinds."""
     successes = sum(row["success"] for row in rows)
     interval = wilson_interval(successes, len(rows))
+    flights = Counter(row["scenario"] for row in rows)
+    wins = Counter(row["scenario"] for row in rows if row["success"])
+    clusters = cluster_interval([wins[name] for name in flights], list(flights.values()))
     return {
         "flights": len(rows),
         "successes": successes,
         "success_rate": successes / len(rows) if rows else math.nan,
         "wilson_lower": interval.lower,
         "wilson_upper": interval.upper,
+        "cluster_lower": clusters.lower,
+        "cluster_upper": clusters.upper,
     } | {
         str(outcome): sum(row["outcome"] == outcome for row in rows)
         for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, INFEASIBLE)
@@ -106,30 +126,57 @@ def scenarios_passed(rows: list[dict[str, Any]]) -> dict[str, int]:
     return {"scenarios": len(successes), "scenarios_passed": passed}
 
 
-def compare(rows: list[dict[str, Any]], first: str, second: str, speed: float) -> PairedComparison:
+class Comparison(NamedTuple):
     """Two policies on the same scenarios and seeds at a speed."""
 
-    def successes(policy: str) -> np.ndarray:
+    first: str
+    second: str
+    speed: float  # [m/s]
+    only_first: int  # flights in which only the first succeeded
+    only_second: int
+    p_seeds: float  # McNemar's: for these scenarios with new seeds
+    p_scenarios: float  # of sign flips: for new scenarios of the same kinds
+
+
+def compare(rows: list[dict[str, Any]], config: StudyConfig) -> list[Comparison]:
+    """Compares all pairs of a study's policies at each speed. Holm's correction for the number of
+    pairs is in the p-values."""
+
+    def wins(policy: str, speed: float) -> np.ndarray:  # (scenarios, seeds), of one order
         flown = select(rows, policy=policy, speed=speed)
         flown.sort(key=lambda row: (row["scenario"], row["seed"]))
-        return np.array([row["success"] for row in flown], dtype=bool)
+        return np.array([row["success"] for row in flown], dtype=bool).reshape(-1, config.seeds)
 
-    return mcnemar(successes(first), successes(second))
+    pairs = []
+    for speed in config.speeds:
+        for names in combinations(config.policy_names, 2):
+            first, second = (wins(name, speed) for name in names)
+            p_scenarios = sign_flip(first.mean(axis=1) - second.mean(axis=1))
+            pairs.append(Comparison(*names, speed, *mcnemar(first, second), p_scenarios))
+    for name in ("p_seeds", "p_scenarios"):
+        adjusted = holm([getattr(pair, name) for pair in pairs])
+        pairs = [p._replace(**{name: float(a)}) for p, a in zip(pairs, adjusted, strict=True)]
+    return pairs
 
 
-def format_table(table: list[dict[str, Any]]) -> str:
-    """The table of policies for a terminal."""
+def format_table(table: list[dict[str, Any]], config: StudyConfig) -> str:
+    """Formats the table of policies for a terminal."""
     width = max([16, *(len(row["policy"]) + 2 for row in table)])
     lines = [
-        f"{'policy':<{width}}{'speed':>6}{'success':>12}{'95 % interval':>16}{'scenarios':>11}"
-        f"{'clearance':>11}{'velocity':>10}{'not run':>9}"
+        f"{describe_seeds(config.split, config.seeds)}; 95 % intervals for these scenarios "
+        "(Wilson) and for new ones of the same kinds (bootstrap over scenarios)",
+        f"{'policy':<{width}}{'speed':>6}{'success':>12}{'these':>16}{'new':>16}{'scenarios':>11}"
+        f"{'clearance':>11}{'velocity':>10}{'not run':>9}",
     ]
     for row in table:
         rate = f"{row['successes']}/{row['flights']}"
         passed = f"{row['scenarios_passed']}/{row['scenarios']}"
-        interval = f"{row['wilson_lower']:.0%} to {row['wilson_upper']:.0%}"
+        these, new = (
+            f"{row[f'{kind}_lower']:.0%} to {row[f'{kind}_upper']:.0%}"
+            for kind in ("wilson", "cluster")
+        )
         lines.append(
-            f"{row['policy']:<{width}}{row['speed']:>6g}{rate:>12}{interval:>16}{passed:>11}"
+            f"{row['policy']:<{width}}{row['speed']:>6g}{rate:>12}{these:>16}{new:>16}{passed:>11}"
             f"{row['min_clearance_m']:>+9.2f} m{row['mean_speed_m_s']:>6.2f} m/s{row['not_run']:>9}"
         )
     return "\n".join(lines)

@@ -62,10 +62,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     benchmark.add_argument("--speeds", type=_names, metavar="2,3", help="nominal, m/s; default: 2")
     benchmark.add_argument("--seeds", type=int, metavar="N", help="flights of each; default: 20")
     benchmark.add_argument(
-        "--first-seed",
-        type=int,
-        metavar="K",
-        help="of the N seeds; default: 0. By those from 500000 on nothing was chosen",
+        "--split",
+        help="whose seeds: dev (default), to develop by, or test, to report what is final",
     )
     benchmark.add_argument("--jobs", type=int, metavar="N", help="worker processes; default: cores")
     benchmark.add_argument(
@@ -112,7 +110,7 @@ def _benchmark(options: argparse.Namespace) -> Any:
         config.seeds = QUICK_SEEDS
     if options.dodgedrone:
         config.scenarios, config.speeds = list(DODGEDRONE), list(DODGEDRONE_SPEEDS)
-    for name in ("scenarios", "seeds", "first_seed"):
+    for name in ("scenarios", "seeds", "split"):
         value = getattr(options, name)
         if value is not None:
             setattr(config, name, value)

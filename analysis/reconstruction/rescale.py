@@ -148,6 +148,8 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         capture_settings=about.capture_settings,
         held_out=about.held_out,
         image_width=about.image_width,
+        split=metadata.split,
+        source_digest=metadata.source_digest,
     )
     size = field.upper_W - field.lower_W
     return RescaleSummary(out, factor, size, geodesic, (*warnings, *unflyable))

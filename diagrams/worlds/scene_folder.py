@@ -133,6 +133,8 @@ def write_scene_folder(
     capture_settings: Sequence[str] = (),
     held_out: Sequence[int] = (),
     image_width: int = 0,
+    split: str = "",
+    source_digest: Sequence[str] = (),
 ) -> SceneMetadata:
     """Writes `world` as a scene folder and returns what its `scene.yaml` says; see `SceneMetadata`
     for what is said about it. Its Gaussians are without the `frontier`, see `close_frontier`.
@@ -149,6 +151,8 @@ def write_scene_folder(
     metadata = SceneMetadata(
         name=world.name,
         provenance=provenance,
+        split=split,
+        source_digest=list(source_digest),
         metric=metric,
         lower_W=[float(x) for x in esdf.lower_W],
         upper_W=[float(x) for x in esdf.upper_W],

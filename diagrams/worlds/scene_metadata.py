@@ -7,6 +7,7 @@ import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from splatpilot.diagrams.worlds.splits import check_split
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.configuration import yaml_problem
 from splatpilot.systems.files import written_atomically
@@ -28,6 +29,11 @@ class SceneMetadata:
     name: str = ""
     provenance: str = ""
     """What the scene was made from, and how."""
+    split: str = ""
+    """What the scene is for: "train", "validation" or "test"; empty if unknown."""
+    source_digest: list[str] = field(default_factory=list)
+    """Digest of what the scene was made from, see `splits.source_digest`: of the images that it was
+    fitted to, or of the mesh or generated world that they were rendered of. Empty if unknown."""
     world_frame: str = WORLD_FRAME
     metric: bool = True
     """Whether the unit of length is the metre."""
@@ -116,6 +122,10 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
             f"{file}: image_width is {metadata.image_width} and held_out {metadata.held_out}; "
             "neither may be negative"
         )
+    try:
+        check_split(metadata.split)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     bounds = np.array([metadata.perturbation_bound or 0.0, *metadata.pose_perturbation_bounds])
     if not (np.isfinite(bounds) & (bounds >= 0)).all():
         raise ValueError(

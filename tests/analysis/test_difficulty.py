@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from splatpilot.analysis import difficulty as difficulty_module
 from splatpilot.analysis.cli import main
 from splatpilot.analysis.difficulty import (
     angle_over_length,
@@ -17,8 +18,10 @@ from splatpilot.analysis.difficulty import (
 )
 from splatpilot.analysis.path_lengths import SPACING, path_length, resampled, shortest_path
 from splatpilot.diagrams.worlds.feasibility import grid_distances
+from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.shapes import Box, Capsule
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
 
 LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
@@ -122,6 +125,21 @@ def test_table_says_what_was_not_run(tmp_path, monkeypatch, capsys):
     lines = run(scenarios=[str(small), "R13"], seeds=1)
     assert "1/1" in lines[1]
     assert "not run" in lines[2] and "TartanAir" in lines[2] and str(tmp_path) in lines[2]
+
+
+def test_infeasible_seeds_are_counted(tmp_path, monkeypatch):
+    small = tmp_path / "small.yaml"
+    small.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
+
+    def make(config, seed):
+        if seed % 2:
+            raise InfeasibleFlightError("no way")
+        return make_world(config, seed)
+
+    monkeypatch.setattr(difficulty_module, "make_world", make)
+    assert "2/3" in run(scenarios=[str(small)], seeds=3)[1]
+    monkeypatch.setattr(difficulty_module, "make_world", lambda config, seed: make(config, 1))
+    assert "0/2" in run(scenarios=[str(small)], seeds=2)[1]
 
 
 @pytest.mark.parametrize("seeds", ["0", "-1"])

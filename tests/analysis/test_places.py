@@ -8,6 +8,7 @@ from splatpilot.analysis.places import BENCHMARK_PLACES, PLACES, Place, PlaceCon
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, other_scenarios
 from splatpilot.diagrams.worlds.scene import SceneSource
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.configuration import load_config
 
 
@@ -56,6 +57,7 @@ def test_a_place_is_made_and_then_left_as_it_is(opengl, tmp_path, capsys, monkey
     room = tmp_path / "scenes/room"
     written = (room / "gaussians.ply").read_bytes()
     assert (room / "metrics.json").is_file() and (tmp_path / "scenes/captures/room").is_dir()
+    assert read_scene_metadata(room).split == "test"
 
     (room / "metrics.json").unlink()
     capsys.readouterr()

@@ -66,6 +66,36 @@ def test_checkout_says_its_commit_and_what_was_changed(checkout):
     assert two.startswith(f"{head}+") and three.startswith(f"{head}+")
 
 
+@pytest.mark.parametrize(
+    "name", ["systems/policies/new.py", "systems/policies/weights/diffaero.npz", "native/new.hpp"]
+)
+def test_untracked_module_and_replaced_weights_change_the_revision(checkout, name):
+    copied = installed(checkout)
+    (checkout / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
+    head = commit(checkout)
+    file = checkout / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(b"\x00one")
+    untracked = copied.revision()
+    commit(checkout)
+    file.write_bytes(b"\x00two")
+    replaced = copied.revision()
+    assert untracked.startswith(f"{head}+")
+    assert replaced.startswith(f"{git(checkout, 'rev-parse', 'HEAD')}+")
+
+
+def test_untracked_file_outside_the_program_does_not_change_the_revision(checkout):
+    copied = installed(checkout)
+    (checkout / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
+    head = commit(checkout)
+    (checkout / "my_policy.py").write_text("x = 1\n")
+    assert copied.revision() == head
+
+
+def test_program_states_the_versions_of_what_computes_policies():
+    assert {"opencv", "torch", "onnx", "numpy"} <= provenance.program().keys()
+
+
 @pytest.mark.parametrize("package", ["lib/site-packages/splatpilot", "third_party/splatpilot", "."])
 def test_checkout_of_something_else_says_nothing(checkout, package):
     """Installed, copied or unpacked inside the checkout of another project, the program is its

@@ -1,12 +1,17 @@
-"""Seeds of the benchmark, of training and of validation."""
+"""Seeds and their purposes."""
+
+from itertools import combinations
 
 import pytest
 
 from splatpilot.systems.seeds import (
+    MONTE_CARLO_SEEDS,
     SEEDS_PER_RUN,
+    STUDY_SEEDS,
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
     first_training_seed,
+    study_seeds,
 )
 
 
@@ -17,8 +22,22 @@ def test_runs_fill_the_seeds_between_benchmark_and_validation():
     assert firsts == list(range(TRAINING_SEEDS, VALIDATION_SEEDS, SEEDS_PER_RUN))
 
 
+def test_ranges_of_seeds_do_not_overlap():
+    training = range(TRAINING_SEEDS, first_training_seed(999) + SEEDS_PER_RUN)
+    validation = range(VALIDATION_SEEDS, VALIDATION_SEEDS + SEEDS_PER_RUN)
+    ranges = [*STUDY_SEEDS.values(), training, validation, MONTE_CARLO_SEEDS]
+    for a, b in combinations(ranges, 2):
+        assert a[-1] < b[0] or b[-1] < a[0]
+
+
 @pytest.mark.parametrize("run", [-1, 1000])
 def test_run_without_seeds_of_its_own_is_refused(run):
     """Runs are numbered from 0 to 999; others would take seeds of the benchmark or validation."""
     with pytest.raises(ValueError, match=f"seed is {run}; it must be 0 to 999"):
         first_training_seed(run)
+
+
+@pytest.mark.parametrize(("split", "count"), [("dev", 101), ("test", 999_001), ("dev", 0)])
+def test_more_seeds_than_a_split_has_are_refused(split, count):
+    with pytest.raises(ValueError, match=f"got {count}"):
+        study_seeds(split, count)

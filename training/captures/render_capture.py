@@ -14,7 +14,8 @@ from tqdm import tqdm
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.gltf import write_gltf
-from splatpilot.diagrams.worlds.make_world import is_procedural, make_blueprint
+from splatpilot.diagrams.worlds.make_world import WorldConfig, is_procedural, make_blueprint
+from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source_digest
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
@@ -23,6 +24,7 @@ from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.output_folders import held_folder
 from splatpilot.systems.read_limit import require_readable_size
+from splatpilot.systems.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
@@ -43,6 +45,10 @@ class RenderedWorld:
     origin: str = ""
     # How the capture was rendered.
     config: RenderConfig = field(default_factory=RenderConfig)
+    # What scenes of the capture are for: train, validation or test.
+    split: str = ""
+    # Digest of the mesh's triangles, or of the generated world, see `splits.source_digest`.
+    source_digest: list[str] = field(default_factory=list)
 
 
 def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
@@ -79,9 +85,14 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
             )
         blueprint = make_blueprint(scenario.world, seed)
         recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config)
+        described = f"{type(scenario.world).__name__} {seed}\n{dump_config(scenario.world)}"
+        digests, found = part_digests([described.encode()]), _generated_split(scenario.world, seed)
     else:
         check_mesh(world, config.up)
         recipe = RenderedWorld(str(world), world.name, config)
+        digests, found = mesh_digests(world), "train"
+    recipe.split = choose_split(recipe.origin, digests, config.split, found)
+    recipe.source_digest = source_digest(digests)
     text = dump_config(recipe)
     if _is_same(out, text):
         print(f"{out}: is rendered already")
@@ -129,10 +140,9 @@ def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | Non
     Raises:
         FileNotFoundError, ValueError, OSError: if its world is gone, damaged or cannot be rendered.
     """
-    file = capture / RECIPE
-    if not file.is_file():
+    recipe = rendered_world(capture)
+    if recipe is None:
         return None
-    recipe = load_config(RenderedWorld(), file)
     config = recipe.config
     config.validate()
     renderer = _renderer(capture / recipe.mesh, config)
@@ -140,9 +150,43 @@ def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | Non
     return lambda X_WC: renderer.frame(X_WC, K, config.width, config.height)
 
 
+def rendered_world(capture: Path) -> RenderedWorld | None:
+    """Returns what a capture was rendered of; None if it was not rendered.
+
+    Raises:
+        ValueError: if its `world.yaml` is damaged.
+    """
+    file = capture / RECIPE
+    return load_config(RenderedWorld(), file) if file.is_file() else None
+
+
 def intrinsics(width: int, height: int) -> NDArray[np.float64]:
     """Returns K (3, 3) [px] of a camera as TartanAir's: 90 degrees wide, centred."""
     return np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
+
+
+def _generated_split(world: WorldConfig, seed: int) -> str:
+    """Returns the split of a generated world, which has that of its seed if it is of the kinds that
+    the benchmark flies in."""
+    kinds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
+    if world not in kinds:
+        return "train"
+    if seed < TRAINING_SEEDS:
+        return "test"
+    return "train" if seed < VALIDATION_SEEDS else "validation"
+
+
+def mesh_digests(mesh: Path) -> set[str]:
+    """Returns a digest of each triangle of a mesh, by its corners to a millimeter: whatever the
+    file's format, and without its materials.
+
+    Raises:
+        ValueError: if the file cannot be read or holds no surface.
+    """
+    corners = np.round(_read_surface(mesh).triangles * 1000).astype(np.int64)
+    packed = corners @ np.array([1 << 42, 1 << 21, 1])  # (N, 3): one number a corner
+    triangles = np.unique(np.sort(packed, axis=1), axis=0)
+    return part_digests(triangle.tobytes() for triangle in triangles)
 
 
 def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
@@ -151,15 +195,8 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     Raises:
         ValueError: if the file cannot be read or holds no surface.
     """
-    try:
-        surface = trimesh.load(mesh, force="mesh")
-        area = surface.area if isinstance(surface, trimesh.Trimesh) else 0.0
-    except Exception as error:  # whatever its reader meets in a damaged file
-        raise ValueError(
-            f"{mesh}: not a readable mesh ({reason_of(error)}); export it again"
-        ) from error
-    if not isinstance(surface, trimesh.Trimesh) or not 0 < area < np.inf:
-        raise ValueError(f"{mesh}: holds no surface; export it again")
+    surface = _read_surface(mesh)
+    area = surface.area
     count = int(_SAMPLES_PER_VOXEL_FACE * area / voxel_size**2) + 1
     require_readable_size(mesh, 64.0 * count)
     lower, upper = surface.bounds
@@ -176,6 +213,19 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     occupied = np.zeros(shape, dtype=bool)
     occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
     return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
+
+
+def _read_surface(mesh: Path) -> trimesh.Trimesh:
+    try:
+        surface = trimesh.load(mesh, force="mesh")
+        area = surface.area if isinstance(surface, trimesh.Trimesh) else 0.0
+    except Exception as error:  # whatever its reader meets in a damaged file
+        raise ValueError(
+            f"{mesh}: not a readable mesh ({reason_of(error)}); export it again"
+        ) from error
+    if not isinstance(surface, trimesh.Trimesh) or not 0 < area < np.inf:
+        raise ValueError(f"{mesh}: holds no surface; export it again")
+    return surface
 
 
 def _is_same(folder: Path, text: str) -> bool:

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from splatpilot.diagrams.worlds.splits import check_split
+
 
 @dataclass(kw_only=True)
 class RenderConfig:
@@ -29,9 +31,13 @@ class RenderConfig:
     # Colour where there is no mesh; red, green, blue in 0 to 1.
     background: list[float] = field(default_factory=lambda: [0.6, 0.75, 0.9])
     voxel_size: float = 0.1  # [m] of the grid in which the path is found
+    # What scenes of the capture are for: train, validation or test. Empty: train, but test for what
+    # the benchmark tests in, and for its worlds of seeds below those of training.
+    split: str = ""
 
     def validate(self) -> None:
         """Raises ValueError for values that make no sense."""
+        check_split(self.split)
         for name in ("width", "height"):
             if not 8 <= getattr(self, name) <= 4096:
                 raise ValueError(f"{name} is {getattr(self, name)} px, 8 to 4096 is needed")

@@ -24,8 +24,8 @@ class LibraryConfig:
     # Scenarios whose worlds are generated, the benchmark's or files; naming one twice doubles its
     # part.
     kinds: list[str] = field(default_factory=lambda: [*PROCEDURAL, *ROUNDABOUT])
-    # Scene folders, each with other obstacles, start and goal every time its turn comes. None that
-    # the benchmark flies in, and each with its fidelity bound (`splatpilot fidelity`).
+    # Scene folders, each with other obstacles, start and goal every time its turn comes. Of split
+    # train, or validation if held out; each with its fidelity bound (`splatpilot fidelity`).
     scenes: list[str] = field(default_factory=list)
     # Whether the seeds are those of validation instead of training.
     held_out: bool = False
@@ -41,7 +41,7 @@ class LibraryConfig:
         for kind in self.kinds:
             check_generated(kind)
         for scene in self.scenes:
-            fidelity_bound(scene)
+            _measured_scene(self, scene)
 
 
 def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
@@ -66,22 +66,24 @@ def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
     name = f"{Path(kind).stem}-{seed}"
     if kind in library.scenes:
         world = InsertedConfig(path=kind, draw_ends=True)
-        return WorldSource(name, world, seed, fidelity_bound(kind))
+        bound, digest = _measured_scene(library, kind)
+        return WorldSource(name, world, seed, bound, digest)
     return WorldSource(name, world_of(kind), seed, inf)
 
 
-def fidelity_bound(scene: str) -> float:
-    """How far from its capture's poses the images of a scene folder can be trusted [m].
+def _measured_scene(library: LibraryConfig, scene: str) -> tuple[float, list[str]]:
+    """Returns how far from its capture's poses the images of a scene folder can be trusted [m], and
+    its `source_digest`.
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: if nobody measured it, or the benchmark flies in it.
+        ValueError: if it was not measured, or is not of the library's split.
     """
-    folder = place_to_learn_in(scene)
+    folder = place_to_learn_in(scene, "validation" if library.held_out else "train")
     metadata = read_scene_metadata(folder)
     if metadata.perturbation_bound is None:
         raise ValueError(
             f"{folder / 'scene.yaml'} does not say how far from the capture its images can be "
             f"trusted (perturbation_bound); measure it with `splatpilot fidelity {folder}`"
         )
-    return metadata.perturbation_bound
+    return metadata.perturbation_bound, metadata.source_digest

@@ -1,6 +1,6 @@
 """A world that a corpus was gathered in: what it takes to make it again, and its distances."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
 from pathlib import Path
@@ -26,6 +26,8 @@ class WorldSource:
     seed: int = 0
     # [m] How far from recorded poses its images can be trusted; infinite where they are exact.
     perturbation_bound: float = inf
+    # Of a scene, that of `scene.yaml`; empty for generated worlds.
+    source_digest: list[str] = field(default_factory=list)
 
 
 class WorldRecord:

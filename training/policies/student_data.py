@@ -11,11 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatpilot.diagrams.worlds.scene import SceneSource
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards
 from splatpilot.training.corpus.sample import RECOVERY
 from splatpilot.training.policies.ray_casting import EsdfGeometry
+from splatpilot.training.world_kinds import require_untested
 
 _PARTS = 1 << 20
 """[-] That a chance is counted in."""
@@ -64,6 +66,9 @@ class StudentData:
                     "student has one nominal speed: gather them at the same"
                 )
         records = {world.name: world for corpus in reversed(corpora) for world in corpus.worlds}
+        for record in records.values():
+            if isinstance(record.source.world, SceneSource):
+                require_untested(record.source.source_digest, str(record.path))
         self.held_out_worlds = held_out_names(list(records), held_out)
         others = _ranked(records.keys() - set(self.held_out_worlds))
         if worlds > len(others):

@@ -21,6 +21,7 @@ _INDIFFERENT = (
     "voxel_size",
     "max_range",
     "distance_field",
+    "split",
 )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from splatpilot.diagrams.worlds.scene_metadata import REPRESENTATIONS
+from splatpilot.diagrams.worlds.splits import SPLITS
 from splatpilot.systems.cores import available_cores
 from splatpilot.training.captures.capture_config import CaptureConfig
 
@@ -36,6 +37,9 @@ class ReconstructConfig:
     max_gaussians: int = 180_000
     """At most as many are there at last. Without iterations, texture is resolved as finely as they
     allow."""
+    split: str = ""
+    """What the scene is for: "train", "validation" or "test". Empty: what the capture says, or
+    "train". What the benchmark tests in is always "test"."""
     image_width: int = 320
     """[px] that images are shrunk to, as nearly as a whole factor can; 0 keeps their size, and so
     do 0 iterations."""
@@ -148,6 +152,7 @@ class ReconstructConfig:
             "initialization": INITIALIZATIONS,
             "strategy": STRATEGIES,
             "distance_field": DISTANCE_FIELDS,
+            "split": ("", *SPLITS),
             "device": DEVICES,
             "depth_mode": ("D", "ED"),
         }

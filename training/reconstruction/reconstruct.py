@@ -1,7 +1,7 @@
 """From a capture to a scene folder that can be flown in."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
+from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -17,6 +18,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.render_capture import RECIPE, rendered_world
 from splatpilot.training.captures.shrink_frame import shrink_factor
 from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_same_run
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -118,8 +120,10 @@ def reconstruct(
     held_out = list(range(0, len(capture), every)) if every else []
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
-    frames = ShrunkFrames(capture, fitted, factor)
+    digests: set[str] = set()
+    frames = ShrunkFrames(_digested(capture, digests), fitted, factor)
     thinned = [ThinnedFrame.of(f) for f in tqdm(frames, "comparing brightness", unit="frame")]
+    source, split = _source_and_split(capture, digests, config.split)
     photometry = estimate_photometry(thinned, config.seed)
     without_depth = _without_depth(capture, fitted, thinned)
     del thinned
@@ -177,6 +181,8 @@ def reconstruct(
         capture_settings=capture.config.settings(),
         held_out=held_out,
         image_width=capture.width // factor if factor > 1 else 0,
+        split=split,
+        source_digest=source,
     )
     if checkpoint is not None:
         checkpoint.remove()
@@ -198,6 +204,44 @@ def reconstruct(
         field_difference=difference,
         warnings=(*capture.dropped, *without_depth, *warnings),
     )
+
+
+def _digested(capture: Capture, digests: set[str]) -> Capture:
+    """Returns the capture, which adds a digest of the pixels of each image that is loaded."""
+
+    def load_image(i: int) -> NDArray[np.uint8]:
+        image = capture.load_image(i)
+        digests.update(part_digests([image.tobytes()]))
+        return image
+
+    return replace(capture, load_image=load_image)
+
+
+def _source_and_split(capture: Capture, images: set[str], asked: str) -> tuple[list[str], str]:
+    """
+    Returns the digest of what a scene is made from, and its split: of the world that the capture
+    was rendered of, or else of its images.
+
+    Args:
+        images: digests of those that the scene is fitted to.
+        asked: the split that the user gives it; empty for none.
+
+    Raises:
+        ValueError: if `asked` is another split than test for what is only tested in, or the capture
+            does not say what it was rendered of.
+    """
+    name = capture.folder or capture.name
+    folder = Path(capture.folder)
+    rendered = None
+    if capture.folder:  # the captures beside a rendered one stand in its folder
+        rendered = rendered_world(folder) or rendered_world(folder.parent)
+    if rendered is None:
+        digests, found = images, "train"
+    elif rendered.source_digest:
+        digests, found = set(rendered.source_digest), rendered.split
+    else:
+        raise ValueError(f"{name}/{RECIPE} has no source_digest; render the capture again")
+    return source_digest(digests), choose_split(name, digests, asked, found)
 
 
 def _without_depth(

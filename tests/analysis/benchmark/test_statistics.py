@@ -2,8 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from splatpilot.analysis.benchmark.statistics import mcnemar, wilson_interval
+from splatpilot.analysis.benchmark.statistics import (
+    cluster_interval,
+    holm,
+    mcnemar,
+    sign_flip,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -49,3 +56,61 @@ def test_mcnemar_is_the_binomial_of_unequal_pairs():
 def test_mcnemar_without_unequal_pairs():
     """Policies that always do alike do not differ."""
     assert mcnemar(*paired(0, 0, 5, 3)) == (0, 0, 1.0)
+
+
+def test_cluster_interval_covers_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(200):
+        rates = rng.beta(2.0, 1.0, size=30)  # of scenarios; the mean is 2/3
+        interval = cluster_interval(rng.binomial(10, rates), np.full(30, 10))
+        covered += interval.lower <= 2 / 3 <= interval.upper
+    assert 0.9 * 200 <= covered <= 0.99 * 200
+
+
+def test_cluster_interval_without_correlation_is_that_of_flights():
+    successes = np.random.default_rng(0).binomial(20, 0.5, size=100)
+    clusters = cluster_interval(successes, np.full(100, 20))
+    flights = wilson_interval(int(successes.sum()), 2000)
+    np.testing.assert_allclose(clusters, flights, atol=0.006)
+
+
+@pytest.mark.parametrize(
+    ("successes", "flights", "expected"),
+    [
+        ([], [], (0.0, 1.0)),
+        ([20], [20], (0.0, 1.0)),
+        ([20, 20, 20], [20, 20, 20], wilson_interval(3, 3)),
+        ([0, 0], [5, 5], wilson_interval(0, 2)),
+    ],
+)
+def test_cluster_interval_of_equal_or_single_scenarios_is_wide(successes, flights, expected):
+    assert cluster_interval(successes, flights) == expected
+
+
+@pytest.mark.parametrize(
+    ("differences", "p_value"),
+    [
+        ([], 1.0),
+        ([0.0, 0.0], 1.0),
+        ([0.5], 1.0),
+        ([0.5, 0.5, 0.5, 0.5], 2 / 16),
+        ([0.5, 0.5, 0.5, -0.5], 10 / 16),
+        ([0.1, 0.2, 0.3, 0.0], 2 / 8),
+    ],
+)
+def test_sign_flip_counts_the_signs_of_the_scenarios(differences, p_value):
+    assert sign_flip(differences) == p_value
+
+
+def test_sign_flip_of_many_scenarios_agrees_with_the_normal_distribution():
+    differences = np.random.default_rng(1).normal(0.3, 1.0, size=60)
+    z = differences.sum() / np.sqrt((differences**2).sum())
+    assert sign_flip(differences) == pytest.approx(2 * norm.sf(abs(z)), rel=0.1)
+
+
+def test_holm_is_the_published_one():
+    # S. Holm's step-down by hand: 4 x 0.01, 3 x 0.02, 2 x 0.03 and 0.04, never falling.
+    np.testing.assert_allclose(holm([0.04, 0.01, 0.03, 0.02]), [0.06, 0.04, 0.06, 0.06])
+    np.testing.assert_allclose(holm([0.9, 0.5]), [1.0, 1.0])
+    assert holm([]).shape == (0,)

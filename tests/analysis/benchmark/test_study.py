@@ -7,7 +7,6 @@ import pytest
 from splatpilot.analysis.benchmark.rollout import chunks
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, default_policies
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
-from splatpilot.systems.seeds import FRESH_SEEDS
 
 
 def test_rollouts_are_all_combinations(short_scenario):
@@ -18,9 +17,12 @@ def test_rollouts_are_all_combinations(short_scenario):
     assert {spec.scenario for spec in specs} == {"short"}
     assert RolloutSpec("short", "straight", 1.5, 2) in specs
     assert RolloutSpec("P02", "planner", 2.0, 7).id == "P02-planner-2-007"
-    config.first_seed = FRESH_SEEDS
-    fresh = config.rollouts()
-    assert {spec.seed for spec in fresh} == {500_000, 500_001, 500_002} and len(fresh) == 12
+
+
+@pytest.mark.parametrize(("split", "seeds"), [("dev", {0, 1}), ("test", {1000, 1001})])
+def test_split_decides_the_seeds(short_scenario, split, seeds):
+    config = StudyConfig([str(short_scenario)], ["straight"], seeds=2, split=split)
+    assert {spec.seed for spec in config.rollouts()} == seeds
 
 
 def test_chunks_are_flights_through_one_place(short_scenario):
@@ -49,9 +51,9 @@ def test_chunks_are_flights_through_one_place(short_scenario):
         ({"speeds": [-1.0]}, "the speed -1 m/s cannot be flown"),
         ({"speeds": [float("nan")]}, "the speed nan m/s cannot be flown"),
         ({"speeds": [50.0], "policies": ["straight"]}, "speed is 50"),
-        ({"seeds": 0}, "seeds is 0; it must be 1 to"),
-        ({"first_seed": -1}, "first_seed is -1; it must be 0 to"),
-        ({"first_seed": 1_000_000}, "first_seed is 1000000; it must be 0 to 999997, so that none"),
+        ({"seeds": 0}, r"seeds of split dev must be in \[1, 100\], got 0"),
+        ({"seeds": 101}, r"seeds of split dev must be in \[1, 100\], got 101"),
+        ({"split": "fresh"}, "split must be one of dev, test, got 'fresh'"),
         ({"overrides": ["world.spacing=0.1"]}, "scenario short: .*spacing"),
         ({"overrides": ["policy.rate=3"]}, "write it as one of them, --policies NAME:rate=3"),
         ({"overrides": ["seed=3"]}, "say how many with --seeds"),

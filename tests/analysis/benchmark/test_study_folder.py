@@ -38,7 +38,7 @@ def test_rows_that_are_none_are_damage(study, tmp_path, row):
         ("format_version: 1\nstudy: {}\nprogram: {}\nshard: 3", "no study: shard is 3"),
         ("format_version: 1\nstudy: {sedes: 3}\nprogram: {}", "there is no field sedes"),
         ("format_version: 1\nstudy: {seeds: many}\nprogram: {}", ".*many"),
-        ("format_version: 1\nstudy: {seeds: 1000000000}\nprogram: {}", "seeds is 1000000000"),
+        ("format_version: 1\nstudy: {seeds: 1000000000}\nprogram: {}", "got 1000000000"),
         ("format_version: 1\nstudy: {speeds: [.nan]}\nprogram: {}", "speed nan m/s cannot be"),
         ("format_version: 9\nstudy: {}\nprogram: {}", "format version 9"),
     ],
@@ -79,8 +79,8 @@ def test_fields_that_came_later_are_as_they_are_by_default(study, tmp_path):
     folder.claim(config, program())
     file = tmp_path / "out/study.yaml"
     begun = file.read_text()
-    assert "  first_seed: 0\n" in begun
-    file.write_text(begun.replace("  first_seed: 0\n", ""))
+    assert "  split: dev\n" in begun
+    file.write_text(begun.replace("  split: dev\n", ""))
     folder.claim(config, program())
-    with pytest.raises(ValueError, match="holds a study with first_seed 0, not 500000; choose"):
-        folder.claim(replace(config, first_seed=500_000), program())
+    with pytest.raises(ValueError, match="holds a study with split dev, not test; choose"):
+        folder.claim(replace(config, split="test"), program())

@@ -1,5 +1,7 @@
 """What a study keeps of what its flights depend on: policies, weights, scenarios, scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,14 @@ from splatpilot.analysis.benchmark import replay
 from splatpilot.analysis.benchmark import run as benchmark
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights, kept_scenario
+from splatpilot.analysis.benchmark.study_inputs import (
+    input_digests,
+    keep_inputs,
+    kept_flights,
+    kept_scenario,
+)
 from splatpilot.analysis.cli import main
+from splatpilot.systems.policies import policy_checkpoint
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
 
@@ -87,6 +95,39 @@ def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, ca
 
     assert main([*words, "--out", str(tmp_path / "other"), "--policies", "straight"]) == 0
     assert f"The policy that {short_scenario} names is not flown" in capsys.readouterr().out
+
+
+def test_study_is_not_continued_with_other_shipped_weights(short_scenario, tmp_path, monkeypatch):
+    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+    monkeypatch.setattr(policy_checkpoint, "_SHIPPED", tmp_path)
+    PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(
+        tmp_path / "diffaero.npz"
+    )
+    config = StudyConfig([str(short_scenario)], ["diffaero"], seeds=2)
+    folder = StudyFolder(tmp_path / "out")
+    benchmark.run(config=config, out=folder.path, jobs=1)
+    assert len(folder.program()["weights of diffaero"]) == 16
+
+    zeros = {name: 0.0 * array for name, array in shipped.weights.items()}
+    PolicyCheckpoint("diffaero", shipped.spec, zeros, {}).save(tmp_path / "diffaero.npz")
+    folder.trajectory("short-diffaero-2-001").unlink()
+    with pytest.raises(ValueError, match="was begun with weights of diffaero"):
+        benchmark.run(config=config, out=folder.path, jobs=1)
+
+
+def test_digest_of_a_scene_is_that_of_what_flies(place, tmp_path):
+    file = tmp_path / "hall.yaml"
+
+    def digest(scene) -> str:
+        file.write_text(f"world: !SceneConfig {{path: {scene}}}\n")
+        config = StudyConfig([str(file)], ["straight"], seeds=1)
+        return input_digests(config, config.load_scenarios())["scene of hall"]
+
+    scene = place.scene("hall")
+    first = digest(scene)
+    assert digest(scene.rename(tmp_path / "renamed")) == first
+    fewer = replace(place.gaussians, means=place.gaussians.means + 0.1)
+    assert digest(place.scene("moved", fewer)) != first
 
 
 def test_begun_study_leaves_its_scenarios_as_they_are(place, tmp_path):

@@ -77,6 +77,8 @@ def unscaled(seen_room, photographs, tmp_path):
         metric=False,
         capture=str(photographs),
         held_out=[0, 8],
+        split="validation",
+        source_digest=["0123456789abcdef"],
     )
     return path
 
@@ -100,6 +102,7 @@ def test_scene_of_photographs_can_be_flown_in_once_it_has_its_size(
     gaussians, capture = seen_room
     np.testing.assert_allclose(new.gaussians.means[: len(gaussians)], gaussians.means, atol=1e-5)
     metadata = read_scene_metadata(out)
+    assert (metadata.split, metadata.source_digest) == ("validation", ["0123456789abcdef"])
     again = read_capture_of(out, metadata)
     assert again.metric
     for i in (0, 15):

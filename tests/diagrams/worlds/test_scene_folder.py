@@ -233,7 +233,7 @@ def test_missing_scene(tmp_path):
         ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG is .*three finite numbers"),
         ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS is \[\]"),
         ("vignetting: 0.0", "vignetting: dark", "dark"),
-        ("metric: true", "metric: [", r"line 7: expected"),
+        ("metric: true", "metric: [", r"line 9: expected"),
         ("representation: 3dgs", "representation: nerf", "representation is 'nerf', it must be"),
         ("held_out: []", "held_out: [-1]", r"held_out \[-1\]; neither may be negative"),
         ("image_width: 0", "perturbation_bound: -0.5", r"perturbation_bound is -0\.5"),

@@ -1,6 +1,9 @@
 """Captures rendered of meshes."""
 
+import os
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +12,24 @@ import trimesh
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.make_world import make_blueprint
 from splatpilot.diagrams.worlds.room import RoomConfig
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.splits import find_test_source, source_digest
 from splatpilot.systems.configuration import load_config
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.captures.render_capture import mesh_distance, run, true_camera
+from splatpilot.training.captures.render_capture import (
+    mesh_digests,
+    mesh_distance,
+    rendered_world,
+    run,
+    true_camera,
+)
 from splatpilot.training.captures.render_config import RenderConfig
+from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 SIZE = np.array([6.0, 4.0, 3.0])  # [m] of a room about the origin, seen from inside
 
@@ -136,6 +150,52 @@ def test_generated_world_is_rendered_where_it_is(opengl, tmp_path):
         assert np.abs(distance[inside]).max() < 0.01
 
 
+@pytest.mark.parametrize(
+    ("seed", "split"), [(4, "test"), (1_000_004, "train"), (2_000_004, "validation")]
+)
+def test_benchmark_world_has_the_split_of_its_seed(opengl, tmp_path, monkeypatch, seed, split):
+    scenario = tmp_path / "room.yaml"
+    scenario.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
+    monkeypatch.setattr(render_capture, "benchmark_scenarios", lambda: {"P13": scenario})
+    config = RenderConfig(width=16, height=12, path=[[1.5, 0.4, 1.5]], yaws=[0.0])
+    run(world="P13", out=tmp_path / "capture", config=config, seed=seed)
+    recipe = rendered_world(tmp_path / "capture")
+    assert recipe is not None and recipe.split == split
+
+
+@pytest.mark.parametrize("name", ["copy.glb", "copy.obj", "copy.ply"])
+def test_mesh_digests_do_not_depend_on_the_file(room, tmp_path, name):
+    mesh = trimesh.load(room, force="mesh")
+    mesh.faces = mesh.faces[::-1, [1, 2, 0]]
+    mesh.export(tmp_path / name)
+    assert mesh_digests(tmp_path / name) == mesh_digests(room)
+    mesh.apply_translation([0.01, 0, 0]).export(tmp_path / name)
+    assert mesh_digests(tmp_path / name).isdisjoint(mesh_digests(room))
+
+
+def test_renamed_copy_of_a_test_mesh_is_of_split_test(opengl, room, tmp_path, monkeypatch):
+    tested = {"warehouse": source_digest(mesh_digests(room))}
+    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
+    copy = shutil.copyfile(room, tmp_path / "capture.obj")
+    config = replace(small(), yaws=[0.0])
+    with pytest.raises(ValueError, match=r"capture.obj must be test, got train: it shows ware"):
+        run(world=copy, out=tmp_path / "out", config=replace(config, split="train"))
+    run(world=copy, out=tmp_path / "out", config=config)
+    scene = replace(ReconstructConfig(), iterations=0, voxel_size=0.1)
+    reconstruct(read_capture(tmp_path / "out"), tmp_path / "scene", scene)
+    assert read_scene_metadata(tmp_path / "scene").split == "test"
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [("warehouse.gltf", "warehouse"), ("edgar_mine.glb", "edgar_mine"), ("cave.glb", None)],
+)
+def test_real_meshes_are_those_of_the_table(file, source):
+    mesh = Path(os.environ["SPLATPILOT_DATA"]) / "worlds" / file
+    assert find_test_source(mesh_digests(mesh)) == source
+
+
 def test_distance_to_a_mesh(room):
     """The grid's distances are those to the walls, to within a voxel and a half."""
     esdf = mesh_distance(room, "z", 0.1)
@@ -158,6 +218,7 @@ def test_bad_input_is_named(room, tmp_path, capsys):
         (room, ["--up", "z", "--path", "0,0,0 5,0,0"], "touches something"),
         (room, ["--set", "spacing=0"], "spacing is 0"),
         (room, ["--set", "yaws=[]"], "yaws"),
+        (room, ["--set", "split=fresh"], "split must be one of train, validation, test, got 'fr"),
         (room, ["--set", "lowest=3"], "nothing lies between"),
     ):
         assert main(["capture", "render", str(world), "--out", str(out), *options]) == 1, world

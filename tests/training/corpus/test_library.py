@@ -9,6 +9,7 @@ import pytest
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
+from splatpilot.diagrams.worlds.splits import load_test_sources
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.seeds import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
@@ -17,7 +18,7 @@ from splatpilot.training.corpus.library import LibraryConfig, world_source
 from splatpilot.training.world_kinds import world_of
 
 
-def write_scene(path, bound, name="attic"):
+def write_scene(path, bound, name="attic", split="train", digest=("0123456789abcdef",)):
     free = np.zeros((10, 10, 10), bool)
     esdf = esdf_from_occupancy(free, free, np.zeros(3), 0.3)
     one = np.ones((1, 3))
@@ -30,7 +31,7 @@ def write_scene(path, bound, name="attic"):
         p_WS=np.ones(3),
         p_WG=2 * np.ones(3),
     )
-    write_scene_folder(path, world, provenance="a test")
+    write_scene_folder(path, world, provenance="a test", split=split, source_digest=digest)
     write_scene_metadata(path, replace(read_scene_metadata(path), perturbation_bound=bound))
     return str(path)
 
@@ -61,6 +62,7 @@ def test_kinds_and_scenes_come_in_turn(tmp_path):
     assert [s.perturbation_bound for s in sources] == [inf, inf, 0.25, inf]
     assert sources[1].world == world_of("P06")
     assert sources[2].world == InsertedConfig(path=scene, draw_ends=True)
+    assert sources[2].source_digest == ["0123456789abcdef"]
 
 
 def test_scenes_without_a_bound_are_refused(tmp_path):
@@ -75,11 +77,40 @@ def test_scenes_without_a_bound_are_refused(tmp_path):
         LibraryConfig(scenes=[f"{scene}/gaussians.ply"]).validate()
 
 
-@pytest.mark.parametrize(("folder", "name"), [("hospital", "attic"), ("attic", "warehouse")])
-def test_places_of_the_benchmark_are_not_learned_in(tmp_path, folder, name):
-    """A scene that the benchmark flies in is refused, by its folder's name or its own."""
-    scene = write_scene(tmp_path / folder, 0.2, name)
-    with pytest.raises(ValueError, match="the benchmark flies in"):
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_renamed_copy_of_a_test_source_is_not_learned_in(tmp_path, split):
+    digest = load_test_sources()["hospital"][3:5]
+    scene = write_scene(tmp_path / "corridor", 0.2, "corridor", split, digest)
+    with pytest.raises(ValueError, match="corridor shows hospital, in which the benchmark tests"):
+        LibraryConfig(scenes=[scene]).validate()
+
+
+def test_copy_of_a_scene_that_the_benchmark_finds_here_is_not_learned_in(tmp_path, monkeypatch):
+    monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
+    write_scene(tmp_path / "bookstore", 0.2, split="test")
+    scene = write_scene(tmp_path / "shop", 0.2)
+    with pytest.raises(ValueError, match="shop shows bookstore, in which the benchmark tests"):
+        LibraryConfig(scenes=[scene]).validate()
+
+
+def test_own_scene_of_a_benchmark_name_is_learned_in(tmp_path):
+    LibraryConfig(scenes=[write_scene(tmp_path / "hospital", 0.2, "hospital")]).validate()
+
+
+@pytest.mark.parametrize(
+    ("split", "held_out"),
+    [("test", False), ("validation", False), ("", False), ("train", True)],
+)
+def test_scene_of_another_split_is_refused(tmp_path, split, held_out):
+    scene = write_scene(tmp_path / "attic", 0.2, split=split)
+    needed = "validation" if held_out else "train"
+    with pytest.raises(ValueError, match=f"split of .*attic must be {needed}, got '{split}'"):
+        LibraryConfig(scenes=[scene], held_out=held_out).validate()
+
+
+def test_scene_of_unknown_source_is_refused(tmp_path):
+    scene = write_scene(tmp_path / "attic", 0.2, digest=())
+    with pytest.raises(ValueError, match=r"attic is missing source_digest.*reconstruct"):
         LibraryConfig(scenes=[scene]).validate()
 
 

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from splatpilot.diagrams.worlds import splits
+from splatpilot.diagrams.worlds.inserted import InsertedConfig
 from splatpilot.systems.configuration import dump_config
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import CONFIG, Corpus
@@ -97,6 +99,20 @@ def test_distances_change_as_waypoints_do(two):
         )
     expected = 2e-3 * gradient.square().sum(-1)
     assert ((ahead - behind - expected).abs() < 2e-5).float().mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("digest", "message"),
+    [([], "missing source_digest"), (["0123456789abcdef"], "shows hospital, in which")],
+)
+def test_corpora_of_test_scenes_are_refused(two, monkeypatch, digest, message):
+    tested = {"hospital": ["0123456789abcdef"]}
+    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
+    source = two[0].worlds[0].source
+    monkeypatch.setattr(source, "world", InsertedConfig(path="corridor"))
+    monkeypatch.setattr(source, "source_digest", digest)
+    with pytest.raises(ValueError, match=message):
+        StudentData(two, 0.3)
 
 
 def test_corpora_that_do_not_fit_are_refused(two, tmp_path):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.scene import SceneConfig
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.diagrams.worlds.splits import part_digests, source_digest
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
@@ -29,7 +31,7 @@ from splatpilot.training.policies.training_worlds import (
 UPPER = np.array([12.0, 7.0, 4.0])
 
 
-def write_place(folder: Path) -> str:
+def write_place(folder: Path, split: str = "train") -> str:
     """A captured yard with a post in it."""
     shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
     esdf = esdf_from_distance_field(AnalyticDistanceField(shapes, np.zeros(3), UPPER), 0.2)
@@ -43,7 +45,8 @@ def write_place(folder: Path) -> str:
         p_WS=np.ones(3),
         p_WG=2 * np.ones(3),
     )
-    write_scene_folder(folder, world, provenance="a test")
+    digest = ["0123456789abcdef"]
+    write_scene_folder(folder, world, provenance="", split=split, source_digest=digest)
     return str(folder)
 
 
@@ -129,11 +132,11 @@ def test_policies_learn_in_places(yard):
 def test_bad_selections_are_refused(yard, tmp_path):
     """Nothing to choose from, places that are flown in, and kinds that are captured places."""
     WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
-    flown = write_place(tmp_path / "warehouse")
+    tested = write_place(tmp_path / "warehouse", "test")
     for fields, message in (
         ({"kinds": []}, "worlds has neither kinds nor scenes"),
         ({"kinds": ["R13"]}, "worlds.kinds has R13, whose world is not generated"),
-        ({"scenes": [flown]}, "the benchmark flies in warehouse"),
+        ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),
         ({"scenes": [f"{yard}/gaussians.ply"]}, "is no scene folder"),
         ({"count": 1001}, "worlds.count is 1001; it must be 1 to 1000"),
     ):
@@ -141,3 +144,13 @@ def test_bad_selections_are_refused(yard, tmp_path):
             WorldSelection(**fields).validate()
     with pytest.raises(FileNotFoundError, match="there is no such scene"):
         WorldSelection(scenes=["nowhere"]).validate()
+
+
+def test_octomap_of_a_test_source_is_refused(tmp_path, monkeypatch):
+    map_file = tmp_path / "renamed.bt"
+    map_file.write_bytes(b"a map")
+    WorldSelection(scenes=[str(map_file)]).validate()
+    tested = {"lab": source_digest(part_digests([b"a map"]))}
+    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
+    with pytest.raises(ValueError, match=r"renamed.bt shows lab, in which the benchmark tests"):
+        WorldSelection(scenes=[str(map_file)]).validate()

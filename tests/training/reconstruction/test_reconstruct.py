@@ -2,15 +2,19 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.scene_folder import read_scene
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.splits import part_digests, source_digest
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.splats.gaussian_ply import read_ply
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -22,6 +26,10 @@ CONFIG = ReconstructConfig(iterations=0, voxel_size=0.1)
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def image_digests(capture: Capture) -> set[str]:
+    return part_digests(capture.load_image(i).tobytes() for i in range(len(capture)))
 
 
 def test_room_end_to_end(tmp_path, write_room, room_in_W):
@@ -170,6 +178,30 @@ def test_bad_capture_leaves_nothing(tmp_path, write_room):
     with pytest.raises(ValueError, match=r"000004_left\.png: not a readable image"):
         reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
     assert list(tmp_path.iterdir()) == [room]
+
+
+@pytest.mark.parametrize("asked", ["", "train", "validation"])
+def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, write_room, asked):
+    room = write_room(tmp_path / "hospital")
+    reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, split=asked))
+    metadata = read_scene_metadata(tmp_path / "scene")
+    assert metadata.split == (asked or "train") and len(metadata.source_digest) == 8
+    for image in (room / "image_left").iterdir():  # the same pixels in another file format
+        pixels = cv2.imread(str(image))
+        image.unlink()
+        cv2.imwrite(str(image), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+    renamed = read_capture(room.rename(tmp_path / "P001"))
+    assert set(metadata.source_digest) <= image_digests(renamed)
+
+
+def test_renamed_copy_of_a_test_capture_is_of_split_test(tmp_path, write_room, monkeypatch):
+    room = read_capture(write_room(tmp_path / "P001"))
+    tested = {"hospital": source_digest(image_digests(room))}
+    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
+    reconstruct(room, tmp_path / "scene", CONFIG)
+    assert read_scene_metadata(tmp_path / "scene").split == "test"
+    with pytest.raises(ValueError, match="must be test, got train: it shows hospital"):
+        reconstruct(room, tmp_path / "scene", replace(CONFIG, split="train"))
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")

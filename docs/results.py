@@ -1,0 +1,277 @@
+"""Keeps the results of studies, and writes the tables of pages from them.
+
+python docs/results.py keep out/study development
+python docs/results.py write
+
+`docs/results/NAME.csv` has a row for each policy, speed and scenario, and `NAME.yaml` how it was
+flown. A page has a table between `<!-- table KIND NAME -->` and `<!-- end of table -->`, KIND being
+one of policies, scenarios, pairs and paper.
+"""
+
+import argparse
+import csv
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from datetime import date
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from splatpilot.analysis.benchmark.statistics import (
+    Interval,
+    cluster_interval,
+    holm,
+    sign_flip,
+    wilson_interval,
+)
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.tables import PAPER, PAPER_FLIGHTS
+from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.systems.seeds import describe_seeds
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TABLE = re.compile(r"(<!-- table (\w+) (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+
+_OUTCOMES = "collision", "timeout", "left_volume", "infeasible"
+_SUMS = {"clearance_sum_m": "min_clearance_m", "speed_sum_m_s": "mean_speed_m_s"}
+"""Columns with the sums, over flights that were flown, of columns of `rollouts.csv`."""
+
+
+def keep(study: Path, name: str) -> None:
+    """Keeps the results of a study's folder as `name`."""
+    folder = StudyFolder(study)
+    config = folder.config()
+    groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
+    with (study / "rollouts.csv").open() as file:
+        for row in csv.DictReader(file):
+            groups.setdefault((row["policy"], row["speed"], row["scenario"]), []).append(row)
+    rows = []
+    for (policy, speed, scenario), flights in groups.items():
+        row: dict[str, Any] = {"policy": policy, "speed": speed, "scenario": scenario}
+        row |= {"flights": len(flights), "successes": sum(f["success"] == "True" for f in flights)}
+        row |= {outcome: sum(f["outcome"] == outcome for f in flights) for outcome in _OUTCOMES}
+        for sum_name, column in _SUMS.items():
+            row[sum_name] = f"{sum(float(f[column]) for f in flights if f[column]):.4f}"
+        rows.append(row)
+    RESULTS.mkdir(exist_ok=True)
+    with (RESULTS / f"{name}.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    timing = folder.read_timing(config.rollouts()[0].id)
+    flown = max(path.stat().st_mtime for path in (study / "rollouts").glob("*.npz"))
+    about = {
+        "split": config.split,
+        "seeds": config.seeds,
+        "date": date.fromtimestamp(flown).isoformat(),
+        "machine": f"{_processor()}, kernels for {timing['simd']}",
+        "command": _command(config),
+        "program": folder.program(),
+    }
+    (RESULTS / f"{name}.yaml").write_text(yaml.safe_dump(about, sort_keys=False, width=1000))
+
+
+def _processor() -> str:
+    models = re.findall(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    return models[0] if models else "an unknown processor"
+
+
+def _command(config: StudyConfig) -> str:
+    words = ["splatpilot", "benchmark", "--split", config.split, "--seeds", str(config.seeds)]
+    words += ["--speeds", ",".join(f"{speed:g}" for speed in config.speeds)]
+    words += ["--policies", ",".join(config.policies)]
+    words += ["--scenarios", ",".join(config.scenarios)]
+    words += [word for override in config.overrides for word in ("--set", override)]
+    return shlex.join([*words, "--out", "out/study"])
+
+
+class Results(NamedTuple):
+    """What is kept of a study."""
+
+    rows: list[dict[str, str]]
+    about: dict[str, Any]
+
+    @classmethod
+    def read(cls, name: str) -> "Results":
+        with (RESULTS / f"{name}.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        return cls(rows, yaml.safe_load((RESULTS / f"{name}.yaml").read_text()))
+
+    @property
+    def scenarios(self) -> list[str]:
+        return list(dict.fromkeys(row["scenario"] for row in self.rows))
+
+    @property
+    def entries(self) -> list[tuple[str, str]]:
+        """Policies, each at one speed."""
+        return list(dict.fromkeys((row["policy"], row["speed"]) for row in self.rows))
+
+    def select(self, entry: tuple[str, str], scenarios: Sequence[str] = ()) -> list[dict[str, str]]:
+        """The rows of a policy at a speed."""
+        return [
+            row
+            for row in self.rows
+            if (row["policy"], row["speed"]) == entry
+            and (not scenarios or row["scenario"] in scenarios)
+        ]
+
+    def description(self) -> str:
+        """How it was flown, as lines of a page."""
+        about = self.about
+        seeds = describe_seeds(about["split"], about["seeds"]).capitalize()
+        program = about["program"]["splatpilot"]
+        command = about["command"].replace(" --scenarios", " \\\n    --scenarios")
+        return (
+            f"{seeds}, {len(self.scenarios)} scenarios, flown on {about['date']} by program "
+            f"`{program[:7]}{program[40:]}` on {about['machine']}:\n\n"
+            f"```\n{command}\n```\n"
+        )
+
+
+def total(rows: list[dict[str, str]], column: str) -> int:
+    return sum(int(row[column]) for row in rows)
+
+
+def mean(rows: list[dict[str, str]], column: str) -> float:
+    """The mean over flights of which the column has the sums."""
+    flown = total(rows, "flights") - total(rows, "infeasible")
+    return sum(float(row[column]) for row in rows) / flown if flown else float("nan")
+
+
+def percent(interval: Interval) -> str:
+    return f"{interval.lower:.0%} to {interval.upper:.0%}"
+
+
+def table(header: list[str], lines: list[list[str]]) -> str:
+    return "\n".join(
+        "| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *lines]
+    )
+
+
+def label(entry: tuple[str, str]) -> str:
+    return f"`{entry[0]}`, {float(entry[1]):g} m/s"
+
+
+def policies(results: Results) -> str:
+    header = ["policy", "success", "these scenarios", "new scenarios", "P01 to P12"]
+    header += ["scenarios passed", "clearance [m]", "velocity [m/s]"]
+    header += ["collision, timeout, left, infeasible"]
+    lines = []
+    for entry in results.entries:
+        rows = results.select(entry)
+        flights, successes = total(rows, "flights"), total(rows, "successes")
+        counts = [(int(row["successes"]), int(row["flights"])) for row in rows]
+        generated = [row for row in rows if row["scenario"].startswith("P")]
+        lines.append(
+            [
+                label(entry),
+                f"{successes}/{flights} ({successes / flights:.0%})",
+                percent(wilson_interval(successes, flights)),
+                percent(cluster_interval([k for k, _ in counts], [n for _, n in counts])),
+                f"{total(generated, 'successes')}/{total(generated, 'flights')}",
+                f"{sum(2 * k > n for k, n in counts)}/{len(rows)}",
+                f"{mean(rows, 'clearance_sum_m'):+.2f}",
+                f"{mean(rows, 'speed_sum_m_s'):.2f}",
+                ", ".join(str(total(rows, outcome)) for outcome in _OUTCOMES),
+            ]
+        )
+    return results.description() + "\n" + table(header, lines)
+
+
+def scenarios(results: Results) -> str:
+    header = ["scenario", *map(label, results.entries)]
+    lines = []
+    for name in results.scenarios:
+        cells = [results.select(entry, [name])[0] for entry in results.entries]
+        lines.append([name, *(f"{cell['successes']}/{cell['flights']}" for cell in cells)])
+    return table(header, lines)
+
+
+def pairs(results: Results) -> str:
+    def rates(entry: tuple[str, str]) -> np.ndarray:
+        return np.array([int(r["successes"]) / int(r["flights"]) for r in results.select(entry)])
+
+    compared = list(combinations(results.entries, 2))
+    differences = [rates(first) - rates(second) for first, second in compared]
+    p_values = holm([sign_flip(d) for d in differences])
+    header = ["policies", "difference of success", "scenarios better, worse", "p"]
+    lines = [
+        [
+            f"{label(first)}; {label(second)}",
+            f"{d.mean():+.0%}",
+            f"{np.sum(d > 0)}, {np.sum(d < 0)}",
+            f"{p:.3f}" if p >= 0.001 else f"{p:.0e}",
+        ]
+        for (first, second), d, p in zip(compared, differences, p_values, strict=True)
+    ]
+    return table(header, lines)
+
+
+def paper(results: Results) -> str:
+    missing = sorted(set(benchmark_scenarios()) - set(results.scenarios))
+    if missing:
+        return (
+            f"This study did not fly {', '.join(missing)}, so it is not set beside the paper's "
+            "Table I."
+        )
+    header = ["policy", "method in the paper", "paper: passed, clearance, velocity"]
+    header += ["here: passed, clearance, velocity"]
+    lines = []
+    for entry in results.entries:
+        if entry[0] not in PAPER:
+            continue
+        rows, theirs = results.select(entry), PAPER[entry[0]]
+        passed = sum(2 * int(row["successes"]) > int(row["flights"]) for row in rows)
+        lines.append(
+            [
+                label(entry),
+                theirs.method,
+                f"{theirs.successes}/{PAPER_FLIGHTS}, {theirs.min_clearance_m:+.2f} m, "
+                f"{theirs.mean_speed_m_s:.2f} m/s",
+                f"{passed}/{len(rows)}, {mean(rows, 'clearance_sum_m'):+.2f} m, "
+                f"{mean(rows, 'speed_sum_m_s'):.2f} m/s",
+            ]
+        )
+    return table(header, lines)
+
+
+KINDS: dict[str, Callable[[Results], str]] = {
+    "policies": policies,
+    "scenarios": scenarios,
+    "pairs": pairs,
+    "paper": paper,
+}
+
+
+def with_tables(text: str) -> str:
+    """The text of a page, its tables as the results have them."""
+
+    def written(found: re.Match) -> str:
+        begin, kind, name, end = found.groups()
+        return f"{begin}\n{KINDS[kind](Results.read(name))}\n\n{end}"
+
+    return TABLE.sub(written, text)
+
+
+def write() -> None:
+    """Writes the tables of all pages."""
+    for page in PAGES:
+        page.write_text(with_tables(page.read_text()))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    verbs.add_parser("write", help=write.__doc__)
+    kept = verbs.add_parser("keep", help=keep.__doc__)
+    kept.add_argument("study", type=Path)
+    kept.add_argument("name")
+    options = vars(parser.parse_args())
+    {"keep": keep, "write": write}[options.pop("verb")](**options)

@@ -1,0 +1,51 @@
+"""Results that pages are rendered from, kept from the folder of a study."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from splatpilot.analysis.benchmark.statistics import Interval
+
+SCRIPT = Path(__file__).parents[3] / "docs" / "results.py"
+PAGE = "Before.\n<!-- table {} small -->\nan older table\n<!-- end of table -->\nAfter.\n"
+
+
+@pytest.fixture
+def results(study, tmp_path, monkeypatch):
+    """The script, with the results of the small study."""
+    spec = importlib.util.spec_from_file_location("results", SCRIPT)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "RESULTS", tmp_path)
+    module.keep(study[1], "small")
+    return module
+
+
+def test_kept_results_agree_with_the_table_of_the_study(study, results, rows_of):
+    kept = results.Results.read("small")
+    assert kept.scenarios == ["short"] and len(kept.entries) == 2
+    for entry, row in zip(kept.entries, rows_of(study[1] / "table.csv"), strict=True):
+        rows = kept.select(entry)
+        assert results.total(rows, "flights") == int(row["flights"])
+        assert results.total(rows, "successes") == int(row["successes"])
+        mean = results.mean(rows, "clearance_sum_m")
+        assert mean == pytest.approx(float(row["min_clearance_m"]), abs=1e-4)
+    assert kept.about["split"] == "dev" and kept.about["program"]["numpy"]
+    assert kept.about["command"].startswith("splatpilot benchmark --split dev --seeds 3")
+
+
+def test_tables_of_a_page_are_written_between_their_markers(results):
+    page = results.with_tables(PAGE.format("policies"))
+    assert page.startswith("Before.\n<!-- table policies small -->\n\nDevelopment seeds 0 to 2")
+    assert page.endswith("<!-- end of table -->\nAfter.\n") and "older" not in page
+    interval = results.wilson_interval(0, 3)
+    assert isinstance(interval, Interval) and results.percent(interval) in page
+    assert results.with_tables(page) == page
+    assert "| short | 0/3 | 0/3 |" in results.with_tables(PAGE.format("scenarios"))
+
+
+def test_paper_is_not_compared_with_fewer_scenarios(results):
+    page = results.with_tables(PAGE.format("paper"))
+    assert "did not fly P01" in page and "DiffAero" not in page
