@@ -46,7 +46,7 @@ def read_splats(path: str | Path) -> GaussianScene:
     if not start:
         raise ValueError(f"{path}: the file is empty; copy it again")
     if start.startswith(b"ply"):
-        return read_ply(path)
+        return read_ply(path, recenter=True)
     if start.startswith((_GZIP, MAGIC)):
         return read_spz(path)
     suffix = path.suffix.lower()
