@@ -58,7 +58,7 @@ def _check(options: argparse.Namespace) -> Any:
 
     config = load_config(_check_defaults(options), overrides=options.overrides)
     report = check.run(capture=options.capture, config=config)
-    if not report.agrees:
+    if report.mistake:
         raise FailureWithResultError(f"{options.capture}: {report.mistake}", report)
     return report
 
