@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -34,7 +34,7 @@ class GaussianScene:
     scales: NDArray[np.float32]  # (N, 3) [m], standard deviations along the principal axes
     opacities: NDArray[np.float32]  # (N,) in (0, 1]
     sh: NDArray[np.float32]  # (N, K, 3), K in {1, 4, 9, 16}: coefficients of red, green, blue
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), kw_only=True)
     """[m], position of the frame's origin in that of the file, whose Gaussians are far from 0."""
 
     def __post_init__(self):
@@ -155,7 +155,7 @@ class GaussianScene:
         scale = np.float32(factor)
         means, scales = self.means * scale, self.scales * scale
         origin = _vector(factor * np.array(self.origin))
-        return GaussianScene(means, self.quats, scales, self.opacities, self.sh, origin)
+        return GaussianScene(means, self.quats, scales, self.opacities, self.sh, origin=origin)
 
     def merged_with(
         self, other: GaussianScene, X_WO: RigidTransform | None = None

@@ -63,5 +63,4 @@ def sound_gaussians(
     if damaged:
         _log.warning("%s: %d of %d Gaussians are damaged and left out", path, damaged, len(sound))
         arrays = [a[sound] for a in arrays]
-    means, quats, scales, opacities, sh = arrays
-    return GaussianScene(means, quats, scales, opacities, sh, origin)
+    return GaussianScene(*arrays, origin=origin)

@@ -197,7 +197,7 @@ def _lens(
             fy = float(values.get("fl_y", fx))
             cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
         listed = dict(zip(_DISTORTION, values.get("distortion_params") or (), strict=False))
-        distortion = tuple(float(listed.get(k, values.get(k, 0.0))) for k in _DISTORTION)
+        distortion = tuple(float({**values, **listed}.get(k, 0.0)) for k in _DISTORTION)
         if not np.abs(distortion).max(initial=0.0) <= _MAX_DISTORTION:
             raise ValueError(f"a distortion of {distortion} is none of a lens")
         radius = float(values.get("fisheye_crop_radius") or np.inf) if model == _FISHEYE else np.inf

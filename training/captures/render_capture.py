@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from tqdm import tqdm
@@ -15,16 +14,15 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.diagrams.worlds.gltf import write_gltf
 from splatpilot.diagrams.worlds.make_world import is_procedural, make_blueprint
-from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.output_folders import held_folder
-from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.drawn_mesh import drawn_mesh
 from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.captures.tartanair import AXES
@@ -52,7 +50,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     interruption, it goes on from there. A capture that is there already is left as it is.
 
     Args:
-        world: a mesh (.gltf or .obj), or a scenario whose world is procedural, one of the
+        world: a mesh (.gltf, .glb or .obj), or a scenario whose world is procedural, one of the
             benchmark's ("P02") or a file (.yaml): that world is exported, with what `seed` draws,
             as `world.gltf` into the capture.
 
@@ -148,29 +146,19 @@ def intrinsics(width: int, height: int) -> NDArray[np.float64]:
 def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     """Returns the distance to the surface of a mesh, from points sampled on it.
 
+    Where textures cut holes there is no surface.
+
     Raises:
         ValueError: if the file cannot be read or holds no surface.
     """
-    try:
-        surface = trimesh.load(mesh, force="mesh")
-        area = surface.area if isinstance(surface, trimesh.Trimesh) else 0.0
-    except Exception as error:  # whatever its reader meets in a damaged file
-        raise ValueError(
-            f"{mesh}: not a readable mesh ({reason_of(error)}); export it again"
-        ) from error
-    if not isinstance(surface, trimesh.Trimesh) or not 0 < area < np.inf:
+    with drawn_mesh(mesh, up) as drawn:
+        p_WQ = drawn.sample(_SAMPLES_PER_VOXEL_FACE / voxel_size**2)
+    if not len(p_WQ):
         raise ValueError(f"{mesh}: holds no surface; export it again")
-    count = int(_SAMPLES_PER_VOXEL_FACE * area / voxel_size**2) + 1
-    require_readable_size(mesh, 64.0 * count)
-    lower, upper = surface.bounds
     try:
-        grid_shape(lower - voxel_size, upper + voxel_size, voxel_size)
+        grid_shape(p_WQ.min(axis=0) - voxel_size, p_WQ.max(axis=0) + voxel_size, voxel_size)
     except ValueError as error:
         raise ValueError(f"{mesh}: {error}") from None
-    samples = trimesh.sample.sample_surface(surface, count, seed=0)[0]
-    p_WQ = np.asarray(samples, dtype=np.float64)
-    if up == "y":
-        p_WQ = p_WQ @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     lower_W = p_WQ.min(axis=0) - voxel_size
     shape = np.ceil((p_WQ.max(axis=0) + voxel_size - lower_W) / voxel_size).astype(int)
     occupied = np.zeros(shape, dtype=bool)

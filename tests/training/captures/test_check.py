@@ -73,7 +73,8 @@ def misread_quaternion(X: RigidTransform) -> RigidTransform:
 def test_sound_capture_agrees(room):
     """Exact depth agrees to a fraction of a pixel's slope, and nothing fits better by half."""
     report = check_capture(room())
-    assert report.agrees and report.agreement.error < 0.005 and report.agreement.inside > 0.5
+    assert report.agrees and report.agreement is not None
+    assert report.agreement.error < 0.005 and report.agreement.inside > 0.5
     assert report.color is not None and report.color.cost < 0.1
     assert str(report).endswith("agrees") and "as it was read" in str(report)
 
@@ -253,5 +254,5 @@ def test_real_captures(name, overrides, error, mistake):
     """The real captures agree, and redkitchen read as registered is found out, with its numbers."""
     config = load_config(CaptureConfig(), overrides=overrides)
     report = check_capture(read_capture(Path(os.environ["SPLATPILOT_DATA"]) / name, config))
-    assert error[0] < report.agreement.error < error[1]
+    assert report.agreement is not None and error[0] < report.agreement.error < error[1]
     assert re.search(mistake, report.mistake) if mistake else report.agrees

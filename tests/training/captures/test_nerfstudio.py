@@ -159,9 +159,9 @@ def test_pixels_are_invalid_where_alpha_is_less_than_a_half(write):
 
 def test_pixels_interpolated_from_masked_ones_are_invalid(write):
     path = write(camera_model="OPENCV", k1=-0.2)
+    image = np.full((48, 64, 3), 100, np.uint8)
+    image[20:28, 24:40] = 255
     for i in range(10):
-        image = np.full((48, 64, 3), 100, np.uint8)
-        image[20:28, 24:40] = 255
         cv2.imwrite(str(path / f"{i:02d}.png"), image)
     cv2.imwrite(str(path / "mask.png"), np.uint8(image[..., 0] == 100))
     masks = {f"frame_{i}": {"mask_path": "mask.png"} for i in range(10)}

@@ -146,12 +146,14 @@ def test_distance_to_a_mesh(room):
 
 def test_bad_input_is_named(room, tmp_path, capsys):
     """Each mistake ends with status 1, one message that says what is wrong, and no capture."""
-    (tmp_path / "world.glb").write_bytes(b"x")
+    (tmp_path / "world.stl").write_bytes(b"x")
+    (tmp_path / "damaged.glb").write_bytes(b"x")
     (tmp_path / "damaged.gltf").write_text("{")
     out = tmp_path / "capture"
     for world, options, message in (
         (tmp_path / "no.gltf", [], "no such file"),
-        (tmp_path / "world.glb", [], "not .glb"),
+        (tmp_path / "world.stl", [], "a mesh must be one of .gltf, .glb, .obj"),
+        (tmp_path / "damaged.glb", [], "damaged.glb: not a readable mesh"),
         (tmp_path / "damaged.gltf", [], "damaged.gltf"),
         (room, ["--path", "1,2"], "finite points"),
         (room, ["--path", "a b"], "separated by spaces"),
