@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from splatpilot.systems.read_limit import require_readable_size
@@ -110,7 +109,16 @@ class CutOuts:
     materials: Sequence[CutMaterial]
 
     @cached_property
-    def _scene(self) -> EmbreeScene:
+    def _scene(self) -> Any:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                "textures that cut holes need embreex, of which there is no wheel for this "
+                "processor; render the capture on another machine",
+                name="embreex",
+            ) from None
         scene = EmbreeScene()
         TriangleMesh(scene, self.triangles.astype(np.float32))
         return scene

@@ -205,7 +205,7 @@ def open_frames(
 
 
 def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) -> list[str]:
-    """What is said of all captures: their intrinsics, and which of their pixels are not used."""
+    """Returns what is noted of every capture: its intrinsics, and which pixels are not used."""
     notes = [f"intrinsics: {lenses[0]}"]
     if len(lenses) > 1:
         notes[0] += f", and {len(lenses) - 1} more cameras"

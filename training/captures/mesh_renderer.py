@@ -106,7 +106,7 @@ class MeshRenderer:
 def check_mesh(mesh: Path, up: str) -> None:
     """Raises what `MeshRenderer` says about its arguments before it reads the file."""
     if not mesh.is_file():
-        raise FileNotFoundError(f"{mesh}: there is no such file; one of {', '.join(SUFFIXES)} is")
+        raise FileNotFoundError(f"No such file: {mesh}")
     if mesh.suffix not in SUFFIXES:
         raise ValueError(f"{mesh}: a mesh must be one of {', '.join(SUFFIXES)}; export it as .glb")
     if up not in ("y", "z"):

@@ -28,6 +28,8 @@ from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.captures.tartanair import AXES
 
 RECIPE = "world.yaml"
+_VERSION = 2
+"""Of how meshes are drawn."""
 _SAMPLES_PER_VOXEL_FACE = 8
 
 
@@ -41,6 +43,8 @@ class RenderedWorld:
     origin: str = ""
     # How the capture was rendered.
     config: RenderConfig = field(default_factory=RenderConfig)
+    # Of how meshes were drawn; 1 where nothing is said.
+    version: int = 1
 
 
 def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
@@ -76,10 +80,10 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
                 "needed"
             )
         blueprint = make_blueprint(scenario.world, seed)
-        recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config)
+        recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config, _VERSION)
     else:
         check_mesh(world, config.up)
-        recipe = RenderedWorld(str(world), world.name, config)
+        recipe = RenderedWorld(str(world), world.name, config, _VERSION)
     text = dump_config(recipe)
     if _is_same(out, text):
         print(f"{out}: is rendered already")
@@ -131,6 +135,10 @@ def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | Non
     if not file.is_file():
         return None
     recipe = load_config(RenderedWorld(), file)
+    if recipe.version != _VERSION:
+        raise ValueError(
+            f"{file}: version must be {_VERSION}, got {recipe.version}; render it again"
+        )
     config = recipe.config
     config.validate()
     renderer = _renderer(capture / recipe.mesh, config)
