@@ -204,7 +204,7 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
     rows: list[list[Panel | None]] = [[Panel(truth)], [None], [true_depth], [None]]
     for arm, views in scenes:
         view, found = views.render(frame), arms[arm.key].frames[i]
-        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting)
+        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
         error = np.abs(view.depth - np.where(known, frame.depth, 0))
         mask = floaters(view.depth, frame.depth)
         fraction, mae = found.floater_fraction or 0.0, found.depth_mae_m or 0.0
