@@ -101,6 +101,8 @@ def _scene(path: Path) -> ShownPlace:
         images = _images_of(read_capture_of(path, metadata))
     except (ValueError, OSError, ModuleNotFoundError) as error:
         notes.append(f"Captured images are not shown: {error}.")
+    if any(metadata.origin):
+        notes.append(_relative(metadata.origin))
     if not metadata.metric:
         notes.append("Its unit of length is unknown. Measure what you know the length of.")
     ends = (world.p_WS, world.p_WG) if metadata.metric else None
@@ -121,7 +123,9 @@ def _gaussians(path: Path) -> ShownPlace:
     except ValueError as error:
         gaussians = read_splats(path)
         lower_W, upper_W = _bounds(gaussians.means)
-        notes = (f"Without distances, start and goal: {error}.",)
+        notes = [f"Without distances, start and goal: {error}."]
+        if any(gaussians.origin):
+            notes.append(_relative(gaussians.origin))
         return ShownPlace(
             path.stem,
             gaussians,
@@ -132,7 +136,14 @@ def _gaussians(path: Path) -> ShownPlace:
             legend=[_BOUNDS],
             notes=notes,
         )
-    return _place_of(world, world.name, (world.p_WS, world.p_WG))
+    place = _place_of(world, world.name, (world.p_WS, world.p_WG))
+    if any(world.gaussians.origin):
+        place = replace(place, notes=[_relative(world.gaussians.origin)])
+    return place
+
+
+def _relative(origin: Sequence[float]) -> str:
+    return f"Positions are relative to {', '.join(f'{x:.10g}' for x in origin)} of the files."
 
 
 def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
@@ -146,6 +157,7 @@ def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
     images = _images_of(capture)
     lower_W, upper_W = _bounds(gaussians.means)
     notes = ["Points as they were captured; `splatpilot reconstruct` makes surfaces of them."]
+    notes += [f"{note[0].upper()}{note[1:]}." for note in capture.notes]
     if not capture.metric:
         notes.append("Its unit of length is unknown; it is told by capture.scale.")
     return ShownPlace(

@@ -33,8 +33,9 @@ def _add_check(actions: argparse._SubParsersAction) -> None:
         "check",
         _check,
         help="tell whether poses, intrinsics and depth of a capture agree",
-        description="Carries depth from frame to frame and compares. Where it does not agree, "
-        "tries the usual mistakes, names the most likely one, and ends with status 1.",
+        description="Carries depth from frame to frame and compares. If it does not agree, tries "
+        "the usual mistakes, names the most likely one, and ends with status 1. Without depth, "
+        "tells what was read or registered.",
         examples=(
             "capture check data/hospital",
             "capture check data/office --set capture.depth_unit=5000 --json",
@@ -58,7 +59,7 @@ def _check(options: argparse.Namespace) -> Any:
 
     config = load_config(_check_defaults(options), overrides=options.overrides)
     report = check.run(capture=options.capture, config=config)
-    if not report.agrees:
+    if report.mistake:
         raise FailureWithResultError(f"{options.capture}: {report.mistake}", report)
     return report
 
@@ -77,7 +78,9 @@ def _add_render(actions: argparse._SubParsersAction) -> None:
         ),
     )
     render.add_argument(
-        "world", type=Path, help=".gltf or .obj, or a scenario of a generated world: P01 or a file"
+        "world",
+        type=Path,
+        help=".glb, .gltf or .obj, or a scenario of a generated world: P01 or a file",
     )
     render.add_argument("--out", type=Path, required=True, help="capture folder to write")
     render.add_argument(
@@ -95,7 +98,7 @@ def _render_defaults(options: argparse.Namespace) -> Any:
 
 
 def _render(options: argparse.Namespace) -> None:
-    check_place(options.world, "a .gltf, an .obj or a scenario")
+    check_place(options.world, "a .glb, .gltf, .obj or a scenario")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import render_capture
 

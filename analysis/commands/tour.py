@@ -24,7 +24,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         ),
     )
     tour.add_argument(
-        "world", type=Path, help=".gltf or .obj, or a scenario of a generated world: P01 or a file"
+        "world",
+        type=Path,
+        help=".glb, .gltf or .obj, or a scenario of a generated world: P01 or a file",
     )
     tour.add_argument("--out", type=Path, required=True, help="folder for capture, scene, flight")
     tour.add_argument("--scene", type=Path, help="scene folder to write (default: OUT/scene)")
@@ -42,7 +44,7 @@ def _defaults(options: argparse.Namespace) -> Any:
 
 
 def _tour(options: argparse.Namespace) -> None:
-    check_place(options.world, "a .gltf, an .obj or a scenario")
+    check_place(options.world, "a .glb, .gltf, .obj or a scenario")
     from splatpilot.analysis import tour
     from splatpilot.systems.configuration import load_config
 

@@ -78,7 +78,7 @@ def write_views(
     for k in picked:
         frame, view = frames[k], views.render(frames[k])
         truth = frame.image / 255
-        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting)
+        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
         _, depth, error = depth_panels(frame, view, samples[k].depth_mae_m, depths, errors)
         panels = (Panel(truth), Panel(image, f"{samples[k].psnr_db:.1f} dB"), depth, error)
         for row, panel in zip(rows, panels, strict=True):

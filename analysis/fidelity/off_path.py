@@ -41,6 +41,8 @@ def drop_frames(capture: Capture, withheld: Sequence[int]) -> Capture:
         X_WCs=[capture.X_WCs[i] for i in kept],
         load_image=lambda k: capture.load_image(kept[k]),
         load_depth=(lambda k: capture.load_depth(kept[k])) if capture.has_depth else no_depth,
+        load_valid=lambda k: capture.load_valid(kept[k]),
+        held_out=None,
         frame_names=[capture.frame_names[i] for i in kept] if capture.frame_names else (),
         folder="",
     )

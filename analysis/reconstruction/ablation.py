@@ -35,8 +35,8 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
-from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.initialization import MOST_STEPS
+from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
+from splatpilot.training.reconstruction.initialization import MOST_STEPS, held_out_frames
 from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 from splatpilot.training.reconstruction.triangulation import triangulate
@@ -142,7 +142,8 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
             seen = capture
             if not arm.depth:
                 if points is None:
-                    fitted = [i for i in range(len(capture)) if i % config.hold_out]
+                    held_out = held_out_frames(capture, config)
+                    fitted = [i for i in range(len(capture)) if i not in held_out]
                     points = triangulate(capture, fitted)
                 seen = replace(capture, points=points)
             reconstruct(seen, scene, arm_config(arm, config))
@@ -154,10 +155,13 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
 
 def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) -> None:
     heading, *rows = result.table()
+    held_out = f"Every {config.hold_out}th frame"
+    if config.hold_out < 0:
+        held_out = f"Frames that the files hold out, or every {HOLD_OUT}th,"
     lines = [
         "# Reconstruction recipe ablation",
         "",
-        f"Every {config.hold_out}th frame held out; {config.iterations} steps; images "
+        f"{held_out} held out; {config.iterations} steps; images "
         f"{config.image_width or 'of full'} px wide. The paper's figures are of another scene (its "
         "LPIPS of another network), for the order of the arms.",
         "",
@@ -200,7 +204,7 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
     rows: list[list[Panel | None]] = [[Panel(truth)], [None], [true_depth], [None]]
     for arm, views in scenes:
         view, found = views.render(frame), arms[arm.key].frames[i]
-        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting)
+        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
         error = np.abs(view.depth - np.where(known, frame.depth, 0))
         mask = floaters(view.depth, frame.depth)
         fraction, mae = found.floater_fraction or 0.0, found.depth_mae_m or 0.0

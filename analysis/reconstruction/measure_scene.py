@@ -95,7 +95,8 @@ def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None
     rows = []
     for i, frame, view in zip(picked, frames, seen, strict=True):
         found = measures.frames[i]
-        image, _ = fit_exposure(view.color, frame.image / 255, views.metadata.vignetting)
+        vignetting = views.metadata.vignetting
+        image, _ = fit_exposure(view.color, frame.image / 255, vignetting, frame.valid)
         row = [Panel(frame.image / 255), Panel(image, f"{found.psnr_db:.1f} dB")]
         rows.append(row + depth_panels(frame, view, found.depth_mae_m, depths, errors))
     columns = ["captured", "scene", "captured depth", "depth of the scene", "depth error"]

@@ -146,6 +146,8 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         representation=metadata.representation,
         capture=about.capture,
         capture_settings=about.capture_settings,
+        capture_notes=about.capture_notes,
+        origin=about.origin,
         held_out=about.held_out,
         image_width=about.image_width,
         split=metadata.split,
@@ -161,6 +163,7 @@ def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadat
     The settings with which the capture is opened again give its poses the same scale. Where they
     cannot, because its metres are those of measured depth, the scene names no capture any more.
     """
+    metadata = replace(metadata, origin=[factor * x for x in metadata.origin])
     if not metadata.capture:
         return metadata, ()
     config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
@@ -172,7 +175,13 @@ def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadat
             setattr(config.scale, name, factor * getattr(given, name))
     else:
         forgotten = replace(
-            metadata, capture="", capture_settings=[], held_out=[], gains=[], image_width=0
+            metadata,
+            capture="",
+            capture_settings=[],
+            capture_notes=[],
+            held_out=[],
+            gains=[],
+            image_width=0,
         )
         warning = (
             f"{metadata.capture} has metres of its own: the scaled scene is not compared to it"

@@ -36,6 +36,7 @@ class FileSummary:
     gaussians: int
     factor: float
     size: NDArray[np.float64]  # (3,) [m], of the box of nearly all Gaussians
+    origin: tuple[float, float, float]  # [m], of the written file in the other, scaled and turned
 
     def __str__(self) -> str:
         rows = {
@@ -44,6 +45,8 @@ class FileSummary:
             "factor": f"{self.factor:.6g}",
             "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
         }
+        if any(self.origin):
+            rows["relative to [m]"] = ", ".join(f"{x:.10g}" for x in self.origin)
         return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
 
 
@@ -79,7 +82,7 @@ def rescale_file(
     gaussians = read_splats(file).transformed_by(X_WF).scaled_by(factor)
     write_ply(gaussians, out)
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
-    return FileSummary(out, len(gaussians), factor, upper_W - lower_W)
+    return FileSummary(out, len(gaussians), factor, upper_W - lower_W, gaussians.origin)
 
 
 def _upright(up: str, floor: Sequence[ArrayLike]) -> RigidTransform:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.scene_metadata import (
     ENVIRONMENT,
@@ -131,6 +132,8 @@ def write_scene_folder(
     representation: str = "3dgs",
     capture: str = "",
     capture_settings: Sequence[str] = (),
+    capture_notes: Sequence[str] = (),
+    origin: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
     held_out: Sequence[int] = (),
     image_width: int = 0,
     split: str = "",
@@ -167,6 +170,8 @@ def write_scene_folder(
         representation=representation,
         capture=capture,
         capture_settings=list(capture_settings),
+        capture_notes=list(capture_notes),
+        origin=[float(x) for x in origin],
         held_out=[int(frame) for frame in held_out],
         image_width=image_width,
     )

@@ -37,6 +37,9 @@ class SceneMetadata:
     world_frame: str = WORLD_FRAME
     metric: bool = True
     """Whether the unit of length is the metre."""
+    origin: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """[m], position of the scene's origin in the world of the capture's files, upright and in
+    meters; all positions of the scene are relative to it."""
     lower_W: list[float] = field(default_factory=list)
     """[m], lower corner of the distance field."""
     upper_W: list[float] = field(default_factory=list)
@@ -65,6 +68,8 @@ class SceneMetadata:
     capture_settings: list[str] = field(default_factory=list)
     """What was set about the capture when it was read, "depth_unit=5000.0" for example; without it
     the folder would be read otherwise."""
+    capture_notes: list[str] = field(default_factory=list)
+    """What was assumed or not used when the capture was read, and where intrinsics come from."""
     held_out: list[int] = field(default_factory=list)
     """Frames of the capture that had no part in making the scene."""
     image_width: int = 0
@@ -101,7 +106,7 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
             f"{file}: format version {metadata.format_version}, this program knows "
             f"{FORMAT_VERSION}; use the version of the program that wrote the scene"
         )
-    for name in ("lower_W", "upper_W", "background", "p_WS", "p_WG"):
+    for name in ("origin", "lower_W", "upper_W", "background", "p_WS", "p_WG"):
         value = getattr(metadata, name)
         if len(value) != 3 or not np.isfinite(value).all():
             raise ValueError(f"{file}: {name} is {value}, three finite numbers are needed")

@@ -26,12 +26,13 @@ def is_compressed(ply: PlyData) -> bool:
     return "vertex" in ply and _PACKED[0] in {p.name for p in ply["vertex"].properties}
 
 
-def unpack(path: Path, ply: PlyData) -> GaussianScene:
+def unpack(path: Path, ply: PlyData, recenter: bool) -> GaussianScene:
     """The Gaussians of a compressed PLY.
 
     Args:
         path: the file, for messages.
         ply: its elements.
+        recenter: see `sound_gaussians`.
 
     Raises:
         ValueError: if a property is missing or of another kind, rows are missing, or the Gaussians
@@ -65,6 +66,7 @@ def unpack(path: Path, ply: PlyData) -> GaussianScene:
             scales=np.exp(between("_scale", "xyz", _three(scale))),
             opacities=np.maximum(_bits(color, 0, 8), 1e-6),
             sh=sh,
+            recenter=recenter,
         )
 
 

@@ -32,8 +32,10 @@ _THICKNESS = 0.01
 _INVISIBLE_LOGIT = -87.0
 
 
-def read_ply(path: str | Path) -> GaussianScene:
+def read_ply(path: str | Path, recenter: bool = False) -> GaussianScene:
     """Reads the Gaussians in a PLY file: binary of either byte order, or ASCII.
+
+    With `recenter` those that are far from 0 get an origin near them, see `sound_gaussians`.
 
     Surfels, whose files have two scales (2DGS), get a third of `_THICKNESS` times the smaller one;
     what PlayCanvas has compressed is unpacked. A few damaged Gaussians are left out, see
@@ -52,7 +54,7 @@ def read_ply(path: str | Path) -> GaussianScene:
     if "vertex" not in ply:
         raise ValueError(f"{path}: no element 'vertex'; a PLY file with Gaussians is needed")
     if is_compressed(ply):
-        return unpack(path, ply)
+        return unpack(path, ply, recenter)
     vertex = ply["vertex"]
     names = {p.name for p in vertex.properties}
     if missing := [n for n in (*_MEANS, *_DC, *_OPACITY, *_SCALES[:2], *_QUATS) if n not in names]:
@@ -96,6 +98,7 @@ def read_ply(path: str | Path) -> GaussianScene:
             scales=scales,
             opacities=1 / (1 + np.exp(-logits)),
             sh=sh,
+            recenter=recenter,
         )
 
 

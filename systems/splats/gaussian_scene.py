@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +34,8 @@ class GaussianScene:
     scales: NDArray[np.float32]  # (N, 3) [m], standard deviations along the principal axes
     opacities: NDArray[np.float32]  # (N,) in (0, 1]
     sh: NDArray[np.float32]  # (N, K, 3), K in {1, 4, 9, 16}: coefficients of red, green, blue
+    origin: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), kw_only=True)
+    """[m], position of the frame's origin in that of the file, whose Gaussians are far from 0."""
 
     def __post_init__(self):
         shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (-1, 3)}
@@ -145,14 +147,15 @@ class GaussianScene:
             scales=self.scales,
             opacities=self.opacities,
             sh=sh.astype(np.float32),
+            origin=_vector(R_WO @ self.origin),
         )
 
     def scaled_by(self, factor: float) -> GaussianScene:
         """Returns these Gaussians with all lengths from the origin times `factor`."""
         scale = np.float32(factor)
-        return GaussianScene(
-            self.means * scale, self.quats, self.scales * scale, self.opacities, self.sh
-        )
+        means, scales = self.means * scale, self.scales * scale
+        origin = _vector(factor * np.array(self.origin))
+        return GaussianScene(means, self.quats, scales, self.opacities, self.sh, origin=origin)
 
     def merged_with(
         self, other: GaussianScene, X_WO: RigidTransform | None = None
@@ -173,7 +176,12 @@ class GaussianScene:
             np.pad(scene.sh, ((0, 0), (0, K - scene.sh.shape[1]), (0, 0)))
             for scene in (self, other)
         ]
-        return GaussianScene(**merged, sh=np.concatenate(padded))
+        return GaussianScene(**merged, sh=np.concatenate(padded), origin=self.origin)
+
+
+def _vector(p: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = p.tolist()
+    return x, y, z
 
 
 def _refuse(bad: NDArray, name: str, array: NDArray, limit: str, remedy: str) -> None:

@@ -18,7 +18,7 @@ _CONVERT = "convert it to PLY, for example with PlayCanvas's splat-transform"
 # What files begin with, or end their name with, that are taken for Gaussians and are none we read.
 _OTHERS = {
     git_lfs.POINTER: git_lfs.REFUSAL,
-    b"glTF": f"a binary glTF; {_CONVERT}, or render a mesh with `splatpilot render`",
+    b"glTF": f"a binary glTF; {_CONVERT}, or render a mesh with `splatpilot capture render`",
     b"PK": f"an archive; if it is SOG, {_CONVERT}",
     b"<": "a page or an XML file; a link that was saved in place of the file, perhaps",
 }
@@ -46,7 +46,7 @@ def read_splats(path: str | Path) -> GaussianScene:
     if not start:
         raise ValueError(f"{path}: the file is empty; copy it again")
     if start.startswith(b"ply"):
-        return read_ply(path)
+        return read_ply(path, recenter=True)
     if start.startswith((_GZIP, MAGIC)):
         return read_spz(path)
     suffix = path.suffix.lower()

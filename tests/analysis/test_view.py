@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from splatpilot.analysis import shown_place, view
 from splatpilot.analysis.cli import main
@@ -133,6 +134,14 @@ def test_bare_gaussians(place, tmp_path):
     records.tofile(tmp_path / "room.splat")
     data = data_of(view.run(what=str(tmp_path / "room.splat"), out=tmp_path / "c.html"))
     assert data["name"] == "room"
+
+
+def test_page_says_where_the_origin_of_far_gaussians_is(place, tmp_path):
+    path = tmp_path / "room.ply"
+    write_ply(place.gaussians.transformed_by(RigidTransform([5000.0, 0, 0])), path)
+    data = data_of(view.run(what=str(path), out=tmp_path / "a.html"))
+    assert data["grid"] is not None
+    assert any("Positions are relative to 500" in note for note in data["notes"])
 
 
 def test_map(tmp_path, monkeypatch):

@@ -23,6 +23,11 @@ class CaptureFrame:
     depth: NDArray[np.float32]  # (H, W) [m], along the optical axis; 0 unknown, inf beyond range
     X_WC: RigidTransform  # pose of the camera (x right, y down, z forward) in the world
     K: NDArray[np.float64]  # (3, 3) [px], pinhole intrinsics
+    valid: NDArray[np.bool_] = field(default_factory=lambda: _EVERYWHERE)
+    """(H, W), the pixels that are used: no other has depth, is fitted or is measured."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "valid", np.broadcast_to(self.valid, self.depth.shape))
 
     def back_project(self, columns: NDArray, rows: NDArray, depth: NDArray) -> NDArray[np.floating]:
         """Returns the points p_CQ, (..., 3) [m], at image coordinates [px] and depths [m]."""
@@ -66,8 +71,16 @@ OPENGL_AXES = FileAxes(
 )
 
 
+_EVERYWHERE = np.ones((1, 1), dtype=bool)
+
+
 def no_depth(i: int) -> None:
     """The `Capture.load_depth` of a capture without depth."""
+
+
+def all_valid(i: int) -> NDArray[np.bool_]:
+    """The `Capture.load_valid` of a capture whose pixels are all used."""
+    return _EVERYWHERE
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +103,8 @@ class Capture:
     load_depth: Callable[[int], NDArray[np.float32] | None] = no_depth
     """Returns the depth of frame i [m] in the pixels of the camera that measured it, None if that
     frame has none, or raises an error that names the file. 0 is unknown, inf is beyond range."""
+    load_valid: Callable[[int], NDArray[np.bool_]] = all_valid
+    """Returns the pixels of the image of frame i that are used, (height, width) or (1, 1)."""
     depth_camera: DepthCamera | None = None
     """The camera that measured depth; None if depth has the pixels of the images."""
     points: SfmPoints | None = None
@@ -97,9 +112,15 @@ class Capture:
     metric: bool = True
     """Whether lengths are metres; if not, their unit is unknown and nothing can fly there."""
     frame_names: Sequence[str] = ()
-    """What each frame is called where it was read from; empty if only numbers are known."""
+    """Path of each image as the files give it; empty if only numbers are known."""
     dropped: Sequence[str] = ()
     """Why frames were left out, one message each that names the file."""
+    held_out: Sequence[int] | None = None
+    """The frames that the files hold out from training; None if they do not say."""
+    notes: Sequence[str] = ()
+    """What was assumed or not used when the files were read, one sentence each."""
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """(3,) [m], position of W's origin in the world of the files, upright and in metres."""
     axes: FileAxes | None = None
     """The axes of the files, for those who doubt that they were read rightly."""
     folder: str = ""
@@ -116,21 +137,32 @@ class Capture:
         """Whether any frame has depth."""
         return self.load_depth is not no_depth
 
-    def registered_depth(self, i: int) -> NDArray[np.float32]:
-        """Returns the depth (height, width) [m] of frame i in the pixels of its image.
-
-        0 where it is unknown, everywhere if the frame has none.
+    def measured_depth(self, i: int) -> NDArray[np.float32] | None:
+        """Returns what `load_depth` does; 0 in invalid pixels if it has the pixels of the images.
 
         Raises:
             OSError, ValueError: if its file cannot be read or is of another size.
         """
         depth = self.load_depth(i)
+        if depth is None or self.depth_camera is not None:
+            return depth
+        return np.where(self.load_valid(i), depth, np.float32(0))
+
+    def registered_depth(self, i: int) -> NDArray[np.float32]:
+        """Returns the depth (height, width) [m] of frame i in the pixels of its image.
+
+        0 where it is unknown or the pixel is invalid, everywhere if the frame has none.
+
+        Raises:
+            OSError, ValueError: if its file cannot be read or is of another size.
+        """
+        depth, camera = self.measured_depth(i), self.depth_camera
         if depth is None:
             return np.zeros((self.height, self.width), np.float32)
-        if self.depth_camera is None:
+        if camera is None:
             return depth
-        camera = self.depth_camera
-        return register_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
+        depth = register_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
+        return np.where(self.load_valid(i), depth, np.float32(0))
 
     def frame(self, i: int) -> CaptureFrame:
         """Loads frame i, 0 <= i < len(self), with its registered depth.
@@ -141,7 +173,9 @@ class Capture:
         """
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {self.name}: it has the frames 0 to {len(self) - 1}")
-        return CaptureFrame(self.load_image(i), self.registered_depth(i), self.X_WCs[i], self.K)
+        return CaptureFrame(
+            self.load_image(i), self.registered_depth(i), self.X_WCs[i], self.K, self.load_valid(i)
+        )
 
     def frames(self) -> Iterator[CaptureFrame]:
         """Loads one frame after the other."""

@@ -77,6 +77,10 @@ class CaptureConfig:
     images are level on average; `ground`: across the largest plane below the cameras."""
     scale: ScaleConfig = field(default_factory=ScaleConfig)
     """Where metres come from when images alone were registered."""
+    origin: list[float] = field(default_factory=list)
+    """[m] Where the origin of the capture is in the world of its files, once that is upright and in
+    meters; empty: in the middle of cameras that are farther than 1 km from theirs, and there of
+    others."""
     topics: list[str] = field(default_factory=list)
     """Topics of a ROS bag that has several of a kind: of colour, depth and poses, in this order."""
     refine_poses: bool = False
@@ -93,7 +97,7 @@ class CaptureConfig:
 
     def validate(self) -> None:
         """Raises ValueError for values that make no sense."""
-        for name, size in (("intrinsics", 4), ("depth_intrinsics", 4), ("p_DC", 3)):
+        for name, size in (("intrinsics", 4), ("depth_intrinsics", 4), ("p_DC", 3), ("origin", 3)):
             values = getattr(self, name)
             if values and (len(values) != size or not np.isfinite(values).all()):
                 raise ValueError(f"capture.{name} is {values}; {size} finite numbers are needed")

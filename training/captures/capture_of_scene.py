@@ -26,4 +26,5 @@ def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
         config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
     except ValueError as error:
         raise ValueError(f"{file}: capture_settings: {error}") from None
+    config.origin = metadata.origin
     return read_capture(metadata.capture, config)

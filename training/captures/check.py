@@ -1,10 +1,10 @@
 """Whether poses, intrinsics and depth of a capture agree, and if not, which mistake explains it.
 
 The capture as it was read and readings with one known mistake each are measured on the same pairs
-of frames, see `frame_agreement`.
+of frames, see `frame_agreement`. Of a capture without depth only what was read is reported.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatpilot.training.captures.capture import Capture
@@ -36,32 +36,40 @@ class CheckReport:
     capture: str
     frames: int
     dropped: tuple[str, ...]
-    pairs: int
-    agreement: ReadingFit
-    others: tuple[ReadingFit, ...]
+    notes: tuple[str, ...]
+    metric: bool
+    pairs: int = 0
+    agreement: ReadingFit | None = None
+    """None if there is no depth to compare."""
+    others: tuple[ReadingFit, ...] = ()
     """Other readings, the best first."""
-    color: ColorFit | None
-    mistake: str
-    """The most likely mistake in one sentence; empty if the capture agrees."""
+    color: ColorFit | None = None
+    mistake: str = ""
+    """The most likely mistake in one sentence; empty if none was found."""
 
     @property
     def agrees(self) -> bool:
-        """Whether poses, intrinsics and depth agree."""
-        return not self.mistake
+        """Whether poses, intrinsics and depth were compared, and agree."""
+        return self.agreement is not None and not self.mistake
 
     def __str__(self) -> str:
         lines = [
             f"{self.capture}",
             f"{self.frames} frames, {len(self.dropped)} left out, {self.pairs} pairs compared",
             *(f"  left out: {message}" for message in self.dropped[:10]),
-            f"{'median error':>12}  {'overlap':>7}  reading",
-            *(
-                f"{each.error:12.2%}  {each.inside:7.0%}  {each.name}"
-                for each in (self.agreement, *self.others[:12])
-            ),
+            *self.notes,
+        ]
+        if not self.metric:
+            lines.append("the scale is unknown; capture.scale gives it, if flights are to be flown")
+        if self.agreement is None:
+            return "\n".join([*lines, "not compared: there is no depth"])
+        lines.append(f"{'median error':>12}  {'overlap':>7}  reading")
+        lines += [
+            f"{each.error:12.2%}  {each.inside:7.0%}  {each.name}"
+            for each in (self.agreement, *self.others[:12])
         ]
         if self.color is not None:
-            lines += ["colour against depth, 1 - correlation between frames:", str(self.color)]
+            lines += ["color against depth, 1 - correlation between frames:", str(self.color)]
         lines.append("does not agree" if self.mistake else "agrees")
         return "\n".join(lines)
 
@@ -113,19 +121,23 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     """Measures how well a capture agrees with itself, as it is read and in other readings.
 
     A capture agrees if its median relative error is at most 2 %, no other reading leaves less than
-    half of an error above 0.2 %, and colours follow depth about as well as they can.
+    half of an error above 0.2 %, and colors follow depth about as well as they can.
 
     Args:
         pairs: how many pairs of frames are compared.
 
     Raises:
-        ValueError: if it has no depth, or too little of it to tell.
+        ValueError: if it has depth, but too little of it to tell.
     """
+    report = CheckReport(
+        capture=capture.source,
+        frames=len(capture),
+        dropped=tuple(capture.dropped),
+        notes=tuple(capture.notes),
+        metric=capture.metric,
+    )
     if not capture.has_depth:
-        raise ValueError(
-            f"{capture.source}: no depth, so there is nothing to compare; look at its poses and "
-            "points with `splatpilot view`"
-        )
+        return report
     found = choose_pairs(capture, pairs)
     if sum(len(pair.depth) for pair in found) < _FEWEST:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")
@@ -157,10 +169,8 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     else:
         color = fit_color_camera(capture, [pair.frames for pair in found])
         mistake = color.mistake if color is not None else ""
-    return CheckReport(
-        capture=capture.source,
-        frames=len(capture),
-        dropped=tuple(capture.dropped),
+    return replace(
+        report,
         pairs=len(found),
         agreement=agreement,
         others=tuple(others),

@@ -20,7 +20,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.extras import import_extra
-from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, SfmPoints
+from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, SfmPoints, all_valid
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.colmap_records import check_records
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
@@ -48,6 +48,11 @@ def model_folder(path: Path) -> Path | None:
             if all((path / name / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
                 return path / name
     return None
+
+
+def mask_folder(images: Path) -> Path:
+    """Returns the folder `masks` of images: beside a folder `images`, or inside another."""
+    return images.with_name("masks") if images.name == "images" else images / "masks"
 
 
 def import_pycolmap() -> ModuleType:
@@ -126,6 +131,7 @@ def capture_of_model(
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"{path}, camera {number}: {reason_of(error)}") from None
     depths = path / config.scale.depth_folder if config.scale.depth_folder else None
+    masks = mask_folder(images)
 
     def frame(image: "pycolmap.Image") -> FrameFiles:
         world_to_camera = image.cam_from_world().inverse().matrix()
@@ -138,9 +144,16 @@ def capture_of_model(
             X_FC,
             _depth_file(depths, image.name) if depths is not None else None,
             lenses[image.camera_id],
+            _mask_file(masks, image.name),
+            name=image.name,
         )
 
     registered = [image for image in reconstruction.images.values() if image.has_pose]
+    total = max(len(reconstruction.images), len(registered) + len(dropped))
+    note = f"{len(registered)} of {total} images are registered"
+    if reconstruction.points3D:
+        error = reconstruction.compute_mean_reprojection_error()
+        note += f", with a mean reprojection error of {error:.2f} px"
     capture = open_frames(
         path,
         kind,
@@ -148,6 +161,7 @@ def capture_of_model(
         axes=OPTICAL_AXES,
         read_depth=lambda file: read_depth(file, config.depth_unit or 1000.0),
         dropped=dropped,
+        notes=[note],
     )
     by_name = {image.name: image for image in registered}
 
@@ -163,31 +177,61 @@ def capture_of_model(
             )
         return reconstruction.points3D[seen[int(np.argmin(distance))].point3D_id].xyz
 
-    points = list(reconstruction.points3D.values())
-    points = [point for point in points if (np.abs(point.xyz) < _LARGEST_COORDINATE).all()]
+    points = {
+        number: point
+        for number, point in reconstruction.points3D.items()
+        if (np.abs(point.xyz) < _LARGEST_COORDINATE).all()
+    }
+    if capture.load_valid is not all_valid:
+        points = _shown_points(capture, by_name, points)
     if points:
         capture = dataclasses.replace(
             capture,
             points=SfmPoints(
-                np.array([point.xyz for point in points]),
-                np.array([point.color for point in points]) / 255,
+                np.array([point.xyz for point in points.values()]),
+                np.array([point.color for point in points.values()]) / 255,
             ),
         )
     return turn_upright(make_metric(capture, config.scale, locate), config.up or "cameras")
 
 
+def _shown_points(
+    capture: Capture, images: dict[str, "pycolmap.Image"], points: dict[int, "pycolmap.Point3D"]
+) -> dict[int, "pycolmap.Point3D"]:
+    """Returns the points that at least two images show in valid pixels."""
+    times = dict.fromkeys(points, 0)
+    for i, name in enumerate(capture.frame_names):
+        seen = [point.point3D_id for point in images[name].points2D if point.point3D_id in points]
+        if not seen:
+            continue
+        p_WQ = np.array([points[number].xyz for number in seen])
+        x, y, z = capture.K @ capture.X_WCs[i].inverse().multiply(p_WQ.T)
+        column = (x / z).clip(0, capture.width - 1).astype(int)
+        row = (y / z).clip(0, capture.height - 1).astype(int)
+        for number, valid in zip(seen, capture.load_valid(i)[row, column], strict=True):
+            times[number] += int(valid)
+    return {number: point for number, point in points.items() if times[number] > 1}
+
+
 def _lens(camera: "pycolmap.Camera", config: CaptureConfig) -> Lens:
-    K = pinhole(*config.intrinsics) if config.intrinsics else camera.calibration_matrix()
+    K, source = camera.calibration_matrix(), "the COLMAP model"
+    if config.intrinsics:
+        K, source = pinhole(*config.intrinsics), "capture.intrinsics"
     if config.intrinsics or camera.is_undistorted():
-        return Lens(K, camera.width, camera.height)
+        return Lens(K, camera.width, camera.height, source=source)
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
 
-    return Lens(K, camera.width, camera.height, project)
+    return Lens(K, camera.width, camera.height, project, source=source)
 
 
 def _depth_file(folder: Path, name: str) -> Path | None:
-    stem = folder / Path(name).stem
-    files = (stem.with_name(stem.name + suffix) for suffix in (".npy", ".png"))
+    files = (folder / Path(name).with_suffix(suffix) for suffix in (".npy", ".png"))
     return next((file for file in files if isfile(file)), None)
+
+
+def _mask_file(folder: Path, name: str) -> Path | None:
+    """Returns the mask of an image, which COLMAP lets have the name of a PNG itself."""
+    names = (f"{name}.png", name) if name.lower().endswith(".png") else (f"{name}.png",)
+    return next((folder / each for each in names if isfile(folder / each)), None)

@@ -79,12 +79,14 @@ def choose_pairs(capture: Capture, count: int) -> list[FramePair]:
     R_WF = RigidTransform(axes.R_WF) if axes is not None else RigidTransform()
     R_BC = RigidTransform(axes.R_BC) if axes is not None else RigidTransform()
 
+    X_OW = RigidTransform(capture.origin)
+
     def X_FB(i: int) -> RigidTransform:
-        return R_WF.inverse() @ capture.X_WCs[i] @ X_CD @ R_BC.inverse()
+        return R_WF.inverse() @ X_OW @ capture.X_WCs[i] @ X_CD @ R_BC.inverse()
 
     pairs = []
     for i in np.unique(np.linspace(0, len(capture) - 2, count).astype(int)).tolist():
-        depth = capture.load_depth(i)
+        depth = capture.measured_depth(i)
         if depth is None:
             continue
         step = grid_step(depth, _POINTS)
@@ -96,7 +98,7 @@ def choose_pairs(capture: Capture, count: int) -> list[FramePair]:
         if not known.any():
             continue
         j = _partner(capture, i, float(np.median(z[known])))
-        other = capture.load_depth(j) if j is not None else None
+        other = capture.measured_depth(j) if j is not None else None
         if j is None or other is None:
             continue
         pixels = np.stack([columns[known] + 0.5, rows[known] + 0.5])

@@ -4,59 +4,30 @@ Readers of meshes believe both: a count that is wrong makes them take all memory
 is wrong ends the process.
 """
 
-import base64
-import binascii
-import json
-import urllib.parse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from splatpilot.systems.array_files import reason_of
-from splatpilot.systems.read_limit import require_readable_size
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_POSITION = 1e6  # [m]
 
 
-def check_gltf_claims(path: Path) -> None:
+def check_gltf_claims(document: dict[str, Any], buffers: list[bytes]) -> None:
     """
     Raises:
-        ValueError: for a `.gltf` file that is none, whose accessors are not within their buffers,
-            whose triangles or positions are none, or that is too large; the message names it.
+        ValueError: for a document whose accessors are not within their buffers, or whose triangles
+            or positions are none.
     """
-    require_readable_size(path, 4 * path.stat().st_size)
-    try:
-        _Claims(path).check()
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OSError) as error:
-        raise ValueError(
-            f"{path}: not a readable mesh ({reason_of(error)}); export it again, with everything "
-            "embedded"
-        ) from None
+    _Claims(document, buffers).check()
 
 
 class _Claims:
-    def __init__(self, path: Path) -> None:
-        self._folder = path.parent
-        self._document = json.loads(path.read_bytes())
-        self._buffers = [self._content(buffer) for buffer in self._document["buffers"]]
-
-    def _content(self, buffer: dict[str, Any]) -> bytes:
-        kind, comma, data = buffer["uri"].partition(",")
-        if kind.startswith("data:") and comma:
-            try:
-                content = base64.b64decode(data, validate=True)
-            except binascii.Error as error:
-                raise ValueError(f"a buffer is not base64: {error}") from None
-        else:
-            file = self._folder / urllib.parse.unquote(buffer["uri"])
-            require_readable_size(file, file.stat().st_size)
-            content = file.read_bytes()
-        if _count(buffer["byteLength"]) > len(content):
-            raise ValueError(f"a buffer claims {buffer['byteLength']} bytes of {len(content)}")
-        return content
+    def __init__(self, document: dict[str, Any], buffers: list[bytes]) -> None:
+        self._document, self._buffers = document, buffers
+        for buffer, content in zip(document["buffers"], buffers, strict=True):
+            if _count(buffer["byteLength"]) > len(content):
+                raise ValueError(f"a buffer claims {buffer['byteLength']} bytes of {len(content)}")
 
     def check(self) -> None:
         arrays = [self._array(accessor) for accessor in self._document.get("accessors", [])]

@@ -18,6 +18,7 @@ IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 _DEPTH_IS = "depth is one number a pixel, of integers of more than 8 bits or floats"
 # Pillow's modes of images without depth; four channels may be the bytes of one number.
 _NO_DEPTH = {"1", "L", "P", "LA", "PA", "RGB", "CMYK", "YCbCr"}
+_ALPHA = {"RGBA", "LA", "PA"}
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
 
 
@@ -31,12 +32,20 @@ def image_size(file: Path) -> tuple[int, int]:
     return _image_header(file)[0]
 
 
+def image_layout(file: Path) -> tuple[tuple[int, int], bool]:
+    """Returns what `image_size` does, and whether the image has an alpha channel."""
+    size, mode = _image_header(file)
+    return size, mode in _ALPHA
+
+
 def _image_header(file: Path) -> tuple[tuple[int, int], str]:
     """Its size, and Pillow's name for what its pixels are."""
     _require_content(file)
     try:
         with Image.open(file) as image:
             size, kind, mode = image.size, image.format, image.mode
+            if "transparency" in image.info:  # of one color, or of those of a palette
+                mode = "RGBA"
     except Exception as error:  # Pillow raises anything of damaged files
         raise ValueError(
             f"{file}: not a readable image ({_reason(error)}); copy it again"
@@ -89,6 +98,20 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     # The pixels as they are stored: poses and intrinsics belong to them, not to the turned picture.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     return cv2.cvtColor(_decode(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
+
+
+def read_alpha(file: Path) -> NDArray[np.bool_]:
+    """Returns where the alpha (H, W) of an image is at least a half; everywhere without any."""
+    pixels = _decode(file, cv2.IMREAD_UNCHANGED)
+    if pixels.ndim < 3 or pixels.shape[2] not in (2, 4):
+        return np.ones(pixels.shape[:2], dtype=bool)
+    largest = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    return 2 * pixels[..., -1].astype(float) >= largest
+
+
+def read_mask(file: Path) -> NDArray[np.bool_]:
+    """Returns where a mask (H, W) is not black; raises ValueError if it is unreadable."""
+    return _decode(file, cv2.IMREAD_ANYDEPTH) > 0
 
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:

@@ -32,6 +32,11 @@ def undo_mistakes(as_read: Reading, capture: Capture) -> list[Reading]:
             is_range=True,
         ),
         replace(as_read, name="quaternions are w x y z, read as x y z w", pose=_from_wxyz),
+        replace(
+            as_read,
+            name="rotations are stored column by column, read row by row",
+            pose=lambda X_FB: RigidTransform(X_FB.rotation().inverse(), X_FB.translation()),
+        ),
     ]
     for name, R in _BODIES.items():
         R_BC = RotationMatrix(np.array(R, dtype=float))

@@ -1,7 +1,7 @@
 """Lenses: how a camera bends rays, and the pinhole camera its images are made into."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,10 @@ class Lens:
     height: int  # [px]
     project: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px]; None for a pinhole."""
+    radius: float = np.inf
+    """[px], distance from the center of the image within which it is used."""
+    source: str = "the files"
+    """Where the intrinsics come from, for the record."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for what is no camera."""
@@ -37,11 +41,23 @@ class Lens:
                 f"focal lengths of {focal.tolist()} px; more than 0 and at most {_LONGEST:g} px "
                 "are needed"
             )
-        if not (np.abs(center - size / 2) <= 10 * size).all():
+        if not ((center > 0) & (center < size)).all():
             raise ValueError(
-                f"a principal point of {center.tolist()} px in {self.width}x{self.height} pixels; "
-                "it must be in the image or near it"
+                f"the principal point must be in the image of {self.width}x{self.height} px, got "
+                f"{center.tolist()} px; intrinsics may be those of images of another size: set "
+                "capture.intrinsics"
             )
+
+    def __str__(self) -> str:
+        fx, fy, cx, cy = np.round([*np.diag(self.K)[:2], *self.K[:2, 2]], 2).tolist()
+        size = f"{self.width}x{self.height}"
+        return f"fx {fx}, fy {fy}, cx {cx}, cy {cy} px for {size} px, from {self.source}"
+
+    @property
+    def is_eccentric(self) -> bool:
+        """Whether the principal point is farther from the center than a quarter of the image."""
+        size = np.array([self.width, self.height])
+        return bool((np.abs(self.K[:2, 2] - size / 2) > size / 4).any())
 
     def pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the image coordinates (N, 2) [px] of rays (N, 2), x/z and y/z."""
@@ -53,11 +69,13 @@ class Lens:
         """Returns the lens of the same camera's images at another resolution."""
         a = np.array([width / self.width, height / self.height])
         project = self.project
-        return Lens(
-            np.diag([*a, 1.0]) @ self.K,
-            width,
-            height,
-            None if project is None else lambda rays: project(rays) * a,
+        return replace(
+            self,
+            K=np.diag([*a, 1.0]) @ self.K,
+            width=width,
+            height=height,
+            project=None if project is None else lambda rays: project(rays) * a,
+            radius=self.radius * float(a.mean()),
         )
 
 
@@ -97,6 +115,31 @@ def opencv_lens(
     return Lens(K, width, height, project)
 
 
+def polynomial_lens(
+    K: NDArray[np.float64],
+    width: int,
+    height: int,
+    radial: Sequence[float],
+    tangential: Sequence[float],
+) -> Lens:
+    """Returns a lens of OpenCV's model with radial terms of any number: k1, k2, k3, k4, ... of the
+    powers r^2, r^4, r^6, r^8, ..., which OpenCV ends at r^6, and p1, p2."""
+    k, (p1, p2) = np.array(radial), tangential
+
+    def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, y = rays.T
+        r2 = x**2 + y**2
+        stretch = 1 + r2[:, None] ** np.arange(1, len(k) + 1) @ k
+        bent = [
+            x * stretch + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+            y * stretch + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+        ]
+        return np.column_stack(bent) @ K[:2, :2].T + K[:2, 2]
+
+    curved = np.any(radial) or np.any(tangential)
+    return Lens(K, width, height, project if curved else None)
+
+
 def fisheye_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float]
 ) -> Lens:
@@ -126,8 +169,11 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
         rays = (edge - first.K[:2, 2]) / (zoom * np.diag(first.K)[:2])
         for lens in lenses:
             pixels = lens.pixels(rays)
+            size = np.array([lens.width, lens.height])
             # Half a pixel outside the first centres is still within the image.
-            if not ((pixels > -0.5) & (pixels < np.array([lens.width, lens.height]) + 0.5)).all():
+            if not ((pixels > -0.5) & (pixels < size + 0.5)).all():
+                return False
+            if not (np.linalg.norm(pixels - size / 2, axis=1) <= lens.radius).all():
                 return False
         return True
 

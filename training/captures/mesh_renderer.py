@@ -1,4 +1,4 @@
-"""Exact views of a mesh, by Drake's OpenGL renderer."""
+"""Exact views of a mesh: by Drake's OpenGL renderer and, where textures cut holes, by rays."""
 
 from pathlib import Path
 
@@ -23,7 +23,8 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.opengl import require_opengl
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.captures.gltf_claims import check_gltf_claims
+from splatpilot.training.captures.drawn_mesh import drawn_mesh
+from splatpilot.training.captures.gltf_files import SUFFIXES
 
 NEAREST, FARTHEST = 0.05, 150.0
 """[m], range of the depth images; nearer is 0, farther is inf."""
@@ -44,7 +45,7 @@ class MeshRenderer:
     """Renders a mesh that stands in the world.
 
     Args:
-        mesh: .gltf, or .obj with its materials.
+        mesh: .gltf, .glb, or .obj with its materials.
         up: the axis of the file's coordinates that points up, "y" (as glTF says) or "z".
         background: colour where there is no mesh; red, green, blue in 0 to 1.
 
@@ -70,16 +71,19 @@ class MeshRenderer:
         )
         properties = PerceptionProperties()
         properties.AddProperty("label", "id", RenderLabel(1))
-        # The engine turns glTF's y up to z by itself, and other files not at all.
-        turns_itself = mesh.suffix == ".gltf"
-        angle = (0.0 if turns_itself else np.pi / 2) if up == "y" else -np.pi / 2 * turns_itself
-        X_WM = RigidTransform(RotationMatrix.MakeXRotation(angle))
-        try:
-            self._engine.RegisterVisual(
-                GeometryId.get_new_id(), Mesh(str(mesh)), properties, X_WM, False
-            )
-        except RuntimeError as error:
-            raise ValueError(f"{mesh}: Drake cannot render it: {error}; export it again") from None
+        # The engine turns glTF's y up to z by itself.
+        X_WM = RigidTransform(RotationMatrix.MakeXRotation(0.0 if up == "y" else -np.pi / 2))
+        with drawn_mesh(mesh, up) as drawn:
+            self._cut_outs = drawn.cut_outs
+            if drawn.solid is not None:
+                try:
+                    self._engine.RegisterVisual(
+                        GeometryId.get_new_id(), Mesh(str(drawn.solid)), properties, X_WM, False
+                    )
+                except RuntimeError as error:
+                    raise ValueError(
+                        f"{mesh}: Drake cannot render it: {error}; export it again"
+                    ) from None
 
     def frame(
         self, X_WC: RigidTransform, K: NDArray[np.float64], width: int, height: int
@@ -93,21 +97,17 @@ class MeshRenderer:
         self._engine.UpdateViewpoint(X_WC)
         self._engine.RenderColorImage(ColorRenderCamera(core), color)
         self._engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(NEAREST, FARTHEST)), depth)
-        return CaptureFrame(
+        frame = CaptureFrame(
             np.array(color.data)[..., :3], np.array(depth.data)[..., 0], X_WC, np.array(K)
         )
+        return frame if self._cut_outs is None else self._cut_outs.draw(frame, NEAREST, _LAMPS)
 
 
 def check_mesh(mesh: Path, up: str) -> None:
-    """Raises what `MeshRenderer` says about its arguments; and ValueError for a damaged .gltf."""
+    """Raises what `MeshRenderer` says about its arguments before it reads the file."""
     if not mesh.is_file():
-        raise FileNotFoundError(f"{mesh}: there is no such file; a .gltf or .obj is needed")
-    if mesh.suffix not in (".gltf", ".obj"):
-        raise ValueError(
-            f"{mesh}: Drake renders .gltf and .obj, not {mesh.suffix or 'files without suffix'}; "
-            "export it as one .gltf with everything embedded"
-        )
-    if mesh.suffix == ".gltf":
-        check_gltf_claims(mesh)
+        raise FileNotFoundError(f"No such file: {mesh}")
+    if mesh.suffix not in SUFFIXES:
+        raise ValueError(f"{mesh}: a mesh must be one of {', '.join(SUFFIXES)}; export it as .glb")
     if up not in ("y", "z"):
         raise ValueError(f"up is {up!r}; 'y' (as glTF says) or 'z' is needed")

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,20 +66,23 @@ def _locate(
 ) -> NDArray[np.float64]:
     """Returns the camera ("a.jpg") or the point ("a.jpg@812,344") that is meant, (3,)."""
     name, at, pixel = what.partition("@")
-    if name not in capture.frame_names:
-        raise ValueError(
-            f"scale.between: there is no registered image {name!r}; there are "
-            f"{', '.join(list(capture.frame_names)[:5])}, ..."
-        )
+    names, parts = list(capture.frame_names), PurePath(name).parts
+    found = [i for i, each in enumerate(names) if PurePath(each).parts == parts] or [
+        i for i, each in enumerate(names) if PurePath(each).parts[-len(parts) :] == parts
+    ]
+    if len(found) != 1:
+        known = ", ".join(names[i] for i in found[:5]) or f"{', '.join(names[:5])}, ..."
+        how = "several registered images are" if found else "no registered image is"
+        raise ValueError(f"scale.between: {how} called {name!r}; choose one of {known}")
     if not at:
-        return capture.X_WCs[list(capture.frame_names).index(name)].translation()
+        return capture.X_WCs[found[0]].translation()
     if locate is None:
         raise ValueError(f"scale.between: {what!r}: this kind of capture knows only cameras")
     try:
         u, v = (float(x) for x in pixel.split(","))
     except ValueError:
         raise ValueError(f"scale.between: {what!r} does not end in a pixel: @u,v") from None
-    return locate(name, np.array([u, v]))
+    return locate(names[found[0]], np.array([u, v]))
 
 
 def camera_height(capture: Capture) -> float:
@@ -125,6 +129,7 @@ def _factor_from_depth(capture: Capture) -> float:
     if len(ratio) < _FEWEST:
         raise ValueError(
             f"scale.depth_folder: {len(ratio)} points have a measured depth, at least {_FEWEST} "
-            "are needed; is there a depth file for each of some images, named like it?"
+            "are needed; is there a depth file for each of some images, of its name and in its "
+            "subfolder?"
         )
     return float(np.median(ratio))

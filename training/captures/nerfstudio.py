@@ -2,7 +2,9 @@
 
 As nerfstudio documents it: `transform_matrix` takes camera axes of OpenGL (x right, y up, z back)
 to a world with z up; intrinsics and distortion stand once or with each frame; a `depth_file_path`
-holds planar depth in units of `depth_unit_scale_factor` (0.001); `ply_file_path` holds points.
+holds planar depth in units of `depth_unit_scale_factor` (0.001); `mask_path` holds an image that is
+black where the other is not to be used; `ply_file_path` holds points; `train_filenames`,
+`val_filenames` and `test_filenames` split the frames. ScanNet++ adds `is_bad` and `test_frames`.
 Whether lengths are metres the file does not say: they are taken to be if there is depth.
 """
 
@@ -10,7 +12,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from os.path import isfile  # false, too, of names that no file system takes
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,7 @@ from splatpilot.training.captures.capture import OPENGL_AXES, Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frame_files import FrameFiles, open_frames
 from splatpilot.training.captures.image_files import image_size, read_depth
-from splatpilot.training.captures.lens import Lens, fisheye_lens, opencv_lens, pinhole
+from splatpilot.training.captures.lens import Lens, fisheye_lens, pinhole, polynomial_lens
 from splatpilot.training.captures.metric_scale import make_metric
 from splatpilot.training.captures.poses import pose_from_matrix
 from splatpilot.training.captures.upright import turn_upright
@@ -31,12 +33,18 @@ from splatpilot.training.captures.upright import turn_upright
 TRANSFORMS = "transforms.json"
 
 _MAX_DISTORTION = 100.0
-_DISTORTION = {
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-    "PINHOLE": (),
-    "SIMPLE_PINHOLE": (),
-}
+_FISHEYE = "OPENCV_FISHEYE"
+# Perspective ones differ in which terms of their distortion are given.
+_MODELS = {"OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", _FISHEYE}
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_SPLIT = {part: f"{part}_filenames" for part in ("train", "val", "test")}
+_CAMERA = {"camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "is_fisheye"}
+_CAMERA |= {*_DISTORTION, "distortion_params", "fisheye_crop_radius"}
+# With those that say how the file was made, which changes nothing.
+_KNOWN = _CAMERA | {*_SPLIT.values(), "frames", "test_frames", "depth_unit_scale_factor"}
+_KNOWN |= {"ply_file_path", "applied_transform", "applied_scale"}
+_KNOWN_OF_FRAME = _CAMERA | {"file_path", "transform_matrix", "depth_file_path", "mask_path"}
+_KNOWN_OF_FRAME |= {"is_bad", "colmap_im_id"}
 
 
 def is_nerfstudio(path: Path) -> bool:
@@ -55,11 +63,12 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
     file = path / TRANSFORMS
     try:
         content = json.loads(read_text(file))
-        entries = [dict(entry) for entry in content["frames"]]
-        named = [(entry["file_path"], entry["transform_matrix"], entry) for entry in entries]
+        entries, held_out = _split(content)
+        named = [(str(entry["file_path"]), entry["transform_matrix"], entry) for entry in entries]
         points, unit = content.get("ply_file_path") or "", _depth_unit(content, config)
-        for path_like in (points, *(entry.get("depth_file_path") or "" for entry in entries)):
-            if not isinstance(path_like, str):
+        paths = [entry.get(key) for entry in entries for key in ("depth_file_path", "mask_path")]
+        for path_like in (points, *paths):
+            if not isinstance(path_like or "", str):
                 raise TypeError(f"{path_like!r:.40} stands where a path belongs")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
@@ -67,18 +76,26 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
             "`transform_matrix` is needed"
         ) from None
     lenses: dict[tuple, Lens] = {}  # Equal cameras share one, and one resampling.
-    frames = []
+    frames, bad = [], []
     for i, (name, matrix, entry) in enumerate(named):
-        image = _image_file(path, str(name))
-        depth = entry.get("depth_file_path")
+        if entry.get("is_bad") or held_out[i] is None:
+            bad.append(f"{file}: {name} {'is_bad' if entry.get('is_bad') else 'is in no split'}")
+            continue
+        image = _image_file(path, name)
+        depth, mask = entry.get("depth_file_path"), entry.get("mask_path")
         frames.append(
             FrameFiles(
                 image,
                 _pose(matrix, f"{file}, frame {i} ({name})"),
                 path / depth if depth else None,
                 _lens(file, {**content, **entry}, image, config, lenses),
+                path / mask if mask else None,
+                name=_name(name),
+                held_out=bool(held_out[i]),
             )
         )
+    unused = content.keys() - _KNOWN | {key for entry in entries for key in entry} - _KNOWN_OF_FRAME
+    listed = ", ".join(sorted(unused))
     capture = open_frames(
         path,
         "nerfstudio capture",
@@ -86,12 +103,37 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
         axes=OPENGL_AXES,
         read_depth=lambda file: read_depth(file, unit),
         stretch_depth=True,
+        dropped=bad,
+        notes=[f"{file.name}: {listed} is not used"] if unused else (),
     )
     if points:
         capture = dataclasses.replace(capture, points=_read_points(path / points))
     if config.scale.given() or not capture.has_depth:
         capture = make_metric(capture, config.scale)
     return turn_upright(capture, config.up or "z")
+
+
+def _split(content: dict[str, Any]) -> tuple[list[dict[str, Any]], list[bool | None]]:
+    """Returns the frames, and whether the file holds each out; None if its split leaves it out."""
+    frames = [dict(entry) for entry in content["frames"]]
+    tests = content.get("test_frames") or []  # frames of their own, or names of others
+    apart = [dict(entry) for entry in tests if not isinstance(entry, str)]
+    names = [_name(entry["file_path"]) for entry in frames + apart]
+    parts = {part: set(map(_name, content[key])) for part, key in _SPLIT.items() if key in content}
+    held_out = {_name(each) for each in tests if isinstance(each, str)}.union(
+        names[len(frames) :], parts.get("val", ()), parts.get("test", ())
+    )
+    fitted = parts.get("train", set(names))
+    if unknown := (fitted | held_out).difference(names):
+        raise ValueError(f"its split names {min(unknown)}, which is not the name of a frame")
+    roles = [name in held_out if name in held_out | fitted else None for name in names]
+    if False not in roles:
+        raise ValueError("its split leaves no frame to train with")
+    return frames + apart, roles
+
+
+def _name(path: Any) -> str:
+    return str(PurePath(str(path)))
 
 
 def _depth_unit(content: dict[str, Any], config: CaptureConfig) -> float:
@@ -136,11 +178,10 @@ def _lens(
     lenses: dict[tuple, Lens],
 ) -> Lens | None:
     """Returns the camera that `values` describe, None if the image's size is needed and unknown."""
-    model = str(values.get("camera_model", "OPENCV"))
-    if model not in _DISTORTION:
-        raise ValueError(
-            f"{file}: camera_model is {model}; known are {', '.join(sorted(_DISTORTION))}"
-        )
+    model = str(values.get("camera_model", _FISHEYE if values.get("is_fisheye") else "OPENCV"))
+    if model not in _MODELS:
+        known = ", ".join(sorted(_MODELS))
+        raise ValueError(f"{file}: camera_model must be one of {known}, got {model}")
     try:
         if "w" in values and "h" in values:
             width, height = int(values["w"]), int(values["h"])
@@ -155,13 +196,21 @@ def _lens(
                 fx = width / 2 / np.tan(float(values["camera_angle_x"]) / 2)
             fy = float(values.get("fl_y", fx))
             cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
-        distortion = tuple(float(values.get(name, 0.0)) for name in _DISTORTION[model])
+        listed = dict(zip(_DISTORTION, values.get("distortion_params") or (), strict=False))
+        distortion = tuple(float({**values, **listed}.get(k, 0.0)) for k in _DISTORTION)
         if not np.abs(distortion).max(initial=0.0) <= _MAX_DISTORTION:
             raise ValueError(f"a distortion of {distortion} is none of a lens")
-        key = (model, width, height, fx, fy, cx, cy, distortion)
+        radius = float(values.get("fisheye_crop_radius") or np.inf) if model == _FISHEYE else np.inf
+        key = (model, width, height, fx, fy, cx, cy, distortion, radius)
         if key not in lenses:
-            make = fisheye_lens if model == "OPENCV_FISHEYE" else opencv_lens
-            lenses[key] = make(pinhole(fx, fy, cx, cy), width, height, distortion)
+            K, radial, tangential = pinhole(fx, fy, cx, cy), distortion[:4], distortion[4:]
+            if model == _FISHEYE:
+                lens = fisheye_lens(K, width, height, radial)
+            else:
+                lens = polynomial_lens(K, width, height, radial, tangential)
+            given = file.name if {"cx", "cy"} <= values.keys() else f"{file.name}, centered"
+            source = "capture.intrinsics" if config.intrinsics else given
+            lenses[key] = dataclasses.replace(lens, radius=radius, source=source)
         return lenses[key]
     except OSError:
         return None

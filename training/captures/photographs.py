@@ -15,7 +15,12 @@ from splatpilot.systems.processes import run_apart
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.colmap import capture_of_model, import_pycolmap, read_model
+from splatpilot.training.captures.colmap import (
+    capture_of_model,
+    import_pycolmap,
+    mask_folder,
+    read_model,
+)
 from splatpilot.training.captures.image_files import IMAGE_SUFFIXES, image_size
 from splatpilot.training.captures.image_pairs import all_pairs, likely_pairs, similarity
 
@@ -63,7 +68,9 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
         raise ValueError(f"{path}: {len(files)} readable photographs, at least 3 are needed")
     folder = files[0].parent
     names = [file.name for file in files]
-    key = cache_key(files, import_pycolmap().__version__, _MAX_SIZE, _SEED, config.partners)
+    masks = sorted(file for file in mask_folder(folder).rglob("*") if file.is_file())
+    version = import_pycolmap().__version__
+    key = cache_key([*files, *masks], version, _MAX_SIZE, _SEED, config.partners)
     model = cache_folder(config, "photographs", key) / "model"
     if not model.is_dir():
         _register(folder, names, one_camera(files), config.partners, model)
@@ -124,11 +131,16 @@ def _write_model(work: tuple[Path, list[str], bool, int, Path]) -> None:
         # Enlarging the image first finds more in small ones and takes four times as long.
         small = max(max(image_size(folder / name)) for name in names) < _SMALL
         extraction.sift.first_octave = -1 if small else 0
+        reader = pycolmap.ImageReaderOptions()
+        if (masks := mask_folder(folder)).is_dir():
+            reader.mask_path = masks
         threads = available_cores()
         with tqdm(total=len(names), desc="features", unit="photo") as progress:
             for start in range(0, len(names), threads):
                 some = names[start : start + threads]
-                pycolmap.extract_features(database, folder, some, extraction_options=extraction)
+                pycolmap.extract_features(
+                    database, folder, some, reader_options=reader, extraction_options=extraction
+                )
                 progress.update(len(some))
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = _SEED

@@ -79,7 +79,8 @@ def _camera(file: Path, config: CaptureConfig) -> tuple[Lens, NDArray[np.float64
     """Returns the lens of a keyframe, and its pose as a matrix (3, 4)."""
     values = json.loads(read_text(file))
     focal = config.intrinsics or [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
-    lens = Lens(pinhole(*focal), int(values["width"]), int(values["height"]))
+    source = "capture.intrinsics" if config.intrinsics else f"{file.parent.name}/"
+    lens = Lens(pinhole(*focal), int(values["width"]), int(values["height"]), source=source)
     entries = [float(values[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
     return lens, np.array(entries).reshape(3, 4)
 

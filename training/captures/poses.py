@@ -9,8 +9,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.read_limit import read_text
 
-_LARGEST = 1e6
-"""[m], beyond which a position is no place of any capture."""
+_LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+_LARGEST = 1e8
+"""[m], beyond which a position is not on Earth, whatever its origin."""
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
@@ -57,6 +58,7 @@ def pose_from_quaternion(row: NDArray[np.float64], source: str) -> RigidTransfor
     Raises:
         ValueError: if it is no pose; the message starts with `source`.
     """
+    _require_finite(row, source)
     _require_position(row[:3], source)
     norm = np.linalg.norm(row[3:])
     if not abs(norm - 1) < 1e-3:
@@ -69,15 +71,21 @@ def pose_from_quaternion(row: NDArray[np.float64], source: str) -> RigidTransfor
 
 
 def pose_from_matrix(matrix: NDArray[np.float64], source: str) -> RigidTransform:
-    """Returns the pose of a matrix (4, 4) whose rotation may be off by rounding.
+    """Returns the pose of a matrix (4, 4), or (3, 4) without its last row, whose rotation may be
+    off by rounding.
 
     Raises:
-        ValueError: if it is no pose; the message starts with `source`.
+        ValueError: if it is not a pose; the message starts with `source`.
     """
+    _require_finite(matrix, source)
+    if not np.allclose(matrix[3:], _LAST_ROW, atol=1e-6):
+        columns = np.allclose(matrix[:, 3], _LAST_ROW, atol=1e-6)
+        why = "the matrix is stored column by column; transpose it" if columns else "copy it again"
+        raise ValueError(
+            f"{source}: the last row of a pose must be 0 0 0 1, got {matrix[3].tolist()}: {why}"
+        )
     R, p = matrix[:3, :3], matrix[:3, 3]
     _require_position(p, source)
-    if not np.isfinite(R).all():
-        raise ValueError(f"{source}: the pose is not finite (tracking was lost?)")
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > 0.01 or np.linalg.det(R) < 0:
         raise ValueError(
@@ -87,9 +95,12 @@ def pose_from_matrix(matrix: NDArray[np.float64], source: str) -> RigidTransform
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 
 
-def _require_position(p: NDArray[np.float64], source: str) -> None:
-    if not np.isfinite(p).all():
+def _require_finite(pose: NDArray[np.float64], source: str) -> None:
+    if not np.isfinite(pose).all():
         raise ValueError(f"{source}: the pose is not finite (tracking was lost?)")
+
+
+def _require_position(p: NDArray[np.float64], source: str) -> None:
     if np.abs(p).max() > _LARGEST:
         raise ValueError(f"{source}: the position {p} is more than {_LARGEST:g} m away")
 

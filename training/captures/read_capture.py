@@ -9,6 +9,7 @@ from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.colmap import model_folder, read_colmap
 from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstudio
+from splatpilot.training.captures.origin import move_origin
 from splatpilot.training.captures.photographs import photographs_in, read_photographs
 from splatpilot.training.captures.polycam import is_polycam, read_polycam
 from splatpilot.training.captures.record3d import is_record3d, read_record3d
@@ -146,6 +147,7 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
         raise ValueError(
             f"{path}: what reads its kind gave {type(capture).__name__}; it must return a Capture"
         )
+    capture = move_origin(capture, config.origin)
     if config.refine_poses:
         capture = refined_capture(capture, path, config)
     return replace(capture, folder=str(path.absolute()), config=said)

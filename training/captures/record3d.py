@@ -65,7 +65,8 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
 
     def lens(i: int) -> Lens:
         values = np.array(config.intrinsics) if config.intrinsics else intrinsics[i]
-        return lenses.setdefault(values.tobytes(), Lens(pinhole(*values), *size))
+        source = "capture.intrinsics" if config.intrinsics else _METADATA
+        return lenses.setdefault(values.tobytes(), Lens(pinhole(*values), *size, source=source))
 
     def frame(i: int, image: Path) -> FrameFiles:
         depth, pose = path / "depth" / f"{i}.exr", np.roll(poses[i], 3)

@@ -25,6 +25,9 @@ _SAME_SURFACE = 0.03
 _FEWEST = 300
 _BETTER = 0.6
 """What fraction of the disagreement another colour camera must leave to be believed."""
+_NEGLIGIBLE, _LARGEST = 0.01, 0.3
+"""Disagreement below which no other color camera is looked for, and above which none is believed.
+It is 0.02 to 0.04 in captures of real cameras, and 0.11 where one is wrongly read as registered."""
 _SHORTEST = 0.008
 _SMALLEST = 0.015
 
@@ -51,7 +54,8 @@ class ColorFit:
 @dataclass(frozen=True, eq=False)
 class _ColoredPair:
     p_DQs: tuple[NDArray[np.float64], NDArray[np.float64]]  # (3, n) [m] each
-    images: tuple[NDArray[np.float32], NDArray[np.float32]]  # (H, W), luminance
+    images: tuple[NDArray[np.float32], NDArray[np.float32]]
+    """(H, W) each, luminance, NaN in invalid pixels."""
 
 
 def grid_step(image: NDArray, count: int) -> int:
@@ -99,11 +103,16 @@ def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Colo
     x, y = (X_DC.translation()[:2] + fit.x[1:]).tolist()
     mistake = ""
     moved = np.linalg.norm(fit.x[1:]) > _SHORTEST or abs(fit.x[0]) > _SMALLEST
-    if fit.fun < _BETTER * as_read and moved:
+    if as_read > _NEGLIGIBLE and fit.fun < _BETTER * as_read and moved:
         mistake = (
             "most likely colour and depth are not registered: a colour camera of focal length "
             f"{focal_length:.0f} px at ({x:+.3f}, {y:+.3f}, 0) m in the depth camera leaves "
             f"{fit.fun:.3f} of disagreement between colours instead of {as_read:.3f}"
+        )
+    elif as_read > _LARGEST:
+        mistake = (
+            f"colors do not follow depth: 1 - their correlation between frames is {as_read:.2f}, "
+            f"at most {_LARGEST} is believed; intrinsics may be those of another camera"
         )
     return ColorFit(as_read, float(fit.fun), focal_length, (x, y), mistake)
 
@@ -112,7 +121,7 @@ def _color_pair(
     capture: Capture, K_D: NDArray[np.float64], X_DC: RigidTransform, i: int, j: int
 ) -> _ColoredPair | None:
     """Returns the points of frame i that frame j sees too, in both depth cameras."""
-    a, b = capture.load_depth(i), capture.load_depth(j)
+    a, b = capture.measured_depth(i), capture.measured_depth(j)
     if a is None or b is None:
         return None
     step = grid_step(a, _POINTS)
@@ -138,7 +147,11 @@ def _color_pair(
 
 def _luminance(capture: Capture, i: int) -> NDArray[np.float32]:
     gray = cv2.cvtColor(capture.load_image(i), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return cv2.GaussianBlur(gray, (0, 0), _BLUR)  # pyright: ignore[reportReturnType]
+    valid = np.broadcast_to(capture.load_valid(i), gray.shape)
+    sums, weights = (
+        cv2.GaussianBlur(each.astype(np.float32), (0, 0), _BLUR) for each in (gray * valid, valid)
+    )
+    return np.divide(sums, weights, out=np.full_like(gray, np.nan), where=valid)
 
 
 def _correlation(pair: _ColoredPair, K: NDArray[np.float64], X_DC: RigidTransform) -> float | None:
@@ -152,7 +165,7 @@ def _correlation(pair: _ColoredPair, K: NDArray[np.float64], X_DC: RigidTransfor
         sampled = cv2.remap(image, u[None], v[None], cv2.INTER_LINEAR, borderValue=outside)[0]
         height, width = image.shape
         inside = (z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-        samples.append((sampled, inside))
+        samples.append((sampled, inside & np.isfinite(sampled)))
     (a, inside_a), (b, inside_b) = samples
     both = inside_a & inside_b
     if both.sum() < _FEWEST or a[both].std() == 0 or b[both].std() == 0:

@@ -23,15 +23,17 @@ from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.output_folders import held_folder
-from splatpilot.systems.read_limit import require_readable_size
 from splatpilot.systems.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.drawn_mesh import drawn_mesh
 from splatpilot.training.captures.mesh_renderer import MeshRenderer, check_mesh
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.captures.tartanair import AXES
 
 RECIPE = "world.yaml"
+_VERSION = 2
+"""Of how meshes are drawn."""
 _SAMPLES_PER_VOXEL_FACE = 8
 
 
@@ -49,6 +51,8 @@ class RenderedWorld:
     split: str = ""
     # Digest of the mesh's triangles, or of the generated world, see `splits.source_digest`.
     source_digest: list[str] = field(default_factory=list)
+    # Of how meshes were drawn; 1 where nothing is said.
+    version: int = 1
 
 
 def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
@@ -58,7 +62,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     interruption, it goes on from there. A capture that is there already is left as it is.
 
     Args:
-        world: a mesh (.gltf or .obj), or a scenario whose world is procedural, one of the
+        world: a mesh (.gltf, .glb or .obj), or a scenario whose world is procedural, one of the
             benchmark's ("P02") or a file (.yaml): that world is exported, with what `seed` draws,
             as `world.gltf` into the capture.
 
@@ -84,12 +88,12 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
                 "needed"
             )
         blueprint = make_blueprint(scenario.world, seed)
-        recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config)
+        recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config, version=_VERSION)
         described = f"{type(scenario.world).__name__} {seed}\n{dump_config(scenario.world)}"
         digests, found = part_digests([described.encode()]), _generated_split(scenario.world, seed)
     else:
         check_mesh(world, config.up)
-        recipe = RenderedWorld(str(world), world.name, config)
+        recipe = RenderedWorld(str(world), world.name, config, version=_VERSION)
         digests, found = mesh_digests(world), "train"
     recipe.split = choose_split(recipe.origin, digests, config.split, found)
     recipe.source_digest = source_digest(digests)
@@ -143,6 +147,10 @@ def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | Non
     recipe = rendered_world(capture)
     if recipe is None:
         return None
+    if recipe.version != _VERSION:
+        raise ValueError(
+            f"{capture / RECIPE}: version must be {_VERSION}, got {recipe.version}; render it again"
+        )
     config = recipe.config
     config.validate()
     renderer = _renderer(capture / recipe.mesh, config)
@@ -192,22 +200,19 @@ def mesh_digests(mesh: Path) -> set[str]:
 def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     """Returns the distance to the surface of a mesh, from points sampled on it.
 
+    Where textures cut holes there is no surface.
+
     Raises:
         ValueError: if the file cannot be read or holds no surface.
     """
-    surface = _read_surface(mesh)
-    area = surface.area
-    count = int(_SAMPLES_PER_VOXEL_FACE * area / voxel_size**2) + 1
-    require_readable_size(mesh, 64.0 * count)
-    lower, upper = surface.bounds
+    with drawn_mesh(mesh, up) as drawn:
+        p_WQ = drawn.sample(_SAMPLES_PER_VOXEL_FACE / voxel_size**2)
+    if not len(p_WQ):
+        raise ValueError(f"{mesh}: holds no surface; export it again")
     try:
-        grid_shape(lower - voxel_size, upper + voxel_size, voxel_size)
+        grid_shape(p_WQ.min(axis=0) - voxel_size, p_WQ.max(axis=0) + voxel_size, voxel_size)
     except ValueError as error:
         raise ValueError(f"{mesh}: {error}") from None
-    samples = trimesh.sample.sample_surface(surface, count, seed=0)[0]
-    p_WQ = np.asarray(samples, dtype=np.float64)
-    if up == "y":
-        p_WQ = p_WQ @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     lower_W = p_WQ.min(axis=0) - voxel_size
     shape = np.ceil((p_WQ.max(axis=0) + voxel_size - lower_W) / voxel_size).astype(int)
     occupied = np.zeros(shape, dtype=bool)

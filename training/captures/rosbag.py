@@ -12,6 +12,7 @@ that.
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,10 @@ _POSES = {
     "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
 }
+_TRANSPORTS = ("/compressed", "/compressedDepth", "/theora")
 _CAMERA = "camera.json"
+_VERSION = 2
+"""Of what is written to the cache; another is written again."""
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
 
@@ -72,7 +76,7 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
     if path.suffix in {".db3", ".mcap"}:
         raise ValueError(f"{path}: a part of a bag; name its folder, in which {_METADATA} lies")
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    folder = cache_folder(config, "bags", cache_key(files, config.topics)) / path.stem
+    folder = cache_folder(config, "bags", cache_key(files, config.topics, _VERSION)) / path.stem
     if not folder.is_dir():
         prepare_cache(folder.parent)
         with folder_written_atomically(folder) as written, _opened(path) as reader:
@@ -80,18 +84,16 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
     camera = json.loads((folder / _CAMERA).read_text())
 
     def lens(width: int, height: int) -> Lens:
-        if config.intrinsics:
-            return Lens(pinhole(*config.intrinsics), width, height)
-        if not camera:
+        if "problem" in camera:
             raise ValueError(
-                f"{path}: has no calibration of the colour camera (CameraInfo); set "
-                "capture.intrinsics to [fx, fy, cx, cy]"
+                f"{path}: {camera['problem']}; set capture.intrinsics to [fx, fy, cx, cy] of "
+                "images without distortion"
             )
         fx, fy, cx, cy = camera["intrinsics"]
         make = _MODELS[camera["model"]]
         K = pinhole(fx, fy, cx + 0.5, cy + 0.5)  # ROS counts from the first pixel's centre
         own = make(K, camera["width"], camera["height"], camera["distortion"])
-        return own.scale_to(width, height)
+        return replace(own, source=camera["source"]).scale_to(width, height)
 
     return open_sequence(folder, "ROS bag", config, lens, DEPTH_UNIT)
 
@@ -147,7 +149,7 @@ class _Bag:
         with (folder / "groundtruth.txt").open("w") as file:
             for time, X_WC in poses:
                 w, x, y, z = X_WC.rotation().ToQuaternion().wxyz()
-                numbers = " ".join(f"{n:.9g}" for n in (*X_WC.translation(), x, y, z, w))
+                numbers = " ".join(f"{n:.17g}" for n in (*X_WC.translation(), x, y, z, w))
                 file.write(f"{time:.9f} {numbers}\n")
         (folder / _CAMERA).write_text(json.dumps(self._calibration(frame)))
 
@@ -228,29 +230,48 @@ class _Bag:
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:
-        """That of the camera whose images are in `frame`; empty if the bag has none."""
-        for topic in self._of(_INFO):
-            message = self._first(topic)
-            if message is None or message.header.frame_id.lstrip("/") != frame:
-                continue
-            # In capitals in ROS 1.
-            matrix = message.K if hasattr(message, "K") else message.k
-            distortion = message.D if hasattr(message, "D") else message.d
-            K = np.asarray(matrix, dtype=float).reshape(3, 3)
-            if message.distortion_model not in _MODELS:
-                raise ValueError(
-                    f"{self._path}: {topic} has the distortion {message.distortion_model!r}; known "
-                    f"are {', '.join(filter(None, _MODELS))}; undistort the images, and set "
-                    "capture.intrinsics"
-                )
-            return {
-                "model": message.distortion_model,
-                "intrinsics": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-                "distortion": [float(d) for d in distortion],
-                "width": int(message.width),
-                "height": int(message.height),
-            }
-        return {}
+        """That of the camera of the color images, which are in `frame`, or why there is none.
+
+        It is in the namespace of the images or, without one there, has their frame. K and D
+        describe images as the camera took them, P alone those that are rectified (CameraInfo).
+        """
+        images = self._color
+        for transport in _TRANSPORTS:
+            images = images.removesuffix(transport)
+        namespace, _, image = images.rpartition("/")
+        infos = {topic: self._first(topic) for topic in self._of(_INFO)}
+        near = [topic for topic in infos if topic.rpartition("/")[0] == namespace and infos[topic]]
+        found = near or [
+            topic
+            for topic, info in infos.items()
+            if info is not None and info.header.frame_id.lstrip("/") == frame
+        ]
+        if not found:
+            return {"problem": "has no calibration of the color camera (CameraInfo)"}
+        topic, message = found[0], infos[found[0]]
+        matrix, projection, distortion = (_field(message, name) for name in "KPD")
+        if any(not np.array_equal(_field(infos[each], "K"), matrix) for each in found):
+            return {"problem": f"{', '.join(found)} differ, and none is beside {self._color}"}
+        K, model = np.asarray(matrix, dtype=float).reshape(3, 3), message.distortion_model
+        if image.startswith("image_rect"):
+            K, model, distortion = np.asarray(projection, dtype=float).reshape(3, 4), "", []
+            topic += ", P without distortion"
+        if model not in _MODELS:
+            known = ", ".join(filter(None, _MODELS))
+            return {"problem": f"{topic} has the distortion {model!r}; known are {known}"}
+        return {
+            "source": topic,
+            "model": model,
+            "intrinsics": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+            "distortion": [float(d) for d in distortion],
+            "width": int(message.width),
+            "height": int(message.height),
+        }
+
+
+def _field(message: Any, name: str) -> Any:
+    """Of a CameraInfo, whose fields are in capitals in ROS 1."""
+    return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 
 
 def _time(message: Any) -> float:

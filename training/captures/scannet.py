@@ -42,8 +42,7 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
     lost = [number for number in colors if _is_lost(path / "pose" / f"{number}.txt")]
     unit = config.depth_unit or 1000.0
-    K_C = pinhole(*config.intrinsics) if config.intrinsics else _intrinsics(path / _COLOR)
-    K_D = K_C
+    K_C = K_D = _intrinsics(path / _COLOR)
     if config.depth_intrinsics:
         K_D = pinhole(*config.depth_intrinsics)
     elif (path / _DEPTH).is_file():
@@ -57,14 +56,19 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
             depth if depth.is_file() else None,
         )
 
+    def depth_camera(width: int, height: int) -> DepthCamera:
+        K = Lens(K_D, width, height).K  # which a camera of that size can have
+        return DepthCamera(K, width, height, RigidTransform())
+
     capture = open_frames(
         path,
         "ScanNet folder",
         [frame(number, color) for number, color in colors.items() if number not in lost],
         axes=OPTICAL_AXES,
-        lens=lambda width, height: Lens(K_C, width, height),
+        lens=lambda width, height: Lens(K_C, width, height, source=str(_COLOR)),
+        intrinsics=config.intrinsics,
         read_depth=lambda file: read_depth(file, unit),
-        depth_camera=lambda width, height: DepthCamera(K_D, width, height, RigidTransform()),
+        depth_camera=depth_camera,
         dropped=[f"{path / 'pose'}: tracking was lost in {len(lost)} frames"] if lost else (),
     )
     return turn_upright(capture, config.up or "z")

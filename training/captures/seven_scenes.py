@@ -57,9 +57,8 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         return FrameFiles(color, X_FC, path / f"{stem}.depth.png")
 
     def lens(width: int, height: int) -> Lens:
-        if config.intrinsics:
-            return Lens(pinhole(*config.intrinsics), width, height)
-        return Lens(pinhole(*_COLOR), 640, 480).scale_to(width, height)
+        source = "what was measured on redkitchen: set capture.intrinsics if the camera is another"
+        return Lens(pinhole(*_COLOR), 640, 480, source=source).scale_to(width, height)
 
     def depth_camera(width: int, height: int) -> DepthCamera:
         if config.depth_intrinsics:
@@ -74,6 +73,7 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         [frame(number, color) for number, color in colors.items()],
         axes=OPTICAL_AXES,
         lens=lens,
+        intrinsics=config.intrinsics,
         read_depth=lambda file: read_depth(file, unit),
         depth_camera=depth_camera,
     )

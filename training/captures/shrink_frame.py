@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from splatpilot.training.captures.capture import CaptureFrame
 
@@ -14,22 +15,34 @@ def shrink_factor(width: int, wanted: int) -> int:
     return max(1, round(width / wanted)) if wanted else 1
 
 
+def shrink_mask(valid: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
+    """Returns which pixels of a shrunken image replace valid ones alone."""
+    return _blocks(valid, factor).all(axis=-1)
+
+
+def _blocks(pixels: NDArray, factor: int) -> NDArray:
+    """(h, w, factor^2) from (H, W): what each shrunken pixel replaces."""
+    height, width = (n // factor for n in pixels.shape)
+    blocks = pixels[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    return blocks.swapaxes(1, 2).reshape(height, width, factor**2)
+
+
 def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
     """Returns the frame with each factor x factor pixels made one; what remains at the right and at
     the bottom is cut off.
 
     Colours are averaged. Depth is averaged as its inverse, which is exact on planes, where it is of
     one surface; at the edges of things it is the (lower) median, a depth that was seen. It is
-    unknown (0) where most of it is, and infinite where it is beyond range.
+    unknown (0) where most of it is, and infinite where it is beyond range. A pixel is valid if all
+    that it replaces are.
     """
     if factor == 1:
         return frame
     height, width = (n // factor for n in frame.depth.shape)
     image = frame.image[: height * factor, : width * factor]
     image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    blocks = frame.depth[: height * factor, : width * factor]
-    blocks = blocks.reshape(height, factor, width, factor).swapaxes(1, 2)
-    blocks = blocks.reshape(height, width, factor**2)
+
+    blocks, valid = _blocks(frame.depth, factor), shrink_mask(frame.valid, factor)
     known = blocks > 0
     count = known.sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -42,7 +55,7 @@ def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
         middle = np.maximum(count - 1, 0)[..., None] // 2
         median = np.take_along_axis(ordered, middle, axis=-1)[..., 0]
         depth = np.where(spread <= _ONE_SURFACE * most, mean, median)
-    depth = np.where(2 * count > factor**2, depth, 0).astype(np.float32)
+    depth = np.where((2 * count > factor**2) & valid, depth, 0).astype(np.float32)
     K = frame.K.copy()
     K[:2] /= factor
-    return CaptureFrame(np.asarray(image, dtype=np.uint8), depth, frame.X_WC, K)
+    return CaptureFrame(np.asarray(image, dtype=np.uint8), depth, frame.X_WC, K, valid)

@@ -120,8 +120,8 @@ def _read(layout: _Layout, path: Path, config: CaptureConfig) -> Capture:
         )
 
     def lens(width: int, height: int) -> Lens:
-        f = width / 2
-        return Lens(pinhole(*(config.intrinsics or (f, f, width / 2, height / 2))), width, height)
+        K = pinhole(width / 2, width / 2, width / 2, height / 2)
+        return Lens(K, width, height, source="TartanAir's 90 degrees of width")
 
     return open_frames(
         path,
@@ -129,6 +129,7 @@ def _read(layout: _Layout, path: Path, config: CaptureConfig) -> Capture:
         [frame(number, i) for i, number in enumerate(numbers)],
         axes=AXES,
         lens=lens,
+        intrinsics=config.intrinsics,
         read_depth=layout.read_depth,
         dropped=extra,
     )

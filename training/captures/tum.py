@@ -8,7 +8,9 @@ Where poses are those of keyframes, too far apart to interpolate, images take th
 time, and those between keyframes have none.
 """
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +34,23 @@ _MAX_GAP = 0.12
 _SAME_TIME = 0.005
 """[s] between an image and the pose of a keyframe that is its own."""
 
-# fx, fy, cx, cy [px], counted from the first pixel's centre, and distortion k1 k2 p1 p2 k3, of the
-# three cameras that the sequences' names tell apart; of any other, the driver's default.
+# fx, fy, cx, cy [px], counted from the first pixel's center, and distortion k1 k2 p1 p2 k3, for
+# images of 640x480 px, of the cameras that the names of sequences tell apart: those of the folder,
+# or of the bag that its lists name. Published with the data sets: TUM's, and that of Bonn's dynamic
+# scenes (Palazzolo et al. 2019).
+_NAMES = r"(?:freiburg|(?<![a-z])fr)([123])(?![0-9])|rgbd_(bonn)_"
 _CAMERAS = {
-    "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "freiburg3": ((535.4, 539.2, 320.1, 247.6), (0.0, 0.0, 0.0, 0.0, 0.0)),
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+    "bonn": (
+        (542.822841, 542.57687, 315.59352, 237.756098),
+        (0.039903, -0.099343, -0.00073, -0.000144),
+    ),
 }
-_DEFAULT = ((525.0, 525.0, 319.5, 239.5), (0.0, 0.0, 0.0, 0.0, 0.0))
+_DEFAULT = (525.0, 525.0, 319.5, 239.5)
+_CALIBRATION = "calibration.txt"
+"""With fx, fy, cx, cy and distortion of the images themselves, as ETH3D's sequences have it."""
 
 
 def is_tum(path: Path) -> bool:
@@ -56,14 +67,42 @@ def read_tum(path: Path, config: CaptureConfig) -> Capture:
     """
 
     def lens(width: int, height: int) -> Lens:
-        if config.intrinsics:
-            return Lens(pinhole(*config.intrinsics), width, height)
-        name = next((name for name in _CAMERAS if name in path.resolve().name), "")
-        (fx, fy, cx, cy), distortion = _CAMERAS.get(name, _DEFAULT)
-        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
-        return opencv_lens(K, 640, 480, distortion).scale_to(width, height)
+        file = path / _CALIBRATION
+        if file.is_file():
+            numbers = read_calibration(file)
+            own = opencv_lens(_K(*numbers[:4]), width, height, numbers[4:].tolist())
+            return replace(own, source=file.name)
+        said = f"{path.resolve().name}\n{read_text(path / 'rgb.txt', 'replace')[:1000]}"
+        if found := re.search(_NAMES, said):
+            focal, distortion = _CAMERAS[found[1] or found[2]]
+            own = opencv_lens(_K(*focal), 640, 480, distortion)
+            return replace(own, source=f"the name {found[0]}").scale_to(width, height)
+        assumed = "what TUM's driver assumes: set capture.intrinsics if the camera is another"
+        return Lens(_K(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
 
     return open_sequence(path, "TUM RGB-D sequence", config, lens, 5000.0)
+
+
+def read_calibration(file: Path) -> NDArray[np.float64]:
+    """Returns fx, fy, cx, cy [px] and what follows of distortion, (4,) to (9,).
+
+    Raises:
+        ValueError: if the file holds anything else.
+    """
+    try:
+        numbers = np.array(read_text(file).split(), dtype=np.float64)
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) not in (4, 8, 9) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"{file}: must be fx fy cx cy, and k1 k2 p1 p2 (k3) of a distorted camera; correct it, "
+            "or set capture.intrinsics"
+        )
+    return numbers
+
+
+def _K(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    return pinhole(fx, fy, cx + 0.5, cy + 0.5)
 
 
 def open_sequence(
@@ -111,6 +150,7 @@ def open_sequence(
         frames,
         axes=OPTICAL_AXES,
         lens=lens,
+        intrinsics=config.intrinsics,
         read_depth=lambda file: read_depth(file, unit),
         dropped=dropped if alone else (),
     )

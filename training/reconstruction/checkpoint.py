@@ -49,7 +49,14 @@ class Checkpoint:
         self.file = _checkpoint_file(out)
         self._config = _compared_fields(config)
         digest = hashlib.sha256()
-        for tensor in (views.images, views.depths, views.viewmats, views.K, views.gains):
+        for tensor in (
+            views.images,
+            views.depths,
+            views.valid,
+            views.viewmats,
+            views.K,
+            views.gains,
+        ):
             digest.update(tensor.numpy().tobytes())
         self._capture = digest.hexdigest()
 

@@ -13,6 +13,8 @@ INITIALIZATIONS = ("auto", "depth", "points", "random")
 STRATEGIES = ("auto", "none", "default", "mcmc")
 DISTANCE_FIELDS = ("rendered", "captured")
 DEVICES = ("cpu", "cuda")
+HOLD_OUT = 8
+"""Every so many frames one is held out, unless said otherwise."""
 # [m]
 _FINEST = 0.005
 
@@ -43,9 +45,10 @@ class ReconstructConfig:
     image_width: int = 320
     """[px] that images are shrunk to, as nearly as a whole factor can; 0 keeps their size, and so
     do 0 iterations."""
-    hold_out: int = 8
-    """Every so many frames one, the first included, is withheld from all that fits, and measures
-    the scene; 0 withholds none, and so do 0 iterations."""
+    hold_out: int = -1
+    """Every so many frames one, the first included, is held out from all that fits, and measures
+    the scene; 0 holds out none, and so do 0 iterations. -1 holds out those that the files of the
+    capture hold out or, where they do not say, every eighth."""
 
     depth_weight: float = 0.2
     """lambda_d, the weight of the depth term; 0 looks at colours alone."""
@@ -166,7 +169,7 @@ class ReconstructConfig:
             "initial_gaussians": 1,
             "max_gaussians": 1,
             "image_width": 0,
-            "hold_out": 0,
+            "hold_out": -1,
             "depth_weight": 0,
             "surface_weight": 0,
             "outline_weight": 0,

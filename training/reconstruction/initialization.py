@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, CaptureFrame
-from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.depth_gaussians import frame_gaussians, principal_axes
 from splatpilot.training.reconstruction.overlap import STRIDE, ThinnedFrame, find_new_pixels
 from splatpilot.training.reconstruction.photometry import Photometry
@@ -58,10 +58,19 @@ def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructCo
         strategy = "none" if kind == "depth" else "default"
     iterations = config.iterations
     if iterations < 0:
-        withheld = len(range(0, len(capture), config.hold_out)) if config.hold_out else 0
-        fitting = max(_STEPS_OF_IMAGE * (len(capture) - withheld), _LEAST_STEPS)
+        fitted = len(capture) - len(held_out_frames(capture, config))
+        fitting = max(_STEPS_OF_IMAGE * fitted, _LEAST_STEPS)
         iterations = min(fitting, MOST_STEPS) if kind == "depth" else MOST_STEPS
     return replace(config, initialization=kind, strategy=strategy, iterations=iterations)
+
+
+def held_out_frames(capture: Capture, config: ReconstructConfig) -> list[int]:
+    """Returns the frames that have no part in all that fits."""
+    if config.iterations == 0 or config.hold_out == 0:
+        return []
+    if config.hold_out < 0 and capture.held_out is not None:
+        return list(capture.held_out)
+    return list(range(0, len(capture), config.hold_out if config.hold_out > 0 else HOLD_OUT))
 
 
 def make_initial_gaussians(
@@ -218,8 +227,9 @@ def gaussians_from_points(p_WQ: NDArray, colors: NDArray) -> GaussianScene:
 def random_points(
     frames: Iterable[CaptureFrame], count: int, near: float, far: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns about `count` points p_WQ (n, 3) [m] and colours (n, 3) along random rays of the
-    cameras, at depths whose inverse is uniform from `near` to `far` [m], coloured as the rays."""
+    """Returns at most `count` points p_WQ (n, 3) [m] and colours (n, 3) along random rays of the
+    cameras through valid pixels, at depths whose inverse is uniform from `near` to `far` [m],
+    coloured as the rays."""
     rng = np.random.default_rng(seed)
     frames = list(frames)
     each = -(-count // len(frames))
@@ -228,6 +238,8 @@ def random_points(
         height, width = frame.depth.shape
         u, v = rng.uniform(0, width, each), rng.uniform(0, height, each)
         z = 1 / rng.uniform(1 / far, 1 / near, each)
+        valid = frame.valid[v.astype(int), u.astype(int)]
+        u, v, z = u[valid], v[valid], z[valid]
         points.append(frame.X_WC.multiply(frame.back_project(u, v, z).T).T)
         colors.append(frame.image[v.astype(int), u.astype(int)] / 255)
     return np.concatenate(points)[:count], np.concatenate(colors)[:count]

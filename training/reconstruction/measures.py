@@ -33,7 +33,7 @@ _SHOWN = {
 @dataclass(frozen=True)
 class ViewMeasures:
     """One view against the truth. Depth is not measured where the truth has none, and nothing in
-    pixels that are left out because no camera saw what they show."""
+    pixels that are left out because they are invalid or no camera saw what they show."""
 
     psnr_db: float  # [dB], before the scene's own background
     psnr_on_black_db: float  # [dB], before black, except where the truth is infinitely far
@@ -176,13 +176,12 @@ def measure_view(
         background: of the scene.
         frame: the truth, of the same size.
         vignetting: of the capture, see `vignette`.
-        seen: (H, W), the pixels to measure, see `seen_pixels`; all if None. For structure and
-            perception, whose windows reach over others, these are as they should be.
+        seen: (H, W), the pixels to measure, if they are valid, see `seen_pixels`; all if None. For
+            structure and perception, whose windows reach over others, these are as they should be.
         lpips: the perceptual distance; None leaves it out.
     """
     truth, far = frame.image / 255, frame.depth >= FAR
-    if seen is None:
-        seen = np.ones(far.shape, dtype=bool)
+    seen = frame.valid if seen is None else seen & frame.valid
     true_depth = np.where(seen, frame.depth, 0)
     view = put_behind(on_black, background, frame.K, frame.X_WC)
     before_black = np.where(far[..., None], view.color, on_black.color)

@@ -70,7 +70,11 @@ class Objective:
             loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
         else:
             target = self._views.target(k, gain, backdrop.cpu()[0]).to(device)
-            loss = self._color_loss(rendering.color, target, step)
+            valid = self._views.valid[k].to(device)[..., None]
+            color, invalid = rendering.color, rendering.color.detach()
+            # Both are the same where pixels are invalid, so that windows compare nothing there.
+            color, target = (torch.where(valid, image, invalid) for image in (color, target))
+            loss = self._color_loss(color, target, step)
         if config.depth_weight > 0:
             loss = loss + config.depth_weight * log_depth_loss(rendering.depth, depth, edges)
         if config.surface_weight > 0:

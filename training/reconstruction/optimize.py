@@ -195,9 +195,10 @@ class Optimization:
         """Sets the gain of each image to what suits what is seen so far; their mean stays 1."""
         views = self._views
         gains = []
-        for seen, image in zip(self._renderings(views), views.images, strict=True):
+        for k, seen in enumerate(self._renderings(views)):
             color = seen.color * views.vignette[..., None]
-            gains.append(fit_gain(color, seen.alpha[..., None] * image / 255))
+            image = seen.alpha[..., None] * views.images[k] / 255
+            gains.append(fit_gain(color, image, views.valid[k]))
         log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
         self.gains = torch.exp(log_gains - log_gains.mean())
 

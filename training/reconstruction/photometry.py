@@ -81,9 +81,9 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
     return Photometry(np.exp(log_gains), float(min(x[n], 0)))
 
 
-def fit_gain(color: Tensor, image: Tensor) -> float:
+def fit_gain(color: Tensor, image: Tensor, valid: Tensor) -> float:
     """Returns the factor by which `color` (H, W, 3) comes nearest to `image` in the least-squares
-    sense, over pixels that are not saturated."""
-    usable = image < _BRIGHTNESS[1]
+    sense, over pixels `valid` (H, W) that are not saturated."""
+    usable = (image < _BRIGHTNESS[1]) & valid[..., None]
     x, y = color[usable].double(), image[usable].double()
     return float((x * y).sum() / (x * x).sum().clamp(min=1e-9))

@@ -26,6 +26,7 @@ from splatpilot.training.reconstruction.environment import learn_background
 from splatpilot.training.reconstruction.initialization import (
     detail_of,
     gaussians_from_depth,
+    held_out_frames,
     make_initial_gaussians,
     resolve_config,
 )
@@ -63,6 +64,7 @@ class ReconstructSummary:
     geodesic: float  # [m], length of the shortest path from start to goal
     held_out: HeldOutMeasures | None = None
     field_difference: FieldDifference | None = None
+    notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
@@ -92,6 +94,7 @@ class ReconstructSummary:
         if self.field_difference is not None:
             rows["rendered field"] = f"{self.field_difference} (against captured depth)"
         lines = [f"{name:<18} {value}" for name, value in rows.items()]
+        lines += [f"note: {note}" for note in self.notes]
         return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
 
 
@@ -116,8 +119,7 @@ def reconstruct(
     config = resolve_config(config, capture)
     if not restart and config.iterations:
         require_same_run(out, config)
-    every = config.hold_out if config.iterations else 0
-    held_out = list(range(0, len(capture), every)) if every else []
+    held_out = held_out_frames(capture, config)
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
     digests: set[str] = set()
@@ -179,6 +181,8 @@ def reconstruct(
         representation=config.representation if config.iterations else "3dgs",
         capture=capture.folder,
         capture_settings=capture.config.settings(),
+        capture_notes=capture.notes,
+        origin=capture.origin,
         held_out=held_out,
         image_width=capture.width // factor if factor > 1 else 0,
         split=split,
@@ -202,6 +206,7 @@ def reconstruct(
         geodesic=geodesic,
         held_out=measured,
         field_difference=difference,
+        notes=tuple(capture.notes),
         warnings=(*capture.dropped, *without_depth, *warnings),
     )
 

@@ -15,6 +15,7 @@ from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.shrink_frame import shrink_mask
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.views import ShrunkFrames
@@ -89,11 +90,17 @@ def render_depth_of(
     capture: Capture, factor: int, gaussians: GaussianScene, representation: str, threads: int
 ) -> DepthSource:
     """Returns what the cameras of a capture would measure in the scene, see `render_depth`, in
-    images shrunken by a whole `factor`."""
+    images shrunken by a whole `factor`; nothing in pixels of which some is invalid."""
     K = capture.K.copy()
     K[:2] /= factor
     width, height = capture.width // factor, capture.height // factor
-    return render_depth(gaussians, representation, K, width, height, capture.X_WCs, threads)
+    rendered = render_depth(gaussians, representation, K, width, height, capture.X_WCs, threads)
+
+    def load(i: int) -> NDArray[np.float32]:
+        valid = np.broadcast_to(capture.load_valid(i), (capture.height, capture.width))
+        return np.where(shrink_mask(valid, factor), rendered.load(i), np.float32(0))
+
+    return DepthSource(load, K, capture.X_WCs)
 
 
 def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:

@@ -34,12 +34,17 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
     """
     with tempfile.TemporaryDirectory(prefix="splatpilot-") as folder:
         images = Path(folder) / "images"
-        images.mkdir()
+        for part in (images, images.parent / "masks"):
+            part.mkdir()
         names = [f"{k:06d}.png" for k in range(len(numbers))]
         for name, i in zip(tqdm(names, "copying", unit="frame"), numbers, strict=True):
             image = capture.load_image(i)
             if not cv2.imwrite(str(images / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
                 raise OSError(f"{images / name}: cannot be written; is the disk full?")
+            valid = np.broadcast_to(capture.load_valid(i), (capture.height, capture.width))
+            mask = images.parent / "masks" / f"{name}.png"
+            if not cv2.imwrite(str(mask), 255 * valid.astype(np.uint8)):
+                raise OSError(f"{mask}: cannot be written; is the disk full?")
         poses = {
             name: capture.X_WCs[i].inverse().GetAsMatrix34()
             for name, i in zip(names, numbers, strict=True)
@@ -100,7 +105,9 @@ def _make_posed_model(
         list(poses),
         camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=pycolmap.ImageReaderOptions(
-            camera_model="PINHOLE", camera_params=",".join(f"{x:.17g}" for x in parameters)
+            camera_model="PINHOLE",
+            camera_params=",".join(f"{x:.17g}" for x in parameters),
+            mask_path=images.parent / "masks",
         ),
         extraction_options=extraction,
         device=pycolmap.Device.cpu,

@@ -17,8 +17,8 @@ from splatpilot.training.captures.shrink_frame import shrink
 from splatpilot.training.reconstruction.losses import depth_edge_weights
 from splatpilot.training.reconstruction.photometry import Photometry
 
-# [bytes], of colour and depth together, and what the frames of a capture may take.
-_PIXEL_SIZE, _MEMORY = 7, 1e9
+# [bytes], of colour, depth and validity together, and what the frames of a capture may take.
+_PIXEL_SIZE, _MEMORY = 8, 1e9
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):
@@ -63,15 +63,17 @@ class ReconstructionViews:
     """
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
-        images, depths, edges, viewmats = [], [], [], []
+        images, depths, edges, valid, viewmats = [], [], [], [], []
         for frame in tqdm(frames, "loading", len(frames), unit="frame"):
             images.append(torch.from_numpy(frame.image))
             depths.append(torch.from_numpy(frame.depth))
             edges.append(depth_edge_weights(depths[-1]).half())
+            valid.append(torch.from_numpy(frame.valid.copy()))
             viewmats.append(torch.from_numpy(frame.X_WC.inverse().GetAsMatrix4()).float())
         self.images = torch.stack(images)  # (n, H, W, 3) uint8
         self.depths = torch.stack(depths)  # (n, H, W) [m]
         self.edges = torch.stack(edges)  # (n, H, W) weights of the depth term
+        self.valid = torch.stack(valid)  # (n, H, W) pixels that are used
         self.viewmats = torch.stack(viewmats)  # (n, 4, 4) X_CW
         self.K = torch.from_numpy(frames[0].K).float()[None]  # (1, 3, 3) [px]
         self.height, self.width = self.depths.shape[1:]
@@ -100,7 +102,8 @@ class ReconstructionViews:
         """Returns a frame as it was given."""
         X_WC = RigidTransform(self.viewmats[k].double().numpy()).inverse()
         K = self.K[0].double().numpy()
-        return CaptureFrame(self.images[k].numpy(), self.depths[k].numpy(), X_WC, K)
+        arrays = (self.images[k].numpy(), self.depths[k].numpy())
+        return CaptureFrame(*arrays, X_WC, K, self.valid[k].numpy())
 
     def target(self, k: int, gain: Tensor, backdrop: Tensor) -> Tensor:
         """(H, W, 3), what the scene should look like before a `backdrop` (3,): the image freed of

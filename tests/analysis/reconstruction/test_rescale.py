@@ -1,6 +1,7 @@
 """Finished scenes in another scale."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
     read_scene_folder,
     write_scene_folder,
 )
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
@@ -140,6 +141,18 @@ def test_factors_multiply(unscaled, tmp_path):
     assert metadata.capture_settings == ["scale.factor=2.0"]
     poses = read_capture_of(tmp_path / "twice", metadata).X_WCs
     np.testing.assert_allclose(poses[0].translation(), [0.25, 0.75, 0.6], atol=1e-9)
+
+
+def test_origin_is_scaled_with_the_scene(unscaled, tmp_path):
+    origin = [100.0, 200.0, -30.0]
+    metadata = replace(read_scene_metadata(unscaled), origin=origin)
+    write_scene_metadata(unscaled, metadata)
+    poses = read_capture_of(unscaled, metadata).X_WCs
+    rescale(unscaled, tmp_path / "scaled", 4.0)
+    scaled = read_scene_metadata(tmp_path / "scaled")
+    assert scaled.origin == [400.0, 800.0, -120.0]
+    for X, Y in zip(poses, read_capture_of(tmp_path / "scaled", scaled).X_WCs, strict=True):
+        np.testing.assert_allclose(Y.translation(), 4 * X.translation(), atol=1e-9)
 
 
 def test_known_height_of_the_cameras_gives_the_scale(unscaled, tmp_path):

@@ -1,11 +1,13 @@
 """Files of Gaussians that other tools write, and what is taken for one."""
 
+import dataclasses
 import gzip
 import struct
 
 import gsply
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.splats.gaussian_ply import write_ply
@@ -139,3 +141,27 @@ def test_claims_of_size(tmp_path):
         (tmp_path / "a.spz").write_bytes(content)
         with pytest.raises(ValueError, match=r"a\.spz would take .* GB of memory"):
             read_splats(tmp_path / "a.spz")
+
+
+def test_far_gaussians_are_read_about_an_origin(tmp_path, caplog):
+    near = random_scene(1)
+    write_ply(near, tmp_path / "near.ply")
+    vertices = PlyData.read(tmp_path / "near.ply")["vertex"].data
+    wide = vertices.astype([(name, "<f8") for name in vertices.dtype.names])
+    far = np.array([456789.0, 5412345.0, 283.0])
+    for axis, offset in zip("xyz", far, strict=True):
+        wide[axis] += offset
+    PlyData([PlyElement.describe(wide, "vertex")]).write(tmp_path / "far.ply")
+    found = read_splats(tmp_path / "far.ply")
+    np.testing.assert_allclose(found.means + found.origin, near.means + far, atol=1e-6)
+    assert np.abs(found.means).max() < 10 and "far.ply: positions are relative to" in caplog.text
+    assert read_splats(tmp_path / "near.ply").origin == (0, 0, 0)
+
+
+def test_origin_turns_and_grows_with_its_gaussians():
+    scene = dataclasses.replace(random_scene(0), origin=(1000.0, 2000.0, 3000.0))
+    X = RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2), [1, 1, 1])
+    moved = scene.transformed_by(X).scaled_by(2)
+    np.testing.assert_allclose(moved.origin, [2000, -6000, 4000])
+    whole = 2 * X.multiply((scene.means.astype(float) + scene.origin).T).T
+    np.testing.assert_allclose(moved.means + moved.origin, whole, atol=1e-3)

@@ -42,6 +42,22 @@ def room(room_views):
     return room
 
 
+@pytest.fixture
+def masked_room(room) -> Capture:
+    """The room with a thing in every image that moves with the camera, red and at 1 m, masked."""
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[40:90, 50:120] = False
+    plain = room()
+
+    def load_image(i: int) -> np.ndarray:
+        return np.where(valid[..., None], plain.load_image(i), np.uint8([255, 0, 0]))
+
+    def load_depth(i: int) -> np.ndarray:
+        return np.where(valid, plain.load_depth(i), np.float32(1))
+
+    return room(load_image=load_image, load_depth=load_depth, load_valid=lambda i: valid)
+
+
 def as_files(capture, change):
     """The poses X_WC that result when the files' X_FB are not what the reader takes them for."""
     R_WF, R_BC = RigidTransform(capture.axes.R_WF), RigidTransform(capture.axes.R_BC)
@@ -57,7 +73,8 @@ def misread_quaternion(X: RigidTransform) -> RigidTransform:
 def test_sound_capture_agrees(room):
     """Exact depth agrees to a fraction of a pixel's slope, and nothing fits better by half."""
     report = check_capture(room())
-    assert report.agrees and report.agreement.error < 0.005 and report.agreement.inside > 0.5
+    assert report.agrees and report.agreement is not None
+    assert report.agreement.error < 0.005 and report.agreement.inside > 0.5
     assert report.color is not None and report.color.cost < 0.1
     assert str(report).endswith("agrees") and "as it was read" in str(report)
 
@@ -73,6 +90,8 @@ FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
          "poses are those of an east-north-up body .* read as a north-east-down body"),
         (lambda X: X @ RigidTransform(NED), "poses are those of optical axes"),
         (misread_quaternion, "quaternions are w x y z, read as x y z w"),
+        (lambda X: RigidTransform(X.rotation().inverse(), X.translation()),
+         "rotations are stored column by column, read row by row"),
         (lambda X: RigidTransform(X.rotation(), X.translation() * [1, -1, -1]),
          "different worlds: up and down differ"),
         (lambda X: RigidTransform(X.rotation(), 10 * X.translation()),
@@ -153,6 +172,19 @@ def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
     assert check_capture(told).agrees
 
 
+def test_colors_that_follow_no_depth_do_not_agree(room):
+    noise = np.random.default_rng(0).integers(0, 256, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    report = check_capture(room(load_image=lambda i: noise[i]))
+    assert not report.agrees and "colors do not follow depth" in report.mistake
+
+
+def test_masked_pixels_have_no_part_in_the_comparison(room, masked_room):
+    report = check_capture(masked_room)
+    assert report.agrees
+    assert report.color is not None and report.color.cost < 0.01
+    assert report.agreement is not None and report.agreement.error < 0.005
+
+
 def test_inaccurate_poses(room):
     """Poses off at random disagree, and no mistake is made up."""
     rng = np.random.default_rng(0)
@@ -178,10 +210,15 @@ def test_doubts(room):
     assert "not checked" in doubt and "too few pixels have depth" in doubt
 
 
-def test_nothing_to_compare(room):
-    """Without depth, or without enough of it, nothing is claimed."""
-    with pytest.raises(ValueError, match="no depth, so there is nothing to compare"):
-        check_capture(room(load_depth=no_depth))
+def test_without_depth_nothing_is_claimed(room):
+    report = check_capture(room(load_depth=no_depth, metric=False, notes=["11 of 11 images"]))
+    assert not report.agrees and not report.mistake
+    lines = str(report).splitlines()
+    assert "11 of 11 images" in lines and "not compared" in lines[-1]
+    assert any("scale is unknown" in line for line in lines)
+
+
+def test_too_little_depth_is_refused(room):
     with pytest.raises(ValueError, match="too few pixels have depth"):
         check_capture(room(load_depth=lambda i: np.zeros((HEIGHT, WIDTH), np.float32)))
 
@@ -217,5 +254,5 @@ def test_real_captures(name, overrides, error, mistake):
     """The real captures agree, and redkitchen read as registered is found out, with its numbers."""
     config = load_config(CaptureConfig(), overrides=overrides)
     report = check_capture(read_capture(Path(os.environ["SPLATPILOT_DATA"]) / name, config))
-    assert error[0] < report.agreement.error < error[1]
+    assert report.agreement is not None and error[0] < report.agreement.error < error[1]
     assert re.search(mistake, report.mistake) if mistake else report.agrees

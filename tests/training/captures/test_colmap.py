@@ -146,10 +146,103 @@ def test_depth_of_some_images(model, K, room_views, room_poses):
     assert capture.load_depth(0) is None and not capture.frame(0).depth.any()
 
 
+@pytest.fixture
+def tracked(model):
+    """The model, each of whose points its next image shows too, if it sees it."""
+    reconstruction = pycolmap.Reconstruction(model / "sparse/0")
+    for number in range(1, 10):
+        seen = [point.point3D_id for point in reconstruction.images[number].points2D][:60]
+        image = reconstruction.images[number + 1]
+        for each in seen:
+            pixel = image.project_point(reconstruction.points3D[each].xyz)
+            if pixel is not None and (pixel >= 0).all() and (pixel < [64, 48]).all():
+                image.points2D.append(pycolmap.Point2D(pixel))
+                element = pycolmap.TrackElement(number + 1, len(image.points2D) - 1)
+                reconstruction.add_observation(each, element)
+    reconstruction.write(model / "sparse/0")
+    return model
+
+
+@pytest.mark.parametrize("name", ["00.png.png", "00.png"])
+def test_masks_of_images_are_those_of_their_names(model, name):
+    (model / "masks").mkdir()
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:24] = 0
+    cv2.imwrite(str(model / "masks" / name), mask)
+    capture = read_capture(model)
+    np.testing.assert_array_equal(capture.frame(0).valid, mask > 0)
+    assert capture.frame(1).valid.all()
+
+
+def test_points_that_only_masked_pixels_show_are_left_out(tracked):
+    before = read_capture(tracked).points
+    (tracked / "masks").mkdir()
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:, :32] = 0
+    for i in range(10):
+        cv2.imwrite(str(tracked / f"masks/{i:02d}.png.png"), mask)
+    capture = read_capture(tracked)
+    assert before is not None and capture.points is not None
+    assert 50 < len(capture.points.p_WQ) < len(before.p_WQ) / 2
+    times = np.zeros(len(capture.points.p_WQ), int)
+    for X_WC in capture.X_WCs:
+        x, y, z = capture.K @ X_WC.inverse().multiply(capture.points.p_WQ.T)
+        times += (z > 0) & (x / z > 31) & (x / z < 64) & (y / z > 0) & (y / z < 48)
+    assert (times >= 2).all()
+
+
+@pytest.fixture
+def rig(model):
+    """The model with its images in two subfolders, the last five under the names of the first."""
+    reconstruction = pycolmap.Reconstruction(model / "sparse/0")
+    for image in reconstruction.images.values():
+        i = image.image_id - 1
+        image.name = f"cam{i // 5}/{i % 5:02d}.png"
+        file = model / "images" / image.name
+        file.parent.mkdir(exist_ok=True)
+        (model / f"images/{i:02d}.png").rename(file)
+    reconstruction.write(model / "sparse/0")
+    return model
+
+
+def test_images_in_subfolders_keep_their_paths(rig, room_poses):
+    capture = read_capture(rig)
+    assert list(capture.frame_names) == [f"cam{k}/{i:02d}.png" for k in (0, 1) for i in range(5)]
+    baseline = room_poses[0].translation() - room_poses[5].translation()
+    between, distance = ["cam0/00.png", "cam1/00.png"], float(np.linalg.norm(baseline))
+    scaled = read_capture(rig, CaptureConfig(scale=ScaleConfig(between=between, distance=distance)))
+    np.testing.assert_allclose(lengths(scaled), true_lengths(room_poses), rtol=1e-9)
+
+
+def test_pixels_of_images_in_subfolders_are_located(rig):
+    point = pycolmap.Reconstruction(rig / "sparse/0").images[6].points2D[7].xy
+    between = [f"cam1/00.png@{point[0]},{point[1]}", "cam0/01.png"]
+    assert read_capture(rig, CaptureConfig(scale=ScaleConfig(between=between, distance=2))).metric
+
+
+def test_depth_of_images_in_subfolders_is_in_subfolders_too(rig, K, room_views):
+    views = room_views(K, 64, 48)
+    (rig / "depth/cam1").mkdir(parents=True)
+    np.save(rig / "depth/cam1/02.npy", (1000 * views[7].depth).astype(np.float32))
+    capture = read_capture(rig, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
+    np.testing.assert_allclose(capture.frame(7).depth, views[7].depth, rtol=1e-5)
+    assert capture.load_depth(2) is None
+
+
+def test_image_name_that_means_several_is_refused(rig):
+    scale = ScaleConfig(between=["00.png", "cam1/01.png"], distance=1)
+    message = "several registered images are called '00.png'; choose one of cam0/00.png, cam1/00"
+    with pytest.raises(ValueError, match=message):
+        read_capture(rig, CaptureConfig(scale=scale))
+
+
 @pytest.mark.parametrize(
     ("scale", "message"),
     [
-        (ScaleConfig(between=["00.png", "xx.png"], distance=1), "no registered image 'xx.png'"),
+        (
+            ScaleConfig(between=["00.png", "xx.png"], distance=1),
+            "no registered image is called 'xx.png'",
+        ),
         (ScaleConfig(between=["00.png", "00.png"], distance=1), "are the same place"),
         (ScaleConfig(between=["00.png@900,1", "00.png"], distance=1), "no registered point within"),
         (ScaleConfig(between=["00.png@9", "00.png"], distance=1), "does not end in a pixel"),

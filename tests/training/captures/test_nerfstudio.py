@@ -9,6 +9,14 @@ from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConf
 from splatpilot.training.captures.read_capture import read_capture
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def pinhole_rays(K, width, height):
+    """The rays (H, W, 2), x/z and y/z, of the pixels of a pinhole."""
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+
+
 DISTORTION = {"k1": -0.15, "k2": 0.03, "p1": 0.002, "p2": -0.001}
 
 
@@ -119,6 +127,146 @@ def test_depth_of_another_view_is_refused(write, room_views, K):
         read_capture(path)
 
 
+def change(path, **keys):
+    """Adds keys to the file or, of the frame i, as `frame_i`."""
+    content = json.loads((path / "transforms.json").read_text())
+    for key, value in keys.items():
+        if key.startswith("frame_"):
+            content["frames"][int(key[6:])] |= value
+        else:
+            content[key] = value
+    (path / "transforms.json").write_text(json.dumps(content))
+    return path
+
+
+def test_pixels_are_valid_where_the_mask_is_not_black(write):
+    path = write()
+    mask = np.full((48, 64), 1, np.uint8)
+    mask[10:30, 20:50] = 0
+    cv2.imwrite(str(path / "mask.png"), mask)
+    capture = read_capture(change(path, frame_3={"mask_path": "mask.png"}))
+    frame = capture.frame(3)
+    np.testing.assert_array_equal(frame.valid, mask > 0)
+    np.testing.assert_array_equal(frame.depth > 0, mask > 0)
+    assert capture.frame(2).valid.all()
+    assert any("1 of 10 images have a mask" in note for note in capture.notes)
+
+
+def test_pixels_are_invalid_where_alpha_is_less_than_a_half(write):
+    path = write()
+    image = cv2.imread(str(path / "05.png"))
+    alpha = np.repeat(np.linspace(0, 255, 64).astype(np.uint8)[None], 48, axis=0)
+    cv2.imwrite(str(path / "05.png"), np.dstack([image, alpha]))
+    capture = read_capture(path)
+    frame = capture.frame(5)
+    np.testing.assert_array_equal(frame.valid, alpha >= 128)
+    np.testing.assert_array_equal(frame.image, image[..., ::-1])
+    assert not frame.depth[alpha < 128].any()
+    assert any("1 of 10 images have an alpha channel" in note for note in capture.notes)
+
+
+def test_pixels_interpolated_from_masked_ones_are_invalid(write):
+    path = write(camera_model="OPENCV", k1=-0.2)
+    image = np.full((48, 64, 3), 100, np.uint8)
+    image[20:28, 24:40] = 255
+    for i in range(10):
+        cv2.imwrite(str(path / f"{i:02d}.png"), image)
+    cv2.imwrite(str(path / "mask.png"), np.uint8(image[..., 0] == 100))
+    masks = {f"frame_{i}": {"mask_path": "mask.png"} for i in range(10)}
+    frame = read_capture(change(path, **masks)).frame(0)
+    assert 0.8 < frame.valid.mean() < 1
+    assert (frame.image[frame.valid] == 100).all()
+
+
+def test_frame_with_a_mask_of_another_size_is_left_out(write):
+    path = write()
+    cv2.imwrite(str(path / "mask.png"), np.ones((24, 32), np.uint8))
+    capture = read_capture(change(path, frame_0={"mask_path": "mask.png"}))
+    assert len(capture) == 9 and "mask.png: 32x24 pixels" in capture.dropped[0]
+
+
+@pytest.mark.parametrize(
+    ("keys", "held_out", "frames"),
+    [
+        ({}, None, 10),
+        ({"test_filenames": ["./03.png"], "val_filenames": ["04.png"]}, [3, 4], 10),
+        ({"train_filenames": [f"{i:02d}.png" for i in range(7)], "test_filenames": ["08.png"]},
+         [7], 8),
+        ({"test_frames": ["09.png"]}, [9], 10),
+    ],
+)  # fmt: skip
+def test_the_files_own_split_is_kept(write, keys, held_out, frames):
+    capture = read_capture(change(write(), **keys))
+    assert capture.held_out == held_out and len(capture) == frames
+    assert len(capture.dropped) == 10 - frames
+
+
+def test_frames_of_their_own_for_tests_are_held_out(write):
+    path = write()
+    content = json.loads((path / "transforms.json").read_text())
+    frames = content["frames"]
+    capture = read_capture(change(path, frames=frames[:6], test_frames=frames[6:]))
+    assert len(capture) == 10 and capture.held_out == [6, 7, 8, 9]
+
+
+def test_frames_that_are_flagged_as_bad_are_left_out_however_many(write):
+    path = write()
+    bad = {f"frame_{i}": {"is_bad": True} for i in (1, 2, 5, 6)}
+    capture = read_capture(change(path, **bad))
+    assert len(capture) == 6 and "02.png is_bad" in capture.dropped[1]
+
+
+def test_keys_that_are_not_used_are_named(write):
+    path = change(write(), aabb_scale=16, applied_scale=1.0, frame_2={"sharpness": 30.0})
+    assert "transforms.json: aabb_scale, sharpness is not used" in read_capture(path).notes
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_RADIAL"])
+def test_distortion_to_the_eighth_power_is_taken_out(write, K, shows_room, trace_rays, model):
+    k = [0.02, -0.01, 0.005, 0.4]
+    v, u = np.mgrid[0:48, 0:64] + 0.5
+    bent = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+    rays = bent.copy()
+    for _ in range(50):
+        r2 = (rays**2).sum(axis=-1, keepdims=True)
+        rays = bent / (1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3 + k[3] * r2**4)
+    path = write(rays, camera_model=model, k1=k[0], k2=k[1], k3=k[2], k4=k[3])
+    captures = [read_capture(path)]
+    listed = change(path, k1=0, k2=0, k3=0, k4=0, distortion_params=[*k, 0, 0])
+    for capture in (*captures, read_capture(listed)):
+        shows_room(capture, color=2.0, depth=0.01)
+        corner = pinhole_rays(capture.K, 64, 48)[:6, :6]
+        frame = capture.frame(0)
+        seen = trace_rays(frame.X_WC, corner)
+        np.testing.assert_allclose(frame.depth[:6, :6], seen.depth, rtol=0.03)
+
+
+def test_fisheye_is_cropped_to_its_radius(write, K):
+    path = write(camera_model="OPENCV_FISHEYE", fisheye_crop_radius=20.0)
+    for i in range(10):
+        image = np.zeros((48, 64, 3), np.uint8)
+        image[np.hypot(*(np.mgrid[0:48, 0:64] + 0.5 - np.array([24, 32])[:, None, None])) < 21] = 90
+        cv2.imwrite(str(path / f"{i:02d}.png"), image)
+    assert (read_capture(path).frame(0).image == 90).all()
+
+
+def test_intrinsics_and_where_they_come_from_are_noted(write):
+    path = write()
+    assert (
+        "fx 50.0, fy 52.0, cx 31.0, cy 25.0 px for 64x48 px, from transforms.json"
+        in (read_capture(path).notes[0])
+    )
+    given = read_capture(path, CaptureConfig(intrinsics=[40, 41, 32, 24]))
+    assert given.notes[0].endswith("fx 40.0, fy 41.0, cx 32.0, cy 24.0 px for 64x48 px, from "
+                                   "capture.intrinsics")  # fmt: skip
+
+
+def test_eccentric_principal_point_is_noted(write):
+    assert any(
+        "(10.0, 25.0) px is far from the center" in n for n in read_capture(write(cx=10)).notes
+    )
+
+
 def test_scale(write, room_poses):
     """Without depth the scale is unknown, until two cameras' distance is given."""
     path = write(depth=False)
@@ -150,7 +298,7 @@ def test_points(write):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is EQUIRECTANGULAR; known are"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be .*, got EQUIRECTANGULAR"),
         ({"fl_x": "wide"}, r"transforms\.json: the camera of 00\.png is not described"),
         ({"frames": 3}, r"transforms\.json: not nerfstudio's format"),
         ({"frames": [{"file_path": "00.png"}]}, r"transforms\.json: .*transform_matrix"),
@@ -165,7 +313,10 @@ def test_points(write):
         ({"fl_x": -40}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[-40"),
         ({"fl_x": 1e300}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[1e\+300"),
         ({"fl_x": np.nan}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[nan"),
-        ({"cx": np.nan}, r"transforms\.json: the camera of 00\.png .*principal point of \[nan"),
+        ({"cx": 64.5}, r"principal point must be in the image of 64x48 px, got \[64\.5"),
+        ({"test_filenames": ["99.png"]}, r"its split names 99\.png"),
+        ({"train_filenames": []}, "its split leaves no frame"),
+        ({"cx": np.nan}, r"transforms\.json: the camera of 00\.png .*principal point .* got \[nan"),
         ({"k1": np.nan}, r"transforms\.json: the camera of 00\.png .*distortion"),
     ],
 )

@@ -206,12 +206,14 @@ def test_distance_to_a_mesh(room):
 
 def test_bad_input_is_named(room, tmp_path, capsys):
     """Each mistake ends with status 1, one message that says what is wrong, and no capture."""
-    (tmp_path / "world.glb").write_bytes(b"x")
+    (tmp_path / "world.stl").write_bytes(b"x")
+    (tmp_path / "damaged.glb").write_bytes(b"x")
     (tmp_path / "damaged.gltf").write_text("{")
     out = tmp_path / "capture"
     for world, options, message in (
         (tmp_path / "no.gltf", [], "no such file"),
-        (tmp_path / "world.glb", [], "not .glb"),
+        (tmp_path / "world.stl", [], "a mesh must be one of .gltf, .glb, .obj"),
+        (tmp_path / "damaged.glb", [], "damaged.glb: not a readable mesh"),
         (tmp_path / "damaged.gltf", [], "damaged.gltf"),
         (room, ["--path", "1,2"], "finite points"),
         (room, ["--path", "a b"], "separated by spaces"),
@@ -232,6 +234,12 @@ def test_other_contents_are_not_overwritten(opengl, room, tmp_path):
     with pytest.raises(ValueError, match="holds something other"):
         run(world=room, out=tmp_path / "capture", config=small())
     assert len(read_capture(tmp_path / "capture")) == 4
+
+
+def test_captures_of_meshes_drawn_otherwise_are_refused(tmp_path):
+    (tmp_path / "world.yaml").write_text("mesh: room.obj\n")
+    with pytest.raises(ValueError, match=r"world\.yaml: version must be 2, got 1; render it again"):
+        true_camera(tmp_path)
 
 
 def test_captures_of_other_kinds_have_no_true_camera(tmp_path):

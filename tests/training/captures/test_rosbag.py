@@ -52,7 +52,9 @@ class Bag:
         raw = serialize(self.message(kind, **fields), kind)
         self._writer.write(self._connections[topic], int(1e9 * time), raw)
 
-    def images(self, compressed: bool = False, depth32: bool = False) -> None:
+    def images(
+        self, compressed: bool = False, depth32: bool = False, color: str = "/color"
+    ) -> None:
         for i, view in enumerate(self.views):
             time = START + i / 30
             header = self.header(time, FRAME)
@@ -61,7 +63,7 @@ class Bag:
             if compressed:
                 png = cv2.imencode(".png", view.image[..., ::-1])[1]
                 self.write(
-                    "/color/compressed", "sensor_msgs/msg/CompressedImage", time,
+                    f"{color}/compressed", "sensor_msgs/msg/CompressedImage", time,
                     header=header, format="bgr8; png compressed bgr8", data=png.ravel(),
                 )  # fmt: skip
                 a, b = 2000.0, 100.0
@@ -79,7 +81,7 @@ class Bag:
             padded = np.zeros((height, width + 2, 3), np.uint8)  # rows of 8 bytes more
             padded[:, :width] = view.image[..., ::-1]
             for topic, encoding, pixels, step in (
-                ("/color", "bgr8", padded, 3 * (width + 2)),
+                (color, "bgr8", padded, 3 * (width + 2)),
                 ("/depth", "32FC1", depth, 4 * width) if depth32 else
                 ("/depth", "16UC1", millimetres, 2 * width),
             ):  # fmt: skip
@@ -89,17 +91,30 @@ class Bag:
                     data=np.ascontiguousarray(pixels).view(np.uint8).ravel(),
                 )  # fmt: skip
 
-    def calibration(self, model: str = "plumb_bob") -> None:
+    def calibration(
+        self,
+        model: str = "plumb_bob",
+        topic: str = "/info",
+        scale: float = 1.0,
+        rectified: bool = False,
+    ) -> None:
+        """That of the room's camera, with focal lengths `scale` times as long; of `rectified`
+        images P is right, and K and D are others."""
         matrix = np.array(self.K)
         matrix[:2, 2] -= 0.5
+        matrix[[0, 1], [0, 1]] *= scale
+        projection, distortion = np.zeros((3, 4)), np.zeros(5)
+        if rectified:
+            projection[:, :3], matrix = matrix, np.diag([0.9, 0.9, 1]) @ matrix
+            distortion[0] = -0.25
         roi = self.message(
             "sensor_msgs/msg/RegionOfInterest",
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
         )  # fmt: skip
         names = "DKRP" if self._one else "dkrp"
-        arrays = (np.zeros(5), matrix.ravel(), np.eye(3).ravel(), np.zeros(12))
+        arrays = (distortion, matrix.ravel(), np.eye(3).ravel(), projection.ravel())
         self.write(
-            "/info", "sensor_msgs/msg/CameraInfo", START, header=self.header(START, FRAME),
+            topic, "sensor_msgs/msg/CameraInfo", START, header=self.header(START, FRAME),
             height=48, width=64, distortion_model=model, binning_x=0, binning_y=0, roi=roi,
             **dict(zip(names, arrays, strict=True)),
         )  # fmt: skip
@@ -202,6 +217,53 @@ def test_compressed_images(bag, config, shows_room, depth32):
     shows_room(read_capture(recorded.close(), config()), color=0.5, depth=0.01)
 
 
+@pytest.mark.parametrize("compressed", [False, True])
+def test_rectified_images_are_described_by_the_projection(bag, config, shows_room, compressed):
+    recorded = bag(1)
+    recorded.images(compressed, color="/camera/image_rect_color")
+    recorded.calibration(topic="/camera/camera_info", rectified=True)
+    recorded.mount()
+    recorded.odometry()
+    capture = read_capture(recorded.close(), config())
+    np.testing.assert_allclose(capture.K, recorded.K)
+    assert capture.notes[0].endswith("from /camera/camera_info, P without distortion")
+    shows_room(capture, color=0.5, depth=0.01)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_calibration_is_in_the_namespace_of_the_images(bag, config, compressed):
+    recorded = bag(1)
+    recorded.images(compressed, color="/camera/color/image_raw")
+    recorded.calibration(topic="/camera/aligned/camera_info", scale=1.3)
+    recorded.calibration(topic="/camera/color/camera_info")
+    recorded.mount()
+    recorded.odometry()
+    np.testing.assert_allclose(read_capture(recorded.close(), config()).K, recorded.K)
+
+
+@pytest.mark.parametrize(
+    ("calibrations", "problem"),
+    [
+        ([{"topic": "/a/info", "scale": 1.3}, {"topic": "/b/info"}],
+         "/a/info, /b/info differ, and none is beside /camera/color"),
+        ([{"model": "omnidirectional"}], "/info has the distortion 'omnidirectional'"),
+    ],
+)  # fmt: skip
+def test_calibration_that_cannot_be_used_is_not_needed_if_intrinsics_are_given(
+    bag, config, calibrations, problem
+):
+    recorded = bag(1)
+    recorded.images(color="/camera/color")
+    for calibration in calibrations:
+        recorded.calibration(**calibration)
+    recorded.mount()
+    recorded.odometry()
+    path = recorded.close()
+    with pytest.raises(ValueError, match=f"{problem}.*; set capture.intrinsics"):
+        read_capture(path, config())
+    assert read_capture(path, config(intrinsics=[50, 52, 31, 25])).K[0, 0] == 50
+
+
 def test_the_bag_is_read_once(bag, config, shows_room):
     """The second time the bag is not read, but what was written; other settings are."""
     recorded = bag(2)
@@ -209,7 +271,7 @@ def test_the_bag_is_read_once(bag, config, shows_room):
     recorded.odometry()
     recorded.mount()
     path = recorded.close()
-    with pytest.raises(ValueError, match=r"has no calibration of the colour camera.*intrinsics"):
+    with pytest.raises(ValueError, match=r"has no calibration of the color camera.*intrinsics"):
         read_capture(path, config())
     database = next(path.glob("*.db3"))
     size, times = database.stat().st_size, database.stat()

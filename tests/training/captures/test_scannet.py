@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.read_capture import read_capture
 
 K_D = np.array([[24.0, 0, 16], [0, 24.0, 12], [0, 0, 1]])
@@ -31,6 +32,16 @@ def test_room(write, shows_room):
     capture = read_capture(write)
     assert capture.source.startswith("ScanNet") and not capture.dropped
     shows_room(capture, color=0.5, depth=0.03)
+
+
+def test_intrinsics_of_larger_images_are_refused(write, K):
+    matrix = np.eye(4)
+    matrix[:2, :3] = [[117.019, 0, 64.275], [0, 117.019, 47.875]]
+    np.savetxt(write / "intrinsic/intrinsic_color.txt", matrix)
+    with pytest.raises(ValueError, match=r"principal point must be in the image of 64x48 px, got"):
+        read_capture(write)
+    given = CaptureConfig(intrinsics=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    np.testing.assert_allclose(read_capture(write, given).K, K)
 
 
 def test_lost_tracking_is_no_damage(write):

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
@@ -52,6 +54,16 @@ def test_edges_holes_and_sky():
     )
     expected = [[1, 0, inf, 4], [1, 2, 0, 2 / (1 + 1 / 1.02)]]
     np.testing.assert_allclose(shrink(frame_of(depth), 2).depth, expected, rtol=1e-6)
+
+
+def test_pixels_are_valid_that_replace_valid_ones_alone():
+    frame = frame_of(np.ones((5, 8)))
+    valid = np.ones((5, 8), bool)
+    valid[1, 2] = valid[3, 6:] = valid[4] = False
+    small = shrink(dataclasses.replace(frame, valid=valid), 2)
+    expected = [[True, False, True, True], [True, True, True, False]]
+    np.testing.assert_array_equal(small.valid, expected)
+    np.testing.assert_array_equal(small.depth > 0, expected)
 
 
 def test_colours_are_averaged():

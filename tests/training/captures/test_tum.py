@@ -61,6 +61,41 @@ def test_known_camera_is_undistorted(write, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "center"),
+    [
+        ("fr1_desk", (319.1, 255.8)),
+        ("rgbd_dataset_freiburg2_xyz", (325.6, 250.2)),
+        ("fr3_office", (320.6, 248.1)),
+        ("rgbd_bonn_balloon", (316.09352, 238.256098)),
+        ("afr1_desk", (320.0, 240.0)),
+    ],
+)
+def test_name_of_the_folder_tells_the_camera(write, tmp_path, name, center):
+    capture = read_capture(write.rename(tmp_path.with_name(name)))
+    np.testing.assert_allclose(capture.K[:2, 2], np.array(center) / 8)
+    assert ("set capture.intrinsics" in capture.notes[0]) == (name == "afr1_desk")
+
+
+def test_bag_that_the_list_names_tells_the_camera(write):
+    text = (write / "rgb.txt").read_text()
+    (write / "rgb.txt").write_text(f"# file: 'rgbd_dataset_freiburg1_desk.bag'\n{text}")
+    capture = read_capture(write)
+    np.testing.assert_allclose(capture.K[:2, 2], np.array([319.1, 255.8]) / 8)
+    assert capture.notes[0].endswith("from the name freiburg1")
+
+
+def test_calibration_beside_the_images_is_read(write):
+    (write / "calibration.txt").write_text("62.8742 63.5 38.3309 29.5\n")
+    capture = read_capture(write)
+    expected = [[62.8742, 0, 38.8309], [0, 63.5, 30], [0, 0, 1]]
+    np.testing.assert_allclose(capture.K, expected)
+    assert capture.notes[0].endswith("from calibration.txt")
+    (write / "calibration.txt").write_text("fx: 62.8742\n")
+    with pytest.raises(ValueError, match=r"calibration\.txt: must be fx fy cx cy"):
+        read_capture(write)
+
+
+@pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("depth.txt", "# nothing\n", r"depth\.txt: lists no file"),

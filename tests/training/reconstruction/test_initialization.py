@@ -9,6 +9,7 @@ from splatpilot.training.reconstruction.initialization import (
     Detail,
     gaussians_from_depth,
     gaussians_from_points,
+    held_out_frames,
     random_points,
     resolve_config,
 )
@@ -23,8 +24,8 @@ class Frames:
 
     points = None
 
-    def __init__(self, count, has_depth):
-        self.count, self.has_depth = count, has_depth
+    def __init__(self, count, has_depth, held_out=None):
+        self.count, self.has_depth, self.held_out = count, has_depth, held_out
 
     def __len__(self):
         return self.count
@@ -86,6 +87,41 @@ def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path, cap
     assert np.linalg.norm(some.scales, axis=1).mean() > np.linalg.norm(every.scales, axis=1).mean()
     with pytest.raises(ValueError, match="20 Gaussians are too few"):
         gaussians_from_depth(frames, photometry, replace(detail, max_gaussians=20, optimized=False))
+
+
+def test_masked_blob_has_no_part_in_gaussians(write_room, tmp_path):
+    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+    valid = np.ones((capture.height, capture.width), bool)
+    valid[15:33, 20:44] = False
+    masked = replace(
+        capture,
+        load_image=lambda i: np.where(
+            valid[..., None], capture.load_image(i), np.uint8([255, 0, 255])
+        ),
+        load_valid=lambda i: valid,
+    )
+    frames = list(masked.frames())
+    photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
+    detail = Detail(max_gaussians=100_000, optimized=True, **COARSE)
+    scene = gaussians_from_depth(frames, photometry, detail)
+    _, colors = random_points(frames, 5000, 0.5, 8.0, seed=0)
+    for found in (scene.base_colors, colors):
+        magenta = (found[:, 0] > 0.95) & (found[:, 1] < 0.05) & (found[:, 2] > 0.95)
+        assert len(found) > 500 and not magenta.any()
+
+
+@pytest.mark.parametrize(
+    ("asked", "own", "expected"),
+    [
+        (-1, None, [0, 8]),
+        (-1, [3, 4], [3, 4]),
+        (5, [3, 4], [0, 5]),
+        (0, [3, 4], []),
+    ],
+)
+def test_frames_held_out_are_those_of_the_files_unless_told_otherwise(asked, own, expected):
+    config = ReconstructConfig(hold_out=asked)
+    assert held_out_frames(Frames(10, True, own), config) == expected  # pyright: ignore[reportArgumentType]
 
 
 def test_points_become_gaussians_of_their_spacing():

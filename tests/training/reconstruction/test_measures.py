@@ -179,6 +179,26 @@ def test_a_translucent_surface_is_a_hole():
     assert measure_view(opaque, gray, frame).psnr_on_black_db > 50
 
 
+def test_masked_pixels_are_not_measured():
+    color = noise().astype(np.float32)
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[8:] = False
+    image = np.round(255 * color).astype(np.uint8)
+    image[~valid] = 255, 0, 0
+    measured = np.where(valid, depth, 0)
+    view = RenderedView(color, depth, np.ones_like(depth))
+    frame = CaptureFrame(image, measured, RigidTransform(), K, valid)
+    found = measure_view(view, (0.0, 0.0, 0.0), frame)
+    assert found.psnr_db > 50 and found.gain == pytest.approx(1, abs=1e-3)
+    assert found.unseen_fraction == pytest.approx(1 - valid.mean())
+    seen = np.zeros_like(valid)
+    seen[4:12] = True
+    half = measure_view(view, (0.0, 0.0, 0.0), frame, seen=seen)
+    assert half.psnr_db > 50
+    assert half.unseen_fraction == pytest.approx(1 - (seen & valid).mean())
+
+
 def test_what_no_camera_saw_is_left_out():
     """Pixels that are not to be measured have no part in any figure but their share."""
     color = noise().astype(np.float32)

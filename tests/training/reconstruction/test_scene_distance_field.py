@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.scene_distance_field import (
@@ -12,6 +13,7 @@ from splatpilot.training.reconstruction.scene_distance_field import (
     add_sky,
     choose_grid,
     fuse,
+    render_depth_of,
 )
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
@@ -45,6 +47,36 @@ def test_space_before_the_sky_is_free_only_where_a_fitted_frame_measured_it():
     grid = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
     states = fuse(sky, grid).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
     np.testing.assert_array_equal(states, [FieldState.FREE, FieldState.UNKNOWN])
+
+
+def test_masked_pixels_leave_space_unknown():
+    valid = np.ones((60, 80), bool)
+    valid[:, 40:] = False
+    capture = Capture(
+        name="half",
+        source="a test",
+        K=K,
+        width=80,
+        height=60,
+        X_WCs=[RigidTransform()],
+        load_image=lambda i: np.zeros((60, 80, 3), np.uint8),
+        load_depth=lambda i: np.full((60, 80), 2.0, np.float32),
+        load_valid=lambda i: valid,
+    )
+    measured = DepthSource(capture.registered_depth, K, capture.X_WCs)
+    points = np.stack(np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)), axis=-1)
+    wall = GaussianScene.from_colors(
+        np.dstack([points, np.full((61, 61), 2.0)]).reshape(-1, 3),
+        np.tile([1.0, 0, 0, 0], (61**2, 1)),
+        np.tile([0.1, 0.1, 1e-3], (61**2, 1)),
+        np.full(61**2, 0.99),
+        np.zeros((61**2, 3)),
+    )
+    rendered = render_depth_of(capture, 2, wall, "3dgs", 1)
+    grid = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
+    for source in (measured, rendered):
+        states = fuse(source, grid).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
+        np.testing.assert_array_equal(states, [FieldState.FREE, FieldState.UNKNOWN])
 
 
 def _wall(depth: float) -> DepthSource:
