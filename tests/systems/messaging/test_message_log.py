@@ -87,6 +87,20 @@ def test_lcms_own_programs_read_our_log(listener, udp_url, tmp_path):
     assert heard == messages
 
 
+def test_a_full_disk_ends_the_log_with_one_warning_and_nothing_else(caplog):
+    transport, heard = lcm.LCM("memq://"), []
+    transport.subscribe(CHANNEL, lambda _, data: heard.append(data))
+    with recorded(transport, Path("/dev/full"), overwrite=True):
+        for _ in range(100):
+            transport.publish(CHANNEL, bytes(1000))
+            while transport.handle_timeout(0):
+                pass
+    assert len(heard) == 100
+    assert [record.message for record in caplog.records] == [
+        "/dev/full cannot be written, the log ends here: No space left on device"
+    ]
+
+
 def test_bad_logs_are_errors(listener, tmp_path):
     """A log that is missing, empty or none is an error that names it; none is overwritten."""
     (tmp_path / "junk").write_bytes(b"this is no log of LCM" * 10)
