@@ -124,7 +124,7 @@ def BuildHardwareDiagram(
     received: dict[str, MessageSubscriber | TimeOfFlightReceiver] = {
         "state": add_subscriber(StateCodec())
     }
-    predictor = StatePredictor()
+    predictor = StatePredictor(config.failsafe.max_age)  # As long as states are flown by.
     builder.AddNamedSystem("state_predictor", predictor)
     builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
     builder.Connect(received["state"].age_output_port(), predictor.age_input_port())

@@ -17,7 +17,7 @@ from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.messaging.failsafe_checks import Box, Signals, what_is_wrong
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.failsafe_modes import Memory
-from splatpilot.systems.messaging.failsafe_velocity import Surroundings, flown_setpoint
+from splatpilot.systems.messaging.failsafe_velocity import Motion, Surroundings, flown_setpoint
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
 from splatpilot.systems.ports import input_port, optional_input, output_port
@@ -64,8 +64,8 @@ class Failsafe(LeafSystem):
       before the first; the latter two, of what is flown by and of the last sight by motion capture,
       are optional.
     - ``lag`` (1) [s], optional: by which the process is behind the wall clock.
-    - ``clearance`` (1) [m], ``gradient`` (3), optional: from the hull to the nearest obstacle that
-      is known, and the direction away from it; NaN and 0 where nothing is known.
+    - ``clearance`` (1) [m], ``gradient`` (3), optional: from the collision sphere to the nearest
+      known obstacle, and the direction away from it; NaN and 0 if none is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
     - ``state_is_known`` (1): whether body rates can be flown by the state, which must be no older
       than 0.1 s for that. Velocity setpoints need not: while the state is unknown they are those
@@ -200,6 +200,14 @@ class Failsafe(LeafSystem):
         memory, age = _memory(context), self._ages(context)[status.STATE_OLD]
         return age <= self._config.max_age and memory.reason != status.STATE_FROZEN
 
+    def _motion(self, context: Context) -> Motion | None:
+        """Where the vehicle is and comes to rest; None if its state cannot be trusted."""
+        if not self._known(context):
+            return None
+        state, age = self._state(context), self._ages(context)[status.STATE_OLD]
+        deceleration = self._config.limits.deceleration
+        return Motion.predict(*state[:2], age, 0.0, deceleration, self._controller)
+
     def _calc_flown(self, context: Context, value: Any) -> None:
         mode, reason = self._mode(context)
         clearance, gradient = (
@@ -211,9 +219,9 @@ class Failsafe(LeafSystem):
             self._box,
             self._field,
         )
-        wanted = optional_input(self, "velocity_setpoint", context)
-        p_WB = self._state(context).p_WB if self._known(context) else None
-        setpoint, limit = flown_setpoint(mode, wanted, p_WB, _memory(context), near, self._config)
+        desired = optional_input(self, "velocity_setpoint", context)
+        motion, memory = self._motion(context), _memory(context)
+        setpoint, limit = flown_setpoint(mode, desired, motion, memory, near, self._config)
         value.set_value((setpoint, mode, reason or limit))
 
     def _flown(self, context: Context) -> tuple[np.ndarray, int, int]:

@@ -163,34 +163,6 @@ def test_a_vehicle_that_tips_over_is_levelled():
     assert bench.out("command")[1] < -3.0
 
 
-@pytest.mark.parametrize(
-    ("wanted", "given", "reason"),
-    [
-        ([9.0, 0.0, 0.0], {}, status.LIMITED_SPEED),
-        ([0.0, 8.0, 0.0], {}, status.LIMITED_GEOFENCE),
-        ([4.0, 0.0, 0.0], {"clearance": 0.5, "gradient": [-1.0, 0, 0]}, status.LIMITED_CLEARANCE),
-    ],
-)
-def test_limits_hold_whatever_the_policy_wants(wanted, given, reason):
-    """Told to fly too fast, over the fence or into a wall for 4 s, the vehicle stays within the
-    limits; the status names the limit, and the mode remains FLYING."""
-    limits = FlightLimits(max_speed=4.0) if reason == status.LIMITED_SPEED else FlightLimits()
-    bench = Bench(replace(CONFIG, limits=limits))
-    wall = 10.0 + 0.5  # of the hull
-    bench.give(velocity_setpoint=[*wanted, np.nan], **given)
-    for _ in range(80):
-        bench.advance(0.02)
-        if given:
-            bench.give(clearance=wall - bench.state()[0])
-        state = bench.state()
-        assert np.linalg.norm(state[3:6]) < 1.05 * limits.max_speed
-        assert (state[:3] > LOWER).all() and (state[:3] < UPPER).all()
-        if given:
-            assert wall - state[0] > 0.05
-        np.testing.assert_array_equal(bench.out("mode"), [status.FLYING, reason])
-        assert np.linalg.norm(bench.out("velocity_setpoint")[:3]) < np.linalg.norm(wanted)
-
-
 def test_outside_the_fence_the_vehicle_is_led_back():
     """A vehicle that is outside is not flown by the policy until it is inside again."""
     config = replace(CONFIG, limits=FlightLimits(geofence=[[0.0, -5, 0], [9.5, 5, 6]]))
