@@ -1,6 +1,8 @@
 """What messages carry: the arrays of Drake's ports, each packed into its message and unpacked."""
 
 import math
+import secrets
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -46,10 +48,17 @@ class Codec:
     image: ImageDepth32F | ImageRgba8U | None = None
     """An image like those that travel, of signals that are images."""
 
+    @cached_property
+    def session(self) -> int:
+        """A random number by which subscribers tell two senders on one channel apart."""
+        return secrets.randbits(31)
+
     def stamped(self, header: lcmt_header) -> Any:
-        """An empty message with a header."""
+        """An empty message with a header and, unless it is of images, the session."""
         message = self.message()
         message.header = header
+        if self.image is None:
+            message.session = self.session
         return message
 
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:

@@ -11,6 +11,9 @@ from pydrake.systems.framework import BasicVector, Context, State
 
 _log = logging.getLogger(__name__)
 
+RESTART = 1.0
+"""[s], after which a stream that fell silent may be another."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Received:

@@ -75,6 +75,12 @@ def test_no_plan_is_no_message():
     assert HypothesesCodec(3).pack(no_plan(3), lcmt_header(), EPOCH) is None
 
 
+def test_each_sender_has_a_session_of_its_own():
+    codec, other = StateCodec(), StateCodec()
+    sessions = [sent(each, SIGNALS[0][1]).session for each in (codec, codec, other)]
+    assert sessions[0] == sessions[1] != sessions[2]
+
+
 def change(field, value):
     return lambda message: setattr(message, field, value)
 

@@ -20,11 +20,11 @@ CHANNEL = CommandCodec.channel
 
 def commands(count: int) -> list[bytes]:
     """Messages that are sent 0.02 s apart from now on, of which the fourth is missing."""
-    now, messages = time.time(), []
+    now, messages, codec = time.time(), [], CommandCodec()
     for k in range(count):
         header = lcmt_header()
         header.seq, header.utime, header.frame_name = k, round((now + 0.02 * k) * 1e6), "body"
-        messages.append(CommandCodec().pack(np.array([k, 0.1, 0.2, 0.3]), header, 0.0).encode())
+        messages.append(codec.pack(np.array([k, 0.1, 0.2, 0.3]), header, 0.0).encode())
     return messages[:3] + messages[4:]
 
 
