@@ -132,7 +132,7 @@ def BuildHardwareDiagram(
     policy = policy or make_policy(scenario, world)
     decided, decision = None, decision_period(scenario, policy)
     codecs = image_codecs(scenario, policy)
-    if codecs and can_be_triggered(policy):
+    if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
         decided = policy.decided_output_port()
     pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
@@ -148,7 +148,9 @@ def BuildHardwareDiagram(
 
     status = BridgeStatus(list(received)[1:])
     builder.AddNamedSystem("status", status)
-    age = {"observation_age": status.observation_age_output_port()}
+    # A policy that sees nothing decides by states.
+    oldest = status.observation_age_output_port()
+    age = {"observation_age": oldest if codecs else received["state"].age_output_port()}
     ConnectObservation(builder, observed | age, pilot.policy)
     failsafe = Failsafe(
         config.failsafe,
@@ -179,6 +181,8 @@ def BuildHardwareDiagram(
         (collision.GetOutputPort("gradient"), "gradient"),
     ):
         builder.Connect(source, failsafe.GetInputPort(name))
+    if pilot.policy.HasOutputPort("failed"):
+        builder.Connect(pilot.policy.GetOutputPort("failed"), failsafe.policy_failed_input_port())
     if config.body:
         body = add_subscriber(MotionCaptureCodec(config.body))
         builder.Connect(body.age_output_port(), failsafe.body_age_input_port())

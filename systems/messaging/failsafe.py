@@ -1,4 +1,4 @@
-"""Failsafe: what is flown where nobody can be trusted to say."""
+"""Failsafe: what is flown if policy, state or observation cannot be trusted."""
 
 import math
 from typing import Any, cast
@@ -14,9 +14,14 @@ from pydrake.systems.framework import (
 )
 
 from splatpilot.systems.collision.distance_field import Distances
-from splatpilot.systems.messaging.failsafe_checks import Box, Signals, what_is_wrong
+from splatpilot.systems.messaging.failsafe_checks import (
+    Box,
+    Signals,
+    state_is_wrong,
+    what_is_wrong,
+)
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
-from splatpilot.systems.messaging.failsafe_modes import Memory
+from splatpilot.systems.messaging.failsafe_modes import Memory, Track
 from splatpilot.systems.messaging.failsafe_velocity import Motion, Surroundings, flown_setpoint
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
@@ -32,7 +37,7 @@ from splatpilot.systems.weakly import weakly
 
 
 class Failsafe(LeafSystem):
-    """Lets pass what a policy and its controller want, within limits; where they or what they see
+    """Passes what a policy and its controller decide, within limits; if they or what they see
     cannot be trusted it brakes and hovers, and then lands.
 
     .. pydrake_system::
@@ -47,6 +52,7 @@ class Failsafe(LeafSystem):
         - observation_age
         - body_age
         - lag
+        - policy_failed
         - clearance
         - gradient
         output_ports:
@@ -64,6 +70,7 @@ class Failsafe(LeafSystem):
       before the first; the latter two, of what is flown by and of the last sight by motion capture,
       are optional.
     - ``lag`` (1) [s], optional: by which the process is behind the wall clock.
+    - ``policy_failed`` (1), optional: 1 while the policy raises exceptions instead of deciding.
     - ``clearance`` (1) [m], ``gradient`` (3), optional: from the collision sphere to the nearest
       known obstacle, and the direction away from it; NaN and 0 if none is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
@@ -73,7 +80,7 @@ class Failsafe(LeafSystem):
     - ``in_charge`` (1): 0 while the mode is WAITING, else 1.
 
     What is wrong is wrong at once, in what goes out; modes change every ``period`` from time 0.
-    WAITING is for the first state and observation; FLYING becomes HOLDING where anything is wrong
+    WAITING is for the first state and observation; FLYING becomes HOLDING if anything is wrong
     and FLYING again when all has been well for ``recovery``; after ``patience`` it is LANDING, and
     remains so.
     """
@@ -86,6 +93,7 @@ class Failsafe(LeafSystem):
     observation_age_input_port = input_port("observation_age")
     body_age_input_port = input_port("body_age")
     lag_input_port = input_port("lag")
+    policy_failed_input_port = input_port("policy_failed")
     clearance_input_port = input_port("clearance")
     gradient_input_port = input_port("gradient")
     velocity_setpoint_output_port = output_port("velocity_setpoint")
@@ -125,10 +133,11 @@ class Failsafe(LeafSystem):
         for name, size in (
             *(("state", 13), ("measured_state", 13), ("velocity_setpoint", 4), ("command", 4)),
             *((name, 1) for name in ("state_age", "observation_age", "body_age", "lag")),
-            *(("clearance", 1), ("gradient", 3)),
+            *(("policy_failed", 1), ("clearance", 1), ("gradient", 3)),
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(Memory()))
+        self.DeclareDiscreteState(Track().to_vector())
         flown = self.DeclareCacheEntry(
             "velocity setpoint (4), mode and reason",
             ValueProducer(
@@ -158,18 +167,27 @@ class Failsafe(LeafSystem):
         read = {reason: optional_input(self, name, context) for reason, name in ports.items()}
         return {reason: float(age[0]) for reason, age in read.items() if age is not None}
 
-    def _wrong(self, context: Context) -> int:
-        """The first reason not to fly as the policy decides; NONE where there is none."""
-        lag = optional_input(self, "lag", context)
-        signals = Signals(
+    def _signals(self, context: Context) -> Signals:
+        lag, failed = (optional_input(self, name, context) for name in ("lag", "policy_failed"))
+        track = _track(context)
+        measured = self.GetInputPort("measured_state").HasValue(context)
+        return Signals(
             ages=self._ages(context),
-            still=context.get_time() - _memory(context).moved,
+            unchanged=context.get_time() - track.changed if measured else 0.0,
+            jumped=bool(track.jumped),
             lag=0.0 if lag is None else float(lag[0]),
             state=self._state(context),
+            policy_failed=failed is not None and bool(failed[0]),
             setpoint=optional_input(self, "velocity_setpoint", context),
             command=np.asarray(self.GetInputPort("command").Eval(context)),
         )
-        return what_is_wrong(signals, self._config, self._controller, self._box)
+
+    def _wrong(self, context: Context) -> int:
+        """The most severe reason not to fly as the policy decides, or NONE."""
+        return what_is_wrong(self._signals(context), self._config, self._controller, self._box)
+
+    def _known(self, context: Context) -> bool:
+        return not state_is_wrong(self._signals(context), self._config)
 
     def _mode(self, context: Context) -> tuple[int, int]:
         """Mode and reason at this instant."""
@@ -181,32 +199,33 @@ class Failsafe(LeafSystem):
         return (status.HOLDING, wrong) if wrong else (mode, status.NONE)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        now, memory = context.get_time(), _memory(context)
+        now, memory, ages = context.get_time(), _memory(context), self._ages(context)
         measured = optional_input(self, "measured_state", context)
-        if measured is None:
-            memory = memory._replace(moved=now)
-        else:
-            memory = memory.seeing(measured[:3], now)
-        waits = any(map(math.isinf, self._ages(context).values()))
+        if measured is not None and not math.isinf(ages[status.STATE_OLD]):
+            time = now - ages[status.STATE_OLD]
+            track = _track(context).after(measured, time, now, self._config.max_age)
+            discrete_state.set_value(1, track.to_vector())
+        waits = any(map(math.isinf, ages.values()))
         idle = waits and memory.mode == status.WAITING
         wrong = status.NONE if idle else self._wrong(context)
         memory = memory.after(wrong, waits, now, self._config)
-        if self._known(context):
-            state = self._state(context)
-            memory = memory.holding(state.p_WB, state.v_WB)
-        discrete_state.set_value(np.array(memory))
-
-    def _known(self, context: Context) -> bool:
-        memory, age = _memory(context), self._ages(context)[status.STATE_OLD]
-        return age <= self._config.max_age and memory.reason != status.STATE_FROZEN
+        memory = memory.holding(self._state(context) if self._known(context) else None)
+        discrete_state.set_value(0, np.array(memory))
 
     def _motion(self, context: Context) -> Motion | None:
         """Where the vehicle is and comes to rest; None if its state cannot be trusted."""
-        if not self._known(context):
+        signals = self._signals(context)
+        if state_is_wrong(signals, self._config):
             return None
-        state, age = self._state(context), self._ages(context)[status.STATE_OLD]
-        deceleration = self._config.limits.deceleration
-        return Motion.predict(*state[:2], age, 0.0, deceleration, self._controller)
+        age = signals.ages[status.STATE_OLD]
+        return Motion.predict(
+            *signals.state[:2],
+            age,
+            # The content of a state that has frozen is older than its message.
+            max(signals.unchanged - age, 0.0),
+            self._config.limits.deceleration,
+            self._controller,
+        )
 
     def _calc_flown(self, context: Context, value: Any) -> None:
         mode, reason = self._mode(context)
@@ -261,4 +280,8 @@ class Failsafe(LeafSystem):
 
 
 def _memory(context: Context) -> Memory:
-    return Memory(*np.asarray(context.get_discrete_state_vector().value()))
+    return Memory(*np.asarray(context.get_discrete_state(0).value()))
+
+
+def _track(context: Context) -> Track:
+    return Track.from_vector(np.asarray(context.get_discrete_state(1).value()))

@@ -5,40 +5,35 @@ from typing import NamedTuple
 
 import numpy as np
 
+from splatpilot.systems.messaging.failsafe_checks import most_severe
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.vehicle.flight_limits import limit_speed
+from splatpilot.systems.vehicle.flight_limits import RETURN_SPEED, limit_speed
+from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 
-_STOPPED = 0.3  # [m/s], below which a place is held instead of braking.
-_HOLDING_GAIN = 1.0  # [1/s], with which the place is returned to, and
-_HOLDING_SPEED = 1.0  # [m/s], the greatest speed at which.
+_STOPPED = 0.3  # [m/s], below which a position is held instead of braking.
+_HOLDING_GAIN = 1.0  # [1/s], with which the vehicle returns to it.
+
+_POSITION_JUMP = 0.3  # [m] by which a position may differ from where velocities have led, beside
+_TIME_ERROR = 0.1  # [s] of flight, by which times of measurement may be wrong.
+_FORGETTING = 0.5  # [s], time constant with which such differences fade.
+_TURN_JUMP = 0.3  # [rad] by which an attitude may turn more than its angular velocities say.
 
 
 class Memory(NamedTuple):
-    """The discrete state of a `Failsafe`: numbers, as Drake has it."""
+    """The modes in the discrete state of a `Failsafe`: numbers, as Drake has it."""
 
     mode: float = status.WAITING
     reason: float = status.NONE
     since: float = 0.0  # [s], when the mode began.
     well: float = math.nan  # [s], since when all has been well.
-    x: float = math.nan  # [m], the place that is held, NaN while there is none.
+    x: float = math.nan  # [m], the position that is held, NaN while there is none.
     y: float = math.nan
     z: float = math.nan
-    seen_x: float = math.nan  # [m], the position that was measured last,
-    seen_y: float = math.nan
-    seen_z: float = math.nan
-    moved: float = 0.0  # [s], and when it was another.
-
-    def seeing(self, p_WB: np.ndarray, now: float) -> "Memory":
-        """After a position (3,) [m] was measured."""
-        x, y, z = p_WB
-        if (x, y, z) == (self.seen_x, self.seen_y, self.seen_z):
-            return self
-        return self._replace(seen_x=x, seen_y=y, seen_z=z, moved=now)
 
     def after(self, wrong: int, waits: bool, now: float, config: FailsafeConfig) -> "Memory":
         """
-        After another period.
+        Gives the memory after another period.
 
         Args:
             wrong: what is, a reason of `lcmt_bridge_status`.
@@ -47,32 +42,86 @@ class Memory(NamedTuple):
         """
         well = math.nan if wrong or waits else (now if math.isnan(self.well) else self.well)
         memory = self._replace(well=well)
-        if self.mode == status.WAITING and not waits:
-            return memory._begun(status.FLYING, status.NONE, now)
-        if self.mode == status.FLYING and wrong:
-            return memory._begun(status.HOLDING, wrong, now)
-        if self.mode == status.HOLDING and now - well >= config.recovery:
-            return memory._begun(status.FLYING, status.NONE, now)
-        if self.mode == status.HOLDING and now - self.since > config.patience:
-            return memory._replace(mode=status.LANDING, since=now)
+        if self.mode == status.WAITING:
+            return memory if waits else memory._begun(status.FLYING, status.NONE, now)
+        if self.mode == status.FLYING:
+            return memory._begun(status.HOLDING, wrong, now) if wrong else memory
+        memory = memory._replace(reason=most_severe(wrong, int(self.reason)))
+        if self.mode == status.HOLDING:
+            if now - well >= config.recovery:
+                return memory._begun(status.FLYING, status.NONE, now)
+            if now - self.since > config.patience:
+                return memory._replace(mode=status.LANDING, since=now)
         return memory
 
-    def holding(self, p_WB: np.ndarray, v_WB: np.ndarray) -> "Memory":
-        """With the place (3,) [m] that is held, once the vehicle has come to rest there."""
-        is_flying, has_place = self.mode == status.FLYING, not math.isnan(self.x)
-        if is_flying or has_place or not np.linalg.norm(v_WB) < _STOPPED:
+    def holding(self, state: QuadrotorState | None) -> "Memory":
+        """Adds the position that is held, once the vehicle has come to rest there; without a state
+        that is known there is none."""
+        if state is None:
+            return self._replace(x=math.nan, y=math.nan, z=math.nan)
+        is_flying, has_position = self.mode == status.FLYING, not math.isnan(self.x)
+        if is_flying or has_position or not np.linalg.norm(state.v_WB) < _STOPPED:
             return self
-        x, y, z = p_WB
+        x, y, z = state.p_WB
         return self._replace(x=x, y=y, z=z)
 
     def return_velocity(self, p_WB: np.ndarray) -> np.ndarray:
-        """The velocity (3,) [m/s] from p_WB (3,) [m] to the place that is held; 0 without one."""
+        """The velocity (3,) [m/s] from p_WB (3,) [m] to the position that is held; 0 without
+        one."""
         if math.isnan(self.x):
             return np.zeros(3)
-        place = np.array([self.x, self.y, self.z])
-        return limit_speed(_HOLDING_GAIN * (place - p_WB), _HOLDING_SPEED)
+        held = np.array([self.x, self.y, self.z])
+        return limit_speed(_HOLDING_GAIN * (held - p_WB), RETURN_SPEED)
 
     def _begun(self, mode: int, reason: int, now: float) -> "Memory":
         return self._replace(
             mode=mode, reason=reason, since=now, x=math.nan, y=math.nan, z=math.nan
         )
+
+
+class Track(NamedTuple):
+    """How measured states follow one another, in the discrete state of a `Failsafe`."""
+
+    time: float = -math.inf  # [s], when the last state of another content was measured,
+    changed: float = 0.0  # [s], and when it was seen.
+    jumped: float = 0.0  # Whether it does not follow from those before.
+    expected_W: np.ndarray = np.zeros(3)  # [m] where the velocities have led.
+    state: np.ndarray = np.full(13, math.nan)
+
+    @classmethod
+    def from_vector(cls, vector: np.ndarray) -> "Track":
+        """The inverse of `to_vector`."""
+        time, changed, jumped = vector[:3]
+        return cls(time, changed, jumped, vector[3:6], vector[6:])
+
+    def to_vector(self) -> np.ndarray:
+        """The fields in one vector (19,)."""
+        return np.hstack(self)
+
+    def after(self, state: np.ndarray, time: float, now: float, max_gap: float) -> "Track":
+        """
+        Gives the track with the state that is there now.
+
+        It has jumped if its position is not where the velocities of the last states lead, or its
+        attitude has turned more than their angular velocities say.
+
+        Args:
+            state: (13,).
+            time: [s] when it was measured.
+            now: [s].
+            max_gap: [s] between measurements, beyond which nothing follows from those before.
+        """
+        if np.array_equal(state, self.state):
+            return self
+        old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
+        duration = time - self.time
+        if not 0.0 < duration <= max_gap:
+            return Track(time, now, 0.0, new.p_WB, state)
+        expected_W = self.expected_W + 0.5 * duration * (old.v_WB + new.v_WB)
+        error = new.p_WB - expected_W
+        turn = 2.0 * math.acos(min(abs(float(old.q_WB.dot(new.q_WB))), 1.0))
+        rate = max(float(np.linalg.norm(each.w_WB_B)) for each in (old, new))
+        max_error = _POSITION_JUMP + _TIME_ERROR * np.linalg.norm(new.v_WB)
+        jumped = np.linalg.norm(error) > max_error or turn > _TURN_JUMP + rate * duration
+        expected_W += min(duration / _FORGETTING, 1.0) * error
+        return Track(time, now, float(jumped), expected_W, state)

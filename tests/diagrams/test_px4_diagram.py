@@ -144,13 +144,13 @@ def test_a_pilot_who_takes_over_is_not_fought(chain):
 
 
 def test_where_px4_falls_silent_the_bridge_stops(chain):
-    """Without telemetry the bridge notices that the state stands still, has PX4 stop, and when that
+    """Without telemetry the bridge notices that the state is old, has PX4 stop, and when that
     lasts, land."""
     flight = chain()
     flight.advance(6.0)
     told, flight.px4._tell = flight.px4._tell, lambda now: None
     flight.advance(1.0)
-    why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.STATE_FROZEN]
+    why = [lcmt_bridge_status.HOLDING, lcmt_bridge_status.STATE_OLD]
     np.testing.assert_array_equal(flight.status()[:2], why)
     assert np.linalg.norm(flight.px4.velocity) == 0.0
     flight.advance(5.0)

@@ -28,7 +28,7 @@ class lcmt_bridge_status(object):
     """ Descends, whatever comes. """
     NONE = 0
     STATE_OLD = 1
-    """ The state is older than allowed, or does not change though the vehicle moves. """
+    """ The state is older than allowed, or its content has not changed for as long. """
     STATE_FROZEN = 2
     OBSERVATION_OLD = 3
     """ The observation is older than allowed. """
@@ -49,6 +49,10 @@ class lcmt_bridge_status(object):
     """
     LIMITED_GEOFENCE = 11
     LIMITED_CLEARANCE = 12
+    STATE_JUMPED = 13
+    """ The state does not follow from those before: position, velocity and attitude do not agree. """
+    POLICY_FAILED = 14
+    """ The policy raised an exception instead of deciding; the log has it. """
 
     def __init__(self):
         self.header = drake.lcmt_header()
