@@ -7,6 +7,7 @@ from pydrake.systems.primitives import (
     Adder,
     ConstantVectorSource,
     LogVectorOutput,
+    Multiplexer,
     Sine,
     ZeroOrderHold,
 )
@@ -19,7 +20,12 @@ from splatpilot.diagrams.pilot import make_policy
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.messaging.codecs import Codec, CommandCodec, StateCodec
+from splatpilot.systems.messaging.codecs import (
+    Codec,
+    CommandCodec,
+    StateCodec,
+    VehicleStatusCodec,
+)
 from splatpilot.systems.messaging.failsafe import Failsafe
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.message_publisher import MessagePublisher
@@ -30,6 +36,9 @@ from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
 SILENCE = 0.1
 """[s] without commands after which the vehicle holds where it is, until they come again."""
+
+STATUS_PERIOD = 0.1
+"""[s] between two messages that say who flies the vehicle."""
 
 _NOISE = 1e-6
 """[m] in published positions: an estimator's output is never the same for long, and a failsafe
@@ -120,6 +129,11 @@ def BuildVehicleDiagram(
         builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
 
     policy = make_policy(scenario, world)  # Only to know what it sees, and how often.
+    armed = builder.AddSystem(ConstantVectorSource(np.ones(1)))
+    vehicle_status = builder.AddSystem(Multiplexer(2))
+    builder.Connect(armed.get_output_port(), vehicle_status.get_input_port(0))
+    builder.Connect(failsafe.is_ready_output_port(), vehicle_status.get_input_port(1))
+    add_publisher(VehicleStatusCodec(), vehicle_status.get_output_port(0), STATUS_PERIOD)
     noise = builder.AddSystem(Sine(np.repeat([_NOISE, 0.0], [3, 10]), np.ones(13), np.zeros(13)))
     estimate = builder.AddSystem(Adder(2, 13))
     builder.Connect(state, estimate.get_input_port(0))

@@ -16,6 +16,7 @@ from splatpilot.systems.messaging.generated import (
     lcmt_motion_capture_pose,
     lcmt_quadrotor_state,
     lcmt_trajectory_hypotheses,
+    lcmt_vehicle_status,
     lcmt_velocity_setpoint,
 )
 from splatpilot.systems.policies.hypotheses import (
@@ -246,6 +247,24 @@ class StatusCodec(Codec):
         ages = message.state_age, message.observation_age
         counts = message.num_gaps, message.num_rejected, message.num_overruns
         return np.array([message.mode, message.reason, *ages, *counts], dtype=float)
+
+
+class VehicleStatusCodec(Codec):
+    """Who flies the vehicle (2): whether it is armed, and whether it flies by the bridge; NaN, of
+    which there is no message, while that is unknown."""
+
+    channel, port, message, size = "VEHICLE_STATUS", "vehicle_status", lcmt_vehicle_status, 2
+    frame = ""
+
+    def pack(self, value, header, epoch):
+        if np.isnan(value).any():
+            return None
+        message = self.stamped(header)
+        message.armed, message.offboard = map(bool, value)
+        return message
+
+    def unpack(self, message, epoch):
+        return np.array([message.armed, message.offboard], dtype=float)
 
 
 def finite(values: Any) -> np.ndarray:

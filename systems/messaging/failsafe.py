@@ -35,6 +35,9 @@ from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_prediction import LONGEST_PREDICTION
 from splatpilot.systems.weakly import weakly
 
+MAX_STATUS_AGE = 1.0
+"""[s] Max age of what a vehicle says of who flies it."""
+
 
 class Failsafe(LeafSystem):
     """Passes what a policy and its controller decide, within limits; if they or what they see
@@ -53,6 +56,8 @@ class Failsafe(LeafSystem):
         - body_age
         - lag
         - policy_failed
+        - vehicle_status
+        - vehicle_status_age
         - clearance
         - gradient
         output_ports:
@@ -60,6 +65,7 @@ class Failsafe(LeafSystem):
         - command
         - mode
         - state_is_known
+        - is_ready
         - in_charge
 
     - ``state``, ``measured_state`` (13 each): of now, and as it was measured.
@@ -71,18 +77,23 @@ class Failsafe(LeafSystem):
       are optional.
     - ``lag`` (1) [s], optional: by which the process is behind the wall clock.
     - ``policy_failed`` (1), optional: 1 while the policy raises exceptions instead of deciding.
+    - ``vehicle_status`` (2), ``vehicle_status_age`` (1) [s], optional: see ``lcmt_vehicle_status``;
+      without them the failsafe is always in charge.
     - ``clearance`` (1) [m], ``gradient`` (3), optional: from the collision sphere to the nearest
       known obstacle, and the direction away from it; NaN and 0 if none is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
     - ``state_is_known`` (1): whether body rates can be flown by the state, which must be no older
       than 0.1 s for that. Velocity setpoints need not: while the state is unknown they are those
       to stop, or to descend.
-    - ``in_charge`` (1): 0 while the mode is WAITING, else 1.
+    - ``is_ready`` (1): 0 while the mode is WAITING, else 1.
+    - ``in_charge`` (1): 1 while an armed vehicle flies by what is commanded, as its last status
+      says; 0 if that is older than 1 s, or before the first.
 
     What is wrong is wrong at once, in what goes out; modes change every ``period`` from time 0.
     WAITING is for the first state and observation; FLYING becomes HOLDING if anything is wrong
-    and FLYING again when all has been well for ``recovery``; after ``patience`` it is LANDING, and
-    remains so.
+    and FLYING again when all has been well for ``recovery``; after ``patience`` in charge it is
+    LANDING, and remains so until the vehicle says that it does not fly by this any more. A vehicle
+    that is not flown yet may stand below its box, from where it takes off.
     """
 
     state_input_port = input_port("state")
@@ -94,12 +105,15 @@ class Failsafe(LeafSystem):
     body_age_input_port = input_port("body_age")
     lag_input_port = input_port("lag")
     policy_failed_input_port = input_port("policy_failed")
+    vehicle_status_input_port = input_port("vehicle_status")
+    vehicle_status_age_input_port = input_port("vehicle_status_age")
     clearance_input_port = input_port("clearance")
     gradient_input_port = input_port("gradient")
     velocity_setpoint_output_port = output_port("velocity_setpoint")
     command_output_port = output_port("command")
     mode_output_port = output_port("mode")
     state_is_known_output_port = output_port("state_is_known")
+    is_ready_output_port = output_port("is_ready")
     in_charge_output_port = output_port("in_charge")
 
     def __init__(
@@ -133,7 +147,8 @@ class Failsafe(LeafSystem):
         for name, size in (
             *(("state", 13), ("measured_state", 13), ("velocity_setpoint", 4), ("command", 4)),
             *((name, 1) for name in ("state_age", "observation_age", "body_age", "lag")),
-            *(("policy_failed", 1), ("clearance", 1), ("gradient", 3)),
+            *(("policy_failed", 1), ("vehicle_status", 2), ("vehicle_status_age", 1)),
+            *(("clearance", 1), ("gradient", 3)),
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(Memory()))
@@ -151,6 +166,7 @@ class Failsafe(LeafSystem):
         self.DeclareVectorOutputPort("command", 4, self._calc_command)
         self.DeclareVectorOutputPort("mode", 2, self._calc_mode)
         self.DeclareVectorOutputPort("state_is_known", 1, self._calc_state_is_known)
+        self.DeclareVectorOutputPort("is_ready", 1, self._calc_is_ready)
         self.DeclareVectorOutputPort("in_charge", 1, self._calc_in_charge)
         self.DeclarePeriodicDiscreteUpdateEvent(controller.period, 0.0, self._update)
 
@@ -184,7 +200,19 @@ class Failsafe(LeafSystem):
 
     def _wrong(self, context: Context) -> int:
         """The most severe reason not to fly as the policy decides, or NONE."""
-        return what_is_wrong(self._signals(context), self._config, self._controller, self._box)
+        box = self._box
+        if not (_memory(context).in_charge or self._is_in_charge(context)):
+            box = Box(np.append(box.lower_W[:2], -math.inf), box.upper_W)
+        return what_is_wrong(self._signals(context), self._config, self._controller, box)
+
+    def _is_in_charge(self, context: Context) -> bool | None:
+        """Whether a vehicle flies by what is commanded; None if that is unknown."""
+        status, age = (
+            optional_input(self, name, context) for name in ("vehicle_status", "vehicle_status_age")
+        )
+        if status is None or age is None:
+            return True
+        return bool(status.all()) if age[0] <= MAX_STATUS_AGE else None
 
     def _known(self, context: Context) -> bool:
         return not state_is_wrong(self._signals(context), self._config)
@@ -208,7 +236,7 @@ class Failsafe(LeafSystem):
         waits = any(map(math.isinf, ages.values()))
         idle = waits and memory.mode == status.WAITING
         wrong = status.NONE if idle else self._wrong(context)
-        memory = memory.after(wrong, waits, now, self._config)
+        memory = memory.after(wrong, waits, self._is_in_charge(context), now, self._config)
         memory = memory.holding(self._state(context) if self._known(context) else None)
         discrete_state.set_value(0, np.array(memory))
 
@@ -270,13 +298,16 @@ class Failsafe(LeafSystem):
         else:
             output.SetFromVector(np.array(self._flown(context)[1:], dtype=float))
 
-    def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
+    def _calc_is_ready(self, context: Context, output: BasicVector) -> None:
         output[0] = float(_memory(context).mode != status.WAITING)
+
+    def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
+        output[0] = float(self._is_in_charge(context) or False)
 
     def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
         is_recent = self._ages(context)[status.STATE_OLD] <= LONGEST_PREDICTION
-        in_charge = _memory(context).mode != status.WAITING
-        output[0] = float(in_charge and is_recent and self._known(context))
+        is_ready = _memory(context).mode != status.WAITING
+        output[0] = float(is_ready and is_recent and self._known(context))
 
 
 def _memory(context: Context) -> Memory:

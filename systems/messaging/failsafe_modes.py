@@ -25,31 +25,42 @@ class Memory(NamedTuple):
 
     mode: float = status.WAITING
     reason: float = status.NONE
-    since: float = 0.0  # [s], when the mode began.
+    since: float = 0.0  # [s], when the mode began or, later, the failsafe came in charge.
     well: float = math.nan  # [s], since when all has been well.
     x: float = math.nan  # [m], the position that is held, NaN while there is none.
     y: float = math.nan
     z: float = math.nan
+    in_charge: float = 0.0  # As the vehicle said last.
 
-    def after(self, wrong: int, waits: bool, now: float, config: FailsafeConfig) -> "Memory":
+    def after(
+        self, wrong: int, waits: bool, in_charge: bool | None, now: float, config: FailsafeConfig
+    ) -> "Memory":
         """
         Gives the memory after another period.
 
         Args:
             wrong: what is, a reason of `lcmt_bridge_status`.
             waits: whether something has never come.
+            in_charge: whether a vehicle flies by what is commanded; None if that is unknown. Who
+                was in charge may be still, and lands a vehicle that is not heard any more.
             now: [s].
         """
         well = math.nan if wrong or waits else (now if math.isnan(self.well) else self.well)
-        memory = self._replace(well=well)
+        if in_charge is None:
+            in_charge = bool(self.in_charge)
+        memory = self._replace(well=well, in_charge=in_charge)
         if self.mode == status.WAITING:
             return memory if waits else memory._begun(status.FLYING, status.NONE, now)
         if self.mode == status.FLYING:
             return memory._begun(status.HOLDING, wrong, now) if wrong else memory
+        if self.mode == status.LANDING and not in_charge:
+            return memory._begun(status.HOLDING, wrong or int(self.reason), now)
         memory = memory._replace(reason=most_severe(wrong, int(self.reason)))
         if self.mode == status.HOLDING:
             if now - well >= config.recovery:
                 return memory._begun(status.FLYING, status.NONE, now)
+            if not in_charge:
+                return memory._replace(since=now)
             if now - self.since > config.patience:
                 return memory._replace(mode=status.LANDING, since=now)
         return memory

@@ -12,9 +12,12 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from splatpilot.systems.messaging.received import Received
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.ports import output_port
-from splatpilot.systems.px4.mavlink import Attitude, Heartbeat, Mavlink, Position
+from splatpilot.systems.px4.mavlink import OFFBOARD, Attitude, Heartbeat, Mavlink, Position
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+
+HEARTBEAT_TIMEOUT = 3.0
+"""[s] since the last heartbeat after which it is unknown who flies: two of PX4's may be lost."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,6 +46,7 @@ class Px4Telemetry(LeafSystem):
         - heartbeat_age
         - armed
         - mode
+        - vehicle_status
         - rejected
 
     - ``state`` (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s], of LOCAL_POSITION_NED and
@@ -50,6 +54,8 @@ class Px4Telemetry(LeafSystem):
     - ``age`` (1): [s] since the older of the two came; infinity before. ``is_fresh`` (1): whether
       that is at most ``max_age``.
     - ``heartbeat_age`` (1), ``armed`` (1), ``mode`` (2): of the last HEARTBEAT; main and sub mode.
+    - ``vehicle_status`` (2): whether it is armed, and whether it is in offboard mode; NaN if the
+      last HEARTBEAT is older than 3 s. See ``lcmt_vehicle_status``.
     - ``rejected`` (1): packets that were no MAVLink, of others than the senders that are named, or
       with numbers that are none; the reason is logged at the first, second, fourth, eighth...
 
@@ -62,6 +68,7 @@ class Px4Telemetry(LeafSystem):
     heartbeat_age_output_port = output_port("heartbeat_age")
     armed_output_port = output_port("armed")
     mode_output_port = output_port("mode")
+    vehicle_status_output_port = output_port("vehicle_status")
     rejected_output_port = output_port("rejected")
 
     def __init__(self, inbox: UdpInbox, mavlink: Mavlink, period: float, max_age: float = 0.1):
@@ -76,6 +83,7 @@ class Px4Telemetry(LeafSystem):
             "heartbeat_age": (1, lambda said, now: now - said.heard),
             "armed": (1, lambda said, now: said.heartbeat.armed),
             "mode": (2, lambda said, now: said.heartbeat.mode),
+            "vehicle_status": (2, _vehicle_status),
             "rejected": (1, lambda said, now: said.rejected),
         }
         for name, (size, value) in outputs.items():
@@ -96,6 +104,12 @@ class Px4Telemetry(LeafSystem):
             return said
 
         _Said.of(context).taking(*self._inbox.receive(), "PX4", after).keep(state)
+
+
+def _vehicle_status(said: _Said, now: float) -> list[float]:
+    if now - said.heard > HEARTBEAT_TIMEOUT:
+        return [math.nan, math.nan]
+    return [said.heartbeat.armed, said.heartbeat.mode[0] == OFFBOARD[0]]
 
 
 def _state(said: _Said) -> np.ndarray:

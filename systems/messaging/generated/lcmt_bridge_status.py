@@ -25,7 +25,7 @@ class lcmt_bridge_status(object):
     HOLDING = 2
     """ Brakes and hovers. """
     LANDING = 3
-    """ Descends, whatever comes. """
+    """ Descends, whatever comes, until it is not in charge any more. """
     NONE = 0
     STATE_OLD = 1
     """ The state is older than allowed, or its content has not changed for as long. """

@@ -12,6 +12,7 @@ from splatpilot.systems.vehicle.flight_limits import FlightLimits
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 
 CONFIG = FailsafeConfig(patience=2.0)
+IN_CHARGE, NOT_IN_CHARGE = [1.0, 1.0], [1.0, 0.0]
 
 
 def test_all_well_passes_as_it_is():
@@ -22,7 +23,8 @@ def test_all_well_passes_as_it_is():
     np.testing.assert_array_equal(bench.out("mode"), [status.FLYING, status.NONE])
     np.testing.assert_array_equal(bench.out("velocity_setpoint"), told)
     np.testing.assert_array_equal(bench.out("command"), command)
-    assert bench.out("state_is_known")[0] == bench.out("in_charge")[0] == 1
+    for port in ("state_is_known", "is_ready", "in_charge"):
+        assert bench.out(port)[0] == 1
 
 
 FAULTS = {
@@ -85,7 +87,7 @@ def test_nothing_is_commanded_before_the_first_state_and_observation():
     bench.give(observation_age=np.inf)
     bench.advance(5.0)
     np.testing.assert_array_equal(bench.out("mode"), [status.WAITING, status.NONE])
-    assert bench.out("in_charge")[0] == bench.out("state_is_known")[0] == 0
+    assert bench.out("is_ready")[0] == bench.out("state_is_known")[0] == 0
     bench.give(observation_age=0.1, command=[10.0, 0.0, 0.0, 0.0])
     bench.advance(0.06)
     assert bench.out("mode")[0] == status.FLYING
@@ -210,6 +212,61 @@ def test_landing_is_let_down_on_what_is_level_and_on_nothing_else():
         v = bench.out("velocity_setpoint")[:3]
         assert (v[2] == pytest.approx(-0.5)) == descends
         assert descends or v.dot(gradient) >= -0.01
+
+
+def test_patience_is_counted_in_charge_alone():
+    bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
+    bench.give(vehicle_status=NOT_IN_CHARGE, vehicle_status_age=0.0, observation_age=1.0)
+    bench.advance(5.0)
+    np.testing.assert_array_equal(bench.out("mode"), [status.HOLDING, status.OBSERVATION_OLD])
+    bench.give(vehicle_status=IN_CHARGE)
+    bench.advance(1.9)
+    assert bench.out("mode")[0] == status.HOLDING
+    bench.advance(0.2)
+    assert bench.out("mode")[0] == status.LANDING
+
+
+@pytest.mark.parametrize("told", [NOT_IN_CHARGE, [0.0, 1.0]])
+def test_a_landing_ends_when_the_vehicle_is_flown_by_another(told):
+    bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
+    bench.give(vehicle_status=IN_CHARGE, vehicle_status_age=0.0, observation_age=1.0)
+    bench.advance(2.2)
+    assert bench.out("mode")[0] == status.LANDING
+    bench.give(vehicle_status=told)
+    bench.advance(0.06)
+    assert bench.out("in_charge")[0] == 0
+    assert bench.out("mode")[0] == status.HOLDING
+    bench.give(observation_age=0.0)
+    bench.advance(0.6)
+    assert bench.out("mode")[0] == status.FLYING
+
+
+def test_an_old_status_begins_no_landing_and_ends_none():
+    bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
+    bench.give(vehicle_status=IN_CHARGE, vehicle_status_age=1.1, observation_age=1.0)
+    bench.advance(4.0)
+    assert bench.out("in_charge")[0] == 0
+    assert bench.out("mode")[0] == status.HOLDING
+    bench.give(vehicle_status_age=0.0)
+    bench.advance(0.06)
+    bench.give(vehicle_status_age=1.1)
+    bench.advance(2.2)
+    assert bench.out("in_charge")[0] == 0
+    assert bench.out("mode")[0] == status.LANDING
+
+
+def test_a_vehicle_on_the_ground_below_its_fence_takes_off_into_it():
+    limits = FlightLimits(geofence=[[0.0, -5, 1.0], [20.0, 5, 6]])
+    bench = Bench(replace(CONFIG, limits=limits), p_WB=(10.0, 0.0, 0.1))
+    bench.give(vehicle_status=NOT_IN_CHARGE, vehicle_status_age=0.0)
+    bench.advance(0.1)
+    np.testing.assert_array_equal(bench.out("mode"), [status.FLYING, status.LIMITED_GEOFENCE])
+    bench.give(vehicle_status=IN_CHARGE)
+    bench.advance(0.4)
+    np.testing.assert_array_equal(bench.out("mode"), [status.HOLDING, status.OUTSIDE])
+    bench.advance(1.8)
+    assert bench.out("mode")[0] == status.FLYING
+    assert bench.state[2] > 1.0
 
 
 @pytest.mark.parametrize("name", ["max_age", "max_lag", "recovery", "patience", "descent"])

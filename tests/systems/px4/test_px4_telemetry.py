@@ -63,3 +63,19 @@ def test_state_needs_position_and_attitude(inbox, caplog):
     np.testing.assert_array_equal(out("state"), before)
     assert out("rejected")[0] == 3
     assert "PX4: a message is refused" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1]), (1, 3, [0, 0])]
+)
+def test_vehicle_status_is_that_of_the_last_heartbeat_unless_it_is_old(inbox, base, mode, told):
+    system = Px4Telemetry(inbox, Mavlink(), 0.01)
+    simulator = Simulator(system)
+    port = system.vehicle_status_output_port()
+    simulator.AdvanceTo(0.1)
+    assert np.isnan(port.Eval(simulator.get_context())).all()
+    send(inbox, dialect.MAVLink_heartbeat_message(2, 12, base, mode << 16, 4, 3))
+    simulator.AdvanceTo(3.0)
+    assert port.Eval(simulator.get_context()).tolist() == told
+    simulator.AdvanceTo(3.2)
+    assert np.isnan(port.Eval(simulator.get_context())).all()
