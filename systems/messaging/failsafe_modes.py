@@ -10,14 +10,15 @@ from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.vehicle.flight_limits import RETURN_SPEED, limit_speed
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.vehicle.state_prediction import predict_state
 
 _STOPPED = 0.3  # [m/s], below which a position is held instead of braking.
 _HOLDING_GAIN = 1.0  # [1/s], with which the vehicle returns to it.
 
-_POSITION_JUMP = 0.3  # [m] by which a position may differ from where velocities have led, beside
-_TIME_ERROR = 0.1  # [s] of flight, by which times of measurement may be wrong.
+_POSITION_JUMP = 0.3  # [m] by which a position may differ from where velocities have led, and
+_TURN_JUMP = 0.3  # [rad] an attitude from what angular velocities have made of it, beside
+_TIME_ERROR = 0.1  # [s] of either, by which times of measurement may be wrong.
 _FORGETTING = 0.5  # [s], time constant with which such differences fade.
-_TURN_JUMP = 0.3  # [rad] by which an attitude may turn more than its angular velocities say.
 
 
 class Memory(NamedTuple):
@@ -96,25 +97,27 @@ class Track(NamedTuple):
     time: float = -math.inf  # [s], when the last state of another content was measured,
     changed: float = 0.0  # [s], and when it was seen.
     jumped: float = 0.0  # Whether it does not follow from those before.
-    expected_W: np.ndarray = np.zeros(3)  # [m] where the velocities have led.
     state: np.ndarray = np.full(13, math.nan)
+    expected: np.ndarray = np.full(13, math.nan)
+    """A state where and as it is turned as the velocities and body rates have led."""
 
     @classmethod
     def from_vector(cls, vector: np.ndarray) -> "Track":
         """The inverse of `to_vector`."""
         time, changed, jumped = vector[:3]
-        return cls(time, changed, jumped, vector[3:6], vector[6:])
+        return cls(time, changed, jumped, vector[3:16], vector[16:])
 
     def to_vector(self) -> np.ndarray:
-        """The fields in one vector (19,)."""
+        """The fields in one vector (29,)."""
         return np.hstack(self)
 
     def after(self, state: np.ndarray, time: float, now: float, max_gap: float) -> "Track":
         """
         Gives the track with the state that is there now.
 
-        It has jumped if its position is not where the velocities of the last states lead, or its
-        attitude has turned more than their angular velocities say.
+        It has jumped if it is not where the velocities of the states have led, or not turned as
+        their angular velocities say. Small differences fade, a jump remains one until the state
+        comes back: what a map says of its place is not true any more.
 
         Args:
             state: (13,).
@@ -124,15 +127,24 @@ class Track(NamedTuple):
         """
         if np.array_equal(state, self.state):
             return self
-        old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
         duration = time - self.time
         if not 0.0 < duration <= max_gap:
-            return Track(time, now, 0.0, new.p_WB, state)
-        expected_W = self.expected_W + 0.5 * duration * (old.v_WB + new.v_WB)
-        error = new.p_WB - expected_W
-        turn = 2.0 * math.acos(min(abs(float(old.q_WB.dot(new.q_WB))), 1.0))
-        rate = max(float(np.linalg.norm(each.w_WB_B)) for each in (old, new))
-        max_error = _POSITION_JUMP + _TIME_ERROR * np.linalg.norm(new.v_WB)
-        jumped = np.linalg.norm(error) > max_error or turn > _TURN_JUMP + rate * duration
-        expected_W += min(duration / _FORGETTING, 1.0) * error
-        return Track(time, now, float(jumped), expected_W, state)
+            return Track(time, now, 0.0, state, state)
+        old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
+        p_WB, _, q_WB, _ = QuadrotorState.of(self.expected)
+        mean = QuadrotorState(p_WB, (old.v_WB + new.v_WB) / 2, q_WB, (old.w_WB_B + new.w_WB_B) / 2)
+        expected = predict_state(mean.to_vector(), duration)
+        p_WB, _, q_WB, _ = QuadrotorState.of(expected)
+        alike = float(q_WB.dot(new.q_WB))
+        moved = np.linalg.norm(new.p_WB - p_WB)
+        turned = 2.0 * math.acos(min(abs(alike), 1.0))
+        speed = max(np.linalg.norm(each.v_WB) for each in (old, new))
+        rate = max(np.linalg.norm(each.w_WB_B) for each in (old, new))
+        jumped = moved > _POSITION_JUMP + speed * _TIME_ERROR or turned > _TURN_JUMP + rate * max(
+            duration, _TIME_ERROR
+        )
+        if not jumped:
+            p_WB += duration / _FORGETTING * (new.p_WB - p_WB)
+            q_WB += duration / _FORGETTING * (math.copysign(1.0, alike) * new.q_WB - q_WB)
+            q_WB /= np.linalg.norm(q_WB)
+        return Track(time, now, float(jumped), state, expected)
