@@ -173,3 +173,13 @@ def test_motion_capture_is_sent_on(chain):
     odometry = flight.px4.odometry
     assert (odometry.x, odometry.y, odometry.z) == (1.0, -2.0, -3.0)
     assert odometry.time_usec == pytest.approx(0.1e6, abs=2)
+
+
+def test_a_vehicle_below_its_fence_is_armed_and_takes_off_into_it(chain):
+    flight = chain()
+    flight.px4.state[2] = -0.3
+    flight.advance(3.0)
+    assert (flight.px4.mode, flight.px4.armed) == (OFFBOARD, True)
+    flight.advance(5.0)
+    assert flight.status()[0] == lcmt_bridge_status.FLYING
+    assert flight.px4.state[2] > 0.35
