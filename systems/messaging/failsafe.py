@@ -83,7 +83,7 @@ class Failsafe(LeafSystem):
       known obstacle, and the direction away from it; NaN and 0 if none is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
     - ``state_is_known`` (1): whether body rates can be flown by the state, which must be no older
-      than 0.1 s for that. Velocity setpoints need not: while the state is unknown they are those
+      than 0.1 s for that, and have changed since. Velocity setpoints need not: while the state is unknown they are those
       to stop, or to descend.
     - ``is_ready`` (1): 0 while the mode is WAITING, else 1.
     - ``in_charge`` (1): 1 while an armed vehicle flies by what is commanded, as its last status
@@ -207,12 +207,12 @@ class Failsafe(LeafSystem):
 
     def _is_in_charge(self, context: Context) -> bool | None:
         """Whether a vehicle flies by what is commanded; None if that is unknown."""
-        status, age = (
+        told, age = (
             optional_input(self, name, context) for name in ("vehicle_status", "vehicle_status_age")
         )
-        if status is None or age is None:
+        if told is None or age is None:
             return True
-        return bool(status.all()) if age[0] <= MAX_STATUS_AGE else None
+        return bool(told.all()) if age[0] <= MAX_STATUS_AGE else None
 
     def _known(self, context: Context) -> bool:
         return not state_is_wrong(self._signals(context), self._config)
@@ -305,9 +305,10 @@ class Failsafe(LeafSystem):
         output[0] = float(self._is_in_charge(context) or False)
 
     def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
-        is_recent = self._ages(context)[status.STATE_OLD] <= LONGEST_PREDICTION
+        signals = self._signals(context)
+        age = max(signals.ages[status.STATE_OLD], signals.unchanged)
         is_ready = _memory(context).mode != status.WAITING
-        output[0] = float(is_ready and is_recent and self._known(context))
+        output[0] = float(is_ready and age <= LONGEST_PREDICTION and self._known(context))
 
 
 def _memory(context: Context) -> Memory:

@@ -113,6 +113,16 @@ def test_a_state_that_does_not_change_is_frozen_at_any_speed_in_any_mode(speed, 
     np.testing.assert_array_equal(bench.out("velocity_setpoint")[:3], np.zeros(3))
 
 
+def test_body_rates_are_flown_by_states_that_change_alone():
+    bench = Bench(CONFIG)
+    bench.advance(0.2)
+    assert bench.out("state_is_known")[0] == 1
+    frozen = bench.state.copy()
+    bench.advance(0.14, measured=lambda now: frozen)
+    assert bench.out("state_is_known")[0] == 0
+    assert bench.out("mode")[0] == status.FLYING
+
+
 def test_a_state_that_changes_again_is_used_again_while_landing():
     bench = Bench(CONFIG)
     bench.advance(2.6, measured=lambda now: hover_state([10.0, 0.0, 3.0]))
