@@ -37,6 +37,7 @@ from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.unix_clock import UnixClock
 from splatpilot.systems.policies.velocity_tracker import VelocityTracker
 from splatpilot.systems.vehicle.flatness_controller import FlatnessController
+from splatpilot.systems.vehicle.flight_limits import FlightLimits
 from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 from splatpilot.systems.vehicle.state_to_pose import StateToPose
 
@@ -102,12 +103,15 @@ def BuildVehicleDiagram(
     subscriber = MessageSubscriber(lcm, codec, config.tick, initial)
     clock, plant, pose = UnixClock(), QuadrotorPlant(scenario.vehicle), StateToPose()
     field = world.distance_field
+    max_speed = config.failsafe.limits.max_speed  # As MPC_XY_VEL_MAX of PX4.
     failsafe = Failsafe(
-        FailsafeConfig(max_age=SILENCE, recovery=config.tick),
+        FailsafeConfig(
+            max_age=SILENCE, recovery=config.tick, limits=FlightLimits(max_speed=max_speed)
+        ),
         scenario.controller,
         scenario.vehicle,
-        field.lower_W,
-        field.upper_W,
+        np.full(3, -np.inf),  # It knows no map.
+        np.full(3, np.inf),
     )
     held, no_age = ZeroOrderHold(config.tick, 4), ConstantVectorSource(np.zeros(1))
     collision = EsdfCollision(field)
@@ -126,7 +130,10 @@ def BuildVehicleDiagram(
     state, command = plant.GetOutputPort("state"), held.get_output_port()
     builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
     told = subscriber.GetOutputPort(codec.port)
-    commanded = _AddVelocityControl(builder, scenario, state, told) if velocities else told
+    commanded = told
+    if velocities:
+        commanded = _AddVelocityControl(builder, scenario, state, told)
+        builder.Connect(told, failsafe.velocity_setpoint_input_port())
     builder.Connect(commanded, failsafe.command_input_port())
     builder.Connect(subscriber.age_output_port(), failsafe.observation_age_input_port())
     builder.Connect(state, failsafe.state_input_port())
