@@ -1,12 +1,14 @@
 """`splatpilot bridge`: policy and controller fly a vehicle by messages."""
 
 import contextlib
+import logging
+import math
 import time
 from pathlib import Path
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram
 
 from splatpilot.diagrams.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.hardware_config import HardwareConfig
@@ -21,6 +23,8 @@ from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.open_lcm import open_lcm
 from splatpilot.systems.messaging.time_of_flight_receiver import TimeOfFlightReceiver
 
+_log = logging.getLogger(__name__)
+
 
 def run(
     *,
@@ -32,10 +36,12 @@ def run(
     """
     Waits for a vehicle's messages and flies it to the scenario's goal.
 
-    It is over at the goal, after the scenario's timeout, where the world's map says that the
-    vehicle has collided or left it, and when it has landed, or state or images were older than
-    allowed for `config.patience` (see `Failsafe` for what happens meanwhile). The vehicle then
-    hears no more, upon which autopilots hold.
+    The flight begins when the bridge is in charge of a vehicle in the air, however long that takes:
+    the vehicle says that it is armed and flies by the bridge, and touches nothing that the world's
+    map has. It is over at the goal, after the scenario's timeout, if the world's map says that the
+    vehicle has collided or left it while the bridge is in charge, and when it has landed, or state
+    or images were older than allowed for `config.patience` (see `Failsafe` for what happens
+    meanwhile). The vehicle then hears no more, upon which autopilots hold.
 
     Args:
         scenario: who flies, and where to.
@@ -44,8 +50,8 @@ def run(
         overwrite: that log, if it is there.
 
     Returns:
-        How it ended (`outcome`: of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of
-        `BridgeStatus` `gaps`, `rejected` and `overruns`.
+        How it ended (`outcome`: of `Outcome`, "timeout" or "silence"), `flight_time_s` since it
+        began, and of `BridgeStatus` `gaps`, `rejected` and `overruns`.
 
     Raises:
         ValueError: for a scenario that cannot be flown by messages.
@@ -61,41 +67,82 @@ def run(
         wait_for_messages(diagram, config.patience)
         simulator = Simulator(diagram)
         root = simulator.get_context()
-        p_WG = goal_of(scenario, world)
-        ended = {"outcome": "timeout", "time": scenario.timeout, "fresh": 0.0}
-
-        def over(now: float) -> bool:
-            status = np.asarray(diagram.GetOutputPort("status").Eval(root))
-            if status[0] == lcmt_bridge_status.LANDING and has_landed(diagram, root):
-                outcome = Outcome.LANDED
-            elif status[2:4].max() <= config.failsafe.max_age:
-                ended["fresh"] = now
-                outcome = flight_outcome(diagram, root, p_WG, scenario.goal_radius)
-            else:
-                outcome = "silence" if now > ended["fresh"] + config.patience else None
-            if outcome is None and now < scenario.timeout:
-                return False
-            ended.update(outcome=str(outcome or "timeout"), time=now)
-            return True
-
+        flight = BridgeFlight(diagram, root, scenario, goal_of(scenario, world), config)
         # Decisions are due when images have just come, as long as both come at the same rate.
         run_in_real_time(
             simulator,
             diagram,
             config.tick,
-            over,
+            flight.is_over,
             ready=lambda: wait_for_messages(diagram, config.patience),
         )
     gaps, rejected, overruns = np.asarray(diagram.GetOutputPort("status").Eval(root))[4:]
     summary = {
-        "outcome": ended["outcome"],
-        "flight_time_s": ended["time"],
+        "outcome": flight.outcome,
+        "flight_time_s": flight.duration,
         "gaps": gaps,
         "rejected": rejected,
         "overruns": overruns,
     }
     print(*(f"{name:<14} {value}" for name, value in summary.items()), sep="\n")
     return summary
+
+
+class BridgeFlight:
+    """
+    A flight as the bridge sees it: it begins when the bridge is in charge of a vehicle in the air.
+
+    Args:
+        diagram, root: of `BuildHardwareDiagram`, and its Context.
+        p_WG: (3,) [m] the goal.
+        config: how old messages may be, and for how long.
+    """
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        root: Context,
+        scenario: Scenario,
+        p_WG: np.ndarray,
+        config: HardwareConfig,
+    ) -> None:
+        self._diagram, self._root = diagram, root
+        self._scenario, self._p_WG, self._config = scenario, p_WG, config
+        self._in_charge, self._began, self._fresh = False, math.inf, -math.inf
+        self.outcome = ""
+        """Of `Outcome`, "timeout" or "silence"; empty until the flight is over."""
+        self.duration = 0.0
+        """[s]"""
+
+    def is_over(self, now: float) -> bool:
+        """Checks at a time [s] whether the flight is over, and how it ended."""
+        status, charge, collision = (
+            np.asarray(self._diagram.GetOutputPort(name).Eval(self._root))
+            for name in ("status", "in_charge", "in_collision")
+        )
+        in_charge, landed = bool(charge[0]), has_landed(self._diagram, self._root)
+        if in_charge != self._in_charge:
+            # Not printed: a reader that is gone would end the flight.
+            _log.warning("%.2f s: the bridge is %sin charge", now, "" if in_charge else "not ")
+            self._in_charge = in_charge
+        if in_charge and not landed and not collision[0]:
+            self._began = min(self._began, now)
+        if now < self._began:
+            return False
+        is_fresh = status[2:4].max() <= self._config.failsafe.max_age
+        self._fresh = now if is_fresh else max(self._fresh, self._began)
+        outcome = None
+        if landed and (status[0] == lcmt_bridge_status.LANDING or not in_charge):
+            outcome = Outcome.LANDED
+        elif not is_fresh:
+            outcome = "silence" if now > self._fresh + self._config.patience else None
+        elif in_charge:
+            radius = self._scenario.goal_radius
+            outcome = flight_outcome(self._diagram, self._root, self._p_WG, radius)
+        if now >= self._began + self._scenario.timeout:
+            outcome = outcome or Outcome.TIMEOUT
+        self.outcome, self.duration = str(outcome or ""), now - self._began
+        return outcome is not None
 
 
 def wait_for_messages(diagram: Diagram, patience: float) -> None:

@@ -22,7 +22,9 @@ class HardwareConfig:
     status_rate: float = 5.0
     # [s] Without a message after which bridge and vehicle give up.
     patience: float = 10.0
-    # The body that motion capture must see; none where empty.
+    # What a simulated vehicle is told: "body_rates" or "velocity"; see `px4.setpoints` for PX4.
+    setpoints: str = "body_rates"
+    # The body that motion capture must see; none if empty.
     body: str = ""
     # The stream of the sensor of a policy that sees by time of flight; LCM's DEPTH_GRID where left
     # out.
@@ -39,6 +41,8 @@ class HardwareConfig:
                     f"{name} is {value}; it must be positive and finite, as "
                     f"{getattr(type(self), name)}"
                 )
+        if self.setpoints not in ("velocity", "body_rates"):
+            raise ValueError(f"setpoints must be velocity or body_rates, got {self.setpoints!r}")
         self.failsafe.validate()
         if self.time_of_flight is not None:
             self.time_of_flight.validate()

@@ -20,6 +20,7 @@ from splatpilot.systems.messaging.codecs import (
     MotionCaptureCodec,
     StateCodec,
     StatusCodec,
+    VehicleStatusCodec,
     VelocitySetpointCodec,
 )
 from splatpilot.systems.messaging.failsafe import Failsafe
@@ -51,7 +52,8 @@ def BuildHardwareDiagram(
 
     Systems, by name: those of `AddPilot`; `clock`; the subscribers `state_subscriber` and one
     `{image}_subscriber` for each image that the policy sees, or `depth_grid_receiver` for the
-    stream of a time-of-flight sensor; `state_predictor`, which brings the state up to date;
+    stream of a time-of-flight sensor; `vehicle_status_subscriber`, which tells when the bridge is
+    in charge; `state_predictor`, which brings the state up to date;
     `velocity_setpoint`, `failsafe`, through which all goes that is sent to the vehicle, `status`;
     where motion capture must see a body `motion_capture_pose_subscriber`; and one
     `{port}_publisher` for each of `command`, `velocity_setpoint`, `status`, and `hypotheses` where
@@ -75,10 +77,11 @@ def BuildHardwareDiagram(
         - field_state
         - velocity_setpoint
         - status
+        - in_charge
 
     The ports are those of `BuildFlightDiagram`, the images those that the policy sees; `status` and
-    `overruns` are those of `BridgeStatus`, `command`, `velocity_setpoint` and `lag` those of
-    `Failsafe`.
+    `overruns` are those of `BridgeStatus`, `command`, `velocity_setpoint`, `in_charge` and `lag`
+    those of `Failsafe`.
 
     Args:
         scenario: who flies, and where to. Its vehicle is what is known of the one that flies.
@@ -132,7 +135,7 @@ def BuildHardwareDiagram(
     policy = policy or make_policy(scenario, world)
     decided, decision = None, decision_period(scenario, policy)
     codecs = image_codecs(scenario, policy)
-    if codecs and can_be_triggered(policy):
+    if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
         decided = policy.decided_output_port()
     pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
@@ -148,7 +151,9 @@ def BuildHardwareDiagram(
 
     status = BridgeStatus(list(received)[1:])
     builder.AddNamedSystem("status", status)
-    age = {"observation_age": status.observation_age_output_port()}
+    # A policy that sees nothing decides by states.
+    oldest = status.observation_age_output_port()
+    age = {"observation_age": oldest if codecs else received["state"].age_output_port()}
     ConnectObservation(builder, observed | age, pilot.policy)
     failsafe = Failsafe(
         config.failsafe,
@@ -179,6 +184,13 @@ def BuildHardwareDiagram(
         (collision.GetOutputPort("gradient"), "gradient"),
     ):
         builder.Connect(source, failsafe.GetInputPort(name))
+    vehicle_status = add_subscriber(VehicleStatusCodec())
+    builder.Connect(
+        vehicle_status.GetOutputPort("vehicle_status"), failsafe.vehicle_status_input_port()
+    )
+    builder.Connect(vehicle_status.age_output_port(), failsafe.vehicle_status_age_input_port())
+    if pilot.policy.HasOutputPort("failed"):
+        builder.Connect(pilot.policy.GetOutputPort("failed"), failsafe.policy_failed_input_port())
     if config.body:
         body = add_subscriber(MotionCaptureCodec(config.body))
         builder.Connect(body.age_output_port(), failsafe.body_age_input_port())
@@ -186,8 +198,8 @@ def BuildHardwareDiagram(
     command, setpoint = failsafe.command_output_port(), failsafe.velocity_setpoint_output_port()
     known, period = failsafe.state_is_known_output_port(), scenario.controller.period
     add_publisher(CommandCodec(), command, period, known)
-    in_charge = failsafe.in_charge_output_port()
-    add_publisher(VelocitySetpointCodec(), setpoint, period, in_charge, decided)
+    is_ready = failsafe.is_ready_output_port()
+    add_publisher(VelocitySetpointCodec(), setpoint, period, is_ready, decided)
     add_publisher(StatusCodec(), status.status_output_port(), 1 / config.status_rate)
     if pilot.policy.HasOutputPort("hypotheses"):
         plans = pilot.policy.GetOutputPort("hypotheses")
@@ -199,6 +211,7 @@ def BuildHardwareDiagram(
     builder.ExportOutput(command, "command")
     builder.ExportOutput(setpoint, "velocity_setpoint")
     builder.ExportOutput(status.status_output_port(), "status")
+    builder.ExportOutput(failsafe.in_charge_output_port(), "in_charge")
     diagram = builder.Build()
     diagram.set_name("hardware")
     return diagram

@@ -1,5 +1,6 @@
 """Who flies: policy and controller, the same in simulation and on hardware."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,8 @@ def AddPilot(
         state: (13) of the vehicle.
         policy, controller: see `BuildFlightDiagram`.
         guarded: whether a failsafe follows: the controller is given zeros, by `finite_decision`,
-            instead of decisions that are no numbers, and its command is not exported.
+            instead of decisions that are not finite, and NaN, by `finite_heading`, instead of such
+            headings; its command is not exported.
 
     Raises:
         ValueError: for a configuration that no policy has, and a system without the ports it needs
@@ -175,7 +177,13 @@ def _ConnectDecision(
     require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
     connect(builder, flown, controller.GetInputPort(kind))
     if policy.HasOutputPort("heading"):
-        connect(builder, policy.GetOutputPort("heading"), controller.GetInputPort("heading"))
+        heading = policy.GetOutputPort("heading")
+        if guarded:
+            finite = FiniteVector(heading.size(), substitute=math.nan)
+            builder.AddNamedSystem("finite_heading", finite)
+            builder.Connect(heading, finite.signal_input_port())
+            heading = finite.finite_output_port()
+        connect(builder, heading, controller.GetInputPort("heading"))
     return decision
 
 

@@ -7,15 +7,17 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Demultiplexer
 
 from splatpilot.diagrams.px4_config import Px4Config
+from splatpilot.diagrams.vehicle_diagram import STATUS_PERIOD
 from splatpilot.systems.messaging.codecs import (
     Codec,
     CommandCodec,
     MotionCaptureCodec,
     StateCodec,
     StatusCodec,
+    VehicleStatusCodec,
     VelocitySetpointCodec,
 )
-from splatpilot.systems.messaging.message_publisher import MeasurementPublisher
+from splatpilot.systems.messaging.message_publisher import MeasurementPublisher, MessagePublisher
 from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 from splatpilot.systems.messaging.udp_inbox import UdpInbox
 from splatpilot.systems.messaging.unix_clock import UnixClock
@@ -33,7 +35,8 @@ def BuildPx4Diagram(
     Builds the diagram that stands between the bridge's messages and PX4: in the place of
     `BuildVehicleDiagram`, but for images, which sensors send themselves.
 
-    Systems, by name: `clock`, `telemetry`, `commander`, `state_publisher`, and the subscribers
+    Systems, by name: `clock`, `telemetry`, `commander`, `state_publisher`,
+    `vehicle_status_publisher`, and the subscribers
     `setpoint_subscriber`, `status_subscriber` and, where there is motion capture,
     `motion_capture_subscriber`, or `motion_capture_receiver` and `motion_capture_publisher`.
 
@@ -118,6 +121,10 @@ def BuildPx4Diagram(
         builder.Connect(pose, commander.motion_capture_pose_input_port())
         builder.Connect(age, commander.motion_capture_age_input_port())
 
+    vehicle_status = MessagePublisher(lcm, VehicleStatusCodec(), STATUS_PERIOD)
+    builder.AddNamedSystem("vehicle_status_publisher", vehicle_status)
+    builder.Connect(telemetry.vehicle_status_output_port(), vehicle_status.get_input_port(0))
+    builder.Connect(clock.get_output_port(), vehicle_status.unix_time_input_port())
     builder.Connect(telemetry.state_output_port(), publisher.GetInputPort("state"))
     builder.Connect(telemetry.age_output_port(), publisher.age_input_port())
     builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())

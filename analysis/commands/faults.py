@@ -40,12 +40,12 @@ def _faults(options: argparse.Namespace) -> None:
     from splatpilot.systems.configuration import load_config
 
     config = load_config(_defaults(options), options.config, options.overrides)
-    # Thousands of packets are refused on purpose.
+    # Thousands of packets are refused, and policies raise, on purpose.
     loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
     levels = [logger.level for logger in loggers]
     try:
         for logger in loggers:
-            logger.setLevel(logging.ERROR)
+            logger.setLevel(logging.CRITICAL)
         run(config=config, out=options.out)
     finally:
         for logger, level in zip(loggers, levels, strict=True):

@@ -1,14 +1,14 @@
 """`splatpilot faults`: flights in which something goes wrong, many, drawn at random."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from splatpilot.analysis.faults.fault import KINDS, Fault
+from splatpilot.analysis.faults.fault import KINDS, Trial
 from splatpilot.analysis.faults.trial import fly_trial
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
@@ -16,25 +16,28 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.output_folders import claim_folder, holds_folder
+from splatpilot.systems.vehicle.flight_limits import FlightLimits
 
 
 def _scenario() -> Scenario:
-    return Scenario(
-        world=ForestConfig(length=14.0, width=8.0, rocks=2, logs=1), policy=policy_named("reactive")
-    )
+    return Scenario(world=ForestConfig(length=14.0, width=8.0, rocks=2, logs=1))
 
 
 @dataclass
 class FaultsConfig:
     """A campaign."""
 
-    # [-] Flights; the kinds of faults take turns.
-    trials: int = 300
+    # [-] Flights; the kinds of faults, what the vehicle is told, and the policies take turns.
+    trials: int = 600
     # Seed of everything random.
     seed: int = 0
     # [-] Worlds that the trials take turns in.
     worlds: int = 10
-    # What is flown; its policy must return accelerations.
+    # [m/s] Of the policies, of which `straight` flies into things.
+    speed: float = 2.0
+    # What is kept, by which a trial is judged.
+    limits: FlightLimits = field(default_factory=lambda: FlightLimits(max_speed=2.5))
+    # What is flown, but for its policy.
     scenario: Scenario = field(default_factory=_scenario)
 
     def validate(self) -> None:
@@ -42,6 +45,7 @@ class FaultsConfig:
         for name in ("trials", "worlds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        self.limits.validate()
         self.scenario.validate()
 
 
@@ -69,9 +73,10 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
         world_seed = config.seed + number % config.worlds
         if world_seed not in worlds:
             worlds[world_seed] = make_world(config.scenario.world, world_seed)
-        config.scenario.seed = config.seed + number
-        fault = Fault.draw(number, np.random.default_rng([config.seed, number]))
-        rows.append(fly_trial(config.scenario, worlds[world_seed], fault, config.seed + number))
+        trial = Trial.draw(number, np.random.default_rng([config.seed, number]))
+        seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
+        scenario = replace(config.scenario, seed=seed, policy=policy)
+        rows.append(fly_trial(scenario, worlds[world_seed], trial, config.limits, seed))
         with written_atomically(lines) as path:
             path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     summary = summarize(rows)
@@ -86,10 +91,10 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
 
 
 def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many trials were safe, and how those of each kind ended."""
+    """How many trials were safe, and how those with each kind of fault ended."""
     kinds = {}
     for kind in KINDS:
-        of_kind = [row for row in rows if row["kind"] == kind]
+        of_kind = [row for row in rows if kind in {fault["kind"] for fault in row["faults"]}]
         ends = [row["outcome"] for row in of_kind]
         kinds[kind] = {
             "trials": len(of_kind),

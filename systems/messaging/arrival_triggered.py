@@ -1,5 +1,6 @@
 """ArrivalTriggered: another system's update, when there is something new to update by."""
 
+import logging
 import math
 from typing import NamedTuple
 
@@ -16,6 +17,8 @@ from pydrake.systems.framework import (
 
 from splatpilot.systems.ports import input_port, output_port
 
+_log = logging.getLogger(__name__)
+
 LATEST = 1.6
 """Periods after the last update in which no observation is waited for."""
 
@@ -31,6 +34,7 @@ class _Last(NamedTuple):
     due: float = -math.inf  # [s], when an observation that comes is not too early.
     observed: float = -math.inf  # [s], when the observation was sent that the last update saw,
     looked: float = -math.inf  # and that which was there at the last look.
+    failed: float = 0.0  # Whether the last update raised an exception.
 
 
 class ArrivalTriggered(LeafSystem):
@@ -42,6 +46,9 @@ class ArrivalTriggered(LeafSystem):
     out, by the rule of virtual scheduling (ITU-T I.371, the generic cell rate algorithm). Without
     an image that comes in time it decides 1.6 periods after the last decision.
 
+    An exception that the system raises is logged, once until the system decides again, and ends
+    nothing: the last decision stands, and ``failed`` tells a failsafe not to fly by it.
+
     .. pydrake_system::
 
         name: ArrivalTriggered
@@ -51,19 +58,23 @@ class ArrivalTriggered(LeafSystem):
         output_ports:
         - (ports of the system)
         - decided
+        - failed
 
     - The ports of the system, by their names.
     - ``observation_age`` (1): [s] since the observation was sent that the system's inputs have;
       infinite before the first.
     - ``decided`` (1): [s], the time of the last update.
+    - ``failed`` (1): 1 if the last update, or an output after it, raised an exception, else 0.
+      Outputs that raise one are NaN.
 
     Looks every ``tick`` seconds from time 0; the first update is by the first observation. The
     discrete state is that of the system, and after it four times: of the last update, from which on
-    the next may be, of what the last one saw, and of what came since.
+    the next may be, of what the last one saw, and of what came since; and ``failed``.
     """
 
     observation_age_input_port = input_port("observation_age")
     decided_output_port = output_port("decided")
+    failed_output_port = output_port("failed")
 
     def __init__(self, system: System, tick: float):
         """Constructs the system.
@@ -99,6 +110,7 @@ class ArrivalTriggered(LeafSystem):
         for index in range(system.num_output_ports()):
             self._declare_output(system.get_output_port(index))
         self.DeclareVectorOutputPort("decided", 1, self._calc_decided, {self.xd_ticket()})
+        self.DeclareVectorOutputPort("failed", 1, self._calc_failed, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._update)
 
     def _declare_output(self, port: OutputPort) -> None:
@@ -113,7 +125,10 @@ class ArrivalTriggered(LeafSystem):
 
         def calc(context: Context, output: BasicVector) -> None:
             inner = self._system.get_output_port(index)
-            output.SetFromVector(np.asarray(inner.Eval(self._context(context, inputs))))
+            try:
+                output.SetFromVector(np.asarray(inner.Eval(self._context(context, inputs))))
+            except Exception:  # The next update logs it.
+                output.SetFromVector(np.full(output.size(), np.nan))
 
         self.DeclareVectorOutputPort(port.get_name(), port.size(), calc, tickets)
 
@@ -130,7 +145,7 @@ class ArrivalTriggered(LeafSystem):
         return inner
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        last = _Last(*np.asarray(context.get_discrete_state(self._last).value()))
+        last = self._kept(context)
         now = context.get_time()
         observed = now - float(np.asarray(self.GetInputPort("observation_age").Eval(context))[0])
         comes, is_new = (observed > seen + _NOISE for seen in (last.looked, last.observed))
@@ -138,17 +153,38 @@ class ArrivalTriggered(LeafSystem):
         discrete_state.set_value(self._last, np.array(last._replace(looked=observed)))
         if math.isinf(observed) or not wanted:
             return
-        inner = self._context(context, list(range(self._system.num_input_ports())))
-        updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
-        for group in range(inner.num_discrete_state_groups()):
-            discrete_state.set_value(group, updated.value(group))
         due = last.due
         if is_new:
             due = max(due, now - _SAVED * self._period) + _LEAST * self._period
-        discrete_state.set_value(self._last, np.array(_Last(now, due, observed, observed)))
+        failed = not self._decide(context, discrete_state)
+        discrete_state.set_value(self._last, np.array(_Last(now, due, observed, observed, failed)))
+
+    def _decide(self, context: Context, discrete_state: DiscreteValues) -> bool:
+        """Updates the system's state; returns False, and logs why, if it raises an exception."""
+        inner = self._context(context, list(range(self._system.num_input_ports())))
+        try:
+            updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
+            values = [updated.value(group) for group in range(inner.num_discrete_state_groups())]
+            for group, value in enumerate(values):
+                inner.SetDiscreteState(group, value)
+            for index in range(self._system.num_output_ports()):
+                self._system.get_output_port(index).Eval(inner)
+        except Exception:
+            if not self._kept(context).failed:
+                _log.exception("the policy %s failed", type(self._system).__name__)
+            return False
+        for group, value in enumerate(values):
+            discrete_state.set_value(group, value)
+        return True
+
+    def _kept(self, context: Context) -> _Last:
+        return _Last(*np.asarray(context.get_discrete_state(self._last).value()))
 
     def _calc_decided(self, context: Context, output: BasicVector) -> None:
-        output[0] = context.get_discrete_state(self._last)[0]
+        output[0] = self._kept(context).time
+
+    def _calc_failed(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._kept(context).failed
 
 
 def can_be_triggered(system: System) -> bool:

@@ -1,6 +1,8 @@
 """What messages carry: the arrays of Drake's ports, each packed into its message and unpacked."""
 
 import math
+import secrets
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +16,7 @@ from splatpilot.systems.messaging.generated import (
     lcmt_motion_capture_pose,
     lcmt_quadrotor_state,
     lcmt_trajectory_hypotheses,
+    lcmt_vehicle_status,
     lcmt_velocity_setpoint,
 )
 from splatpilot.systems.policies.hypotheses import (
@@ -46,10 +49,17 @@ class Codec:
     image: ImageDepth32F | ImageRgba8U | None = None
     """An image like those that travel, of signals that are images."""
 
+    @cached_property
+    def session(self) -> int:
+        """A random number by which subscribers tell two senders on one channel apart."""
+        return secrets.randbits(31)
+
     def stamped(self, header: lcmt_header) -> Any:
-        """An empty message with a header."""
+        """An empty message with a header and, unless it is of images, the session."""
         message = self.message()
         message.header = header
+        if self.image is None:
+            message.session = self.session
         return message
 
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:
@@ -237,6 +247,24 @@ class StatusCodec(Codec):
         ages = message.state_age, message.observation_age
         counts = message.num_gaps, message.num_rejected, message.num_overruns
         return np.array([message.mode, message.reason, *ages, *counts], dtype=float)
+
+
+class VehicleStatusCodec(Codec):
+    """Who flies the vehicle (2): whether it is armed, and whether it flies by the bridge; NaN, of
+    which there is no message, while that is unknown."""
+
+    channel, port, message, size = "VEHICLE_STATUS", "vehicle_status", lcmt_vehicle_status, 2
+    frame = ""
+
+    def pack(self, value, header, epoch):
+        if np.isnan(value).any():
+            return None
+        message = self.stamped(header)
+        message.armed, message.offboard = map(bool, value)
+        return message
+
+    def unpack(self, message, epoch):
+        return np.array([message.armed, message.offboard], dtype=float)
 
 
 def finite(values: Any) -> np.ndarray:

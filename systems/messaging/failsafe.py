@@ -1,4 +1,4 @@
-"""Failsafe: what is flown where nobody can be trusted to say."""
+"""Failsafe: what is flown if policy, state or observation cannot be trusted."""
 
 import math
 from typing import Any, cast
@@ -14,10 +14,15 @@ from pydrake.systems.framework import (
 )
 
 from splatpilot.systems.collision.distance_field import Distances
-from splatpilot.systems.messaging.failsafe_checks import Box, Signals, what_is_wrong
+from splatpilot.systems.messaging.failsafe_checks import (
+    Box,
+    Signals,
+    state_is_wrong,
+    what_is_wrong,
+)
 from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
-from splatpilot.systems.messaging.failsafe_modes import Memory
-from splatpilot.systems.messaging.failsafe_velocity import Surroundings, flown_setpoint
+from splatpilot.systems.messaging.failsafe_modes import Memory, Track
+from splatpilot.systems.messaging.failsafe_velocity import Motion, Surroundings, flown_setpoint
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
 from splatpilot.systems.ports import input_port, optional_input, output_port
@@ -30,9 +35,12 @@ from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
 from splatpilot.systems.vehicle.state_prediction import LONGEST_PREDICTION
 from splatpilot.systems.weakly import weakly
 
+MAX_STATUS_AGE = 1.0
+"""[s] Max age of what a vehicle says of who flies it."""
+
 
 class Failsafe(LeafSystem):
-    """Lets pass what a policy and its controller want, within limits; where they or what they see
+    """Passes what a policy and its controller decide, within limits; if they or what they see
     cannot be trusted it brakes and hovers, and then lands.
 
     .. pydrake_system::
@@ -47,6 +55,9 @@ class Failsafe(LeafSystem):
         - observation_age
         - body_age
         - lag
+        - policy_failed
+        - vehicle_status
+        - vehicle_status_age
         - clearance
         - gradient
         output_ports:
@@ -54,6 +65,7 @@ class Failsafe(LeafSystem):
         - command
         - mode
         - state_is_known
+        - is_ready
         - in_charge
 
     - ``state``, ``measured_state`` (13 each): of now, and as it was measured.
@@ -64,18 +76,24 @@ class Failsafe(LeafSystem):
       before the first; the latter two, of what is flown by and of the last sight by motion capture,
       are optional.
     - ``lag`` (1) [s], optional: by which the process is behind the wall clock.
-    - ``clearance`` (1) [m], ``gradient`` (3), optional: from the hull to the nearest obstacle that
-      is known, and the direction away from it; NaN and 0 where nothing is known.
+    - ``policy_failed`` (1), optional: 1 while the policy raises exceptions instead of deciding.
+    - ``vehicle_status`` (2), ``vehicle_status_age`` (1) [s], optional: see ``lcmt_vehicle_status``;
+      without them the failsafe is always in charge.
+    - ``clearance`` (1) [m], ``gradient`` (3), optional: from the collision sphere to the nearest
+      known obstacle, and the direction away from it; NaN and 0 if none is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
     - ``state_is_known`` (1): whether body rates can be flown by the state, which must be no older
-      than 0.1 s for that. Velocity setpoints need not: while the state is unknown they are those
-      to stop, or to descend.
-    - ``in_charge`` (1): 0 while the mode is WAITING, else 1.
+      than 0.1 s for that, and have changed since. Velocity setpoints need not: while the state is
+      unknown they are those to stop, or to descend.
+    - ``is_ready`` (1): 0 while the mode is WAITING, else 1.
+    - ``in_charge`` (1): 1 while an armed vehicle flies by what is commanded, as its last status
+      says; 0 if that is older than 1 s, or before the first.
 
     What is wrong is wrong at once, in what goes out; modes change every ``period`` from time 0.
-    WAITING is for the first state and observation; FLYING becomes HOLDING where anything is wrong
-    and FLYING again when all has been well for ``recovery``; after ``patience`` it is LANDING, and
-    remains so.
+    WAITING is for the first state and observation; FLYING becomes HOLDING if anything is wrong
+    and FLYING again when all has been well for ``recovery``; after ``patience`` in charge it is
+    LANDING, and remains so until the vehicle says that it does not fly by this any more. A vehicle
+    that is not flown yet may stand below its box, from where it takes off.
     """
 
     state_input_port = input_port("state")
@@ -86,12 +104,16 @@ class Failsafe(LeafSystem):
     observation_age_input_port = input_port("observation_age")
     body_age_input_port = input_port("body_age")
     lag_input_port = input_port("lag")
+    policy_failed_input_port = input_port("policy_failed")
+    vehicle_status_input_port = input_port("vehicle_status")
+    vehicle_status_age_input_port = input_port("vehicle_status_age")
     clearance_input_port = input_port("clearance")
     gradient_input_port = input_port("gradient")
     velocity_setpoint_output_port = output_port("velocity_setpoint")
     command_output_port = output_port("command")
     mode_output_port = output_port("mode")
     state_is_known_output_port = output_port("state_is_known")
+    is_ready_output_port = output_port("is_ready")
     in_charge_output_port = output_port("in_charge")
 
     def __init__(
@@ -125,10 +147,12 @@ class Failsafe(LeafSystem):
         for name, size in (
             *(("state", 13), ("measured_state", 13), ("velocity_setpoint", 4), ("command", 4)),
             *((name, 1) for name in ("state_age", "observation_age", "body_age", "lag")),
+            *(("policy_failed", 1), ("vehicle_status", 2), ("vehicle_status_age", 1)),
             *(("clearance", 1), ("gradient", 3)),
         ):
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(Memory()))
+        self.DeclareDiscreteState(Track().to_vector())
         flown = self.DeclareCacheEntry(
             "velocity setpoint (4), mode and reason",
             ValueProducer(
@@ -142,6 +166,7 @@ class Failsafe(LeafSystem):
         self.DeclareVectorOutputPort("command", 4, self._calc_command)
         self.DeclareVectorOutputPort("mode", 2, self._calc_mode)
         self.DeclareVectorOutputPort("state_is_known", 1, self._calc_state_is_known)
+        self.DeclareVectorOutputPort("is_ready", 1, self._calc_is_ready)
         self.DeclareVectorOutputPort("in_charge", 1, self._calc_in_charge)
         self.DeclarePeriodicDiscreteUpdateEvent(controller.period, 0.0, self._update)
 
@@ -158,18 +183,39 @@ class Failsafe(LeafSystem):
         read = {reason: optional_input(self, name, context) for reason, name in ports.items()}
         return {reason: float(age[0]) for reason, age in read.items() if age is not None}
 
-    def _wrong(self, context: Context) -> int:
-        """The first reason not to fly as the policy decides; NONE where there is none."""
-        lag = optional_input(self, "lag", context)
-        signals = Signals(
+    def _signals(self, context: Context) -> Signals:
+        lag, failed = (optional_input(self, name, context) for name in ("lag", "policy_failed"))
+        track = _track(context)
+        measured = self.GetInputPort("measured_state").HasValue(context)
+        return Signals(
             ages=self._ages(context),
-            still=context.get_time() - _memory(context).moved,
+            unchanged=context.get_time() - track.changed if measured else 0.0,
+            jumped=bool(track.jumped),
             lag=0.0 if lag is None else float(lag[0]),
             state=self._state(context),
+            policy_failed=failed is not None and bool(failed[0]),
             setpoint=optional_input(self, "velocity_setpoint", context),
             command=np.asarray(self.GetInputPort("command").Eval(context)),
         )
-        return what_is_wrong(signals, self._config, self._controller, self._box)
+
+    def _wrong(self, context: Context) -> int:
+        """The most severe reason not to fly as the policy decides, or NONE."""
+        box = self._box
+        if not (_memory(context).in_charge or self._is_in_charge(context)):
+            box = Box(np.append(box.lower_W[:2], -math.inf), box.upper_W)
+        return what_is_wrong(self._signals(context), self._config, self._controller, box)
+
+    def _is_in_charge(self, context: Context) -> bool | None:
+        """Whether a vehicle flies by what is commanded; None if that is unknown."""
+        told, age = (
+            optional_input(self, name, context) for name in ("vehicle_status", "vehicle_status_age")
+        )
+        if told is None or age is None:
+            return True
+        return bool(told.all()) if age[0] <= MAX_STATUS_AGE else None
+
+    def _known(self, context: Context) -> bool:
+        return not state_is_wrong(self._signals(context), self._config)
 
     def _mode(self, context: Context) -> tuple[int, int]:
         """Mode and reason at this instant."""
@@ -181,24 +227,33 @@ class Failsafe(LeafSystem):
         return (status.HOLDING, wrong) if wrong else (mode, status.NONE)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        now, memory = context.get_time(), _memory(context)
+        now, memory, ages = context.get_time(), _memory(context), self._ages(context)
         measured = optional_input(self, "measured_state", context)
-        if measured is None:
-            memory = memory._replace(moved=now)
-        else:
-            memory = memory.seeing(measured[:3], now)
-        waits = any(map(math.isinf, self._ages(context).values()))
+        if measured is not None and not math.isinf(ages[status.STATE_OLD]):
+            time = now - ages[status.STATE_OLD]
+            track = _track(context).after(measured, time, now, self._config.max_age)
+            discrete_state.set_value(1, track.to_vector())
+        waits = any(map(math.isinf, ages.values()))
         idle = waits and memory.mode == status.WAITING
         wrong = status.NONE if idle else self._wrong(context)
-        memory = memory.after(wrong, waits, now, self._config)
-        if self._known(context):
-            state = self._state(context)
-            memory = memory.holding(state.p_WB, state.v_WB)
-        discrete_state.set_value(np.array(memory))
+        memory = memory.after(wrong, waits, self._is_in_charge(context), now, self._config)
+        memory = memory.holding(self._state(context) if self._known(context) else None)
+        discrete_state.set_value(0, np.array(memory))
 
-    def _known(self, context: Context) -> bool:
-        memory, age = _memory(context), self._ages(context)[status.STATE_OLD]
-        return age <= self._config.max_age and memory.reason != status.STATE_FROZEN
+    def _motion(self, context: Context) -> Motion | None:
+        """Where the vehicle is and comes to rest; None if its state cannot be trusted."""
+        signals = self._signals(context)
+        if state_is_wrong(signals, self._config):
+            return None
+        age = signals.ages[status.STATE_OLD]
+        return Motion.predict(
+            *signals.state[:2],
+            age,
+            # The content of a state that has frozen is older than its message.
+            max(signals.unchanged - age, 0.0),
+            self._config.limits.deceleration,
+            self._controller,
+        )
 
     def _calc_flown(self, context: Context, value: Any) -> None:
         mode, reason = self._mode(context)
@@ -211,9 +266,9 @@ class Failsafe(LeafSystem):
             self._box,
             self._field,
         )
-        wanted = optional_input(self, "velocity_setpoint", context)
-        p_WB = self._state(context).p_WB if self._known(context) else None
-        setpoint, limit = flown_setpoint(mode, wanted, p_WB, _memory(context), near, self._config)
+        desired = optional_input(self, "velocity_setpoint", context)
+        motion, memory = self._motion(context), _memory(context)
+        setpoint, limit = flown_setpoint(mode, desired, motion, memory, near, self._config)
         value.set_value((setpoint, mode, reason or limit))
 
     def _flown(self, context: Context) -> tuple[np.ndarray, int, int]:
@@ -243,14 +298,22 @@ class Failsafe(LeafSystem):
         else:
             output.SetFromVector(np.array(self._flown(context)[1:], dtype=float))
 
-    def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
+    def _calc_is_ready(self, context: Context, output: BasicVector) -> None:
         output[0] = float(_memory(context).mode != status.WAITING)
 
+    def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
+        output[0] = float(self._is_in_charge(context) or False)
+
     def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
-        is_recent = self._ages(context)[status.STATE_OLD] <= LONGEST_PREDICTION
-        in_charge = _memory(context).mode != status.WAITING
-        output[0] = float(in_charge and is_recent and self._known(context))
+        signals = self._signals(context)
+        age = max(signals.ages[status.STATE_OLD], signals.unchanged)
+        is_ready = _memory(context).mode != status.WAITING
+        output[0] = float(is_ready and age <= LONGEST_PREDICTION and self._known(context))
 
 
 def _memory(context: Context) -> Memory:
-    return Memory(*np.asarray(context.get_discrete_state_vector().value()))
+    return Memory(*np.asarray(context.get_discrete_state(0).value()))
+
+
+def _track(context: Context) -> Track:
+    return Track.from_vector(np.asarray(context.get_discrete_state(1).value()))

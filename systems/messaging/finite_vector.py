@@ -1,4 +1,4 @@
-"""FiniteVector: a signal for whoever cannot do with what is no number."""
+"""FiniteVector: a signal for systems that need numbers."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -7,7 +7,7 @@ from splatpilot.systems.ports import input_port, output_port
 
 
 class FiniteVector(LeafSystem):
-    """Gives zeros where any part of a signal is infinite or not a number.
+    """Replaces a signal any part of which is infinite or not a number.
 
     .. pydrake_system::
 
@@ -17,17 +17,20 @@ class FiniteVector(LeafSystem):
         output_ports:
         - finite
 
-    Both are of the size that the constructor is given. Stateless.
+    Both have the size that the constructor is given, ``finite`` is ``signal`` or ``substitute``
+    throughout. Stateless.
     """
 
     signal_input_port = input_port("signal")
     finite_output_port = output_port("finite")
 
-    def __init__(self, size: int):
+    def __init__(self, size: int, substitute: float = 0.0):
         super().__init__()
+        self._substitute = substitute
         self.DeclareVectorInputPort("signal", size)
         self.DeclareVectorOutputPort("finite", size, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         signal = np.asarray(self.get_input_port().Eval(context))
-        output.SetFromVector(signal if np.isfinite(signal).all() else np.zeros(len(signal)))
+        finite = bool(np.isfinite(signal).all())
+        output.SetFromVector(signal if finite else np.full(len(signal), self._substitute))

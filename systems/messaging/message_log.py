@@ -1,5 +1,6 @@
 """Logs of messages, as `lcm-logger` writes and `lcm-logplayer` plays them."""
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,8 @@ from pydrake.systems.analysis import Simulator
 from splatpilot.systems.files import require_unused
 from splatpilot.systems.messaging.unix_clock import UnixClock
 
+_log = logging.getLogger(__name__)
+
 
 @contextmanager
 def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
@@ -18,15 +21,26 @@ def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
     Writes what comes by LCM, on all channels, into a log, each message with the time at which the
     LCM was asked for it.
 
+    A disk that is full ends the log, with one warning, but not the flight that it is a log of.
+
     Raises:
-        OSError: if there is such a file already, unless with `overwrite`, or it cannot be written.
+        OSError: if there is such a file already, unless with `overwrite`, or it cannot be made.
     """
     require_unused(path, overwrite)
-    log = EventLog(path, "w", overwrite=overwrite)
-    subscription = lcm.subscribe(
-        ".*", lambda channel, data: log.write_event(time.time_ns() // 1000, channel, data)
-    )
-    subscription.set_queue_capacity(10_000)  # Nobody looks while a world is made.
+    log, is_writable = EventLog(path, "w", overwrite=overwrite), True
+
+    def write(channel: str, data: bytes) -> None:
+        nonlocal is_writable
+        if not is_writable:
+            return
+        try:
+            log.write_event(time.time_ns() // 1000, channel, data)
+        except OSError as error:
+            is_writable = False
+            _log.warning("%s cannot be written, the log ends here: %s", path, error.strerror)
+
+    subscription = lcm.subscribe(".*", write)
+    subscription.set_queue_capacity(10_000)  # They wait while a world is made.
     try:
         yield
     finally:

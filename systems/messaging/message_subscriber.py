@@ -13,7 +13,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from splatpilot.systems.messaging.codecs import Codec
-from splatpilot.systems.messaging.received import Received
+from splatpilot.systems.messaging.received import RESTART, Received
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.weakly import weakly
 
@@ -29,6 +29,7 @@ class _Received(Received):
     value: np.ndarray  # of the last message that could be used
     utime: int | None = None  # [us], of the last message; None before the first.
     seq: int = 0
+    session: int = 0
     gaps: int = 0
 
 
@@ -70,8 +71,9 @@ class MessageSubscriber(LeafSystem):
     - ``gaps`` (1): how many messages were sent between those that came. A sender that starts again
       leaves no gap.
     - ``rejected`` (1): how many came but were of another type, malformed, not finite, in another
-      frame, no newer than the one before, or sent more than 0.2 s ahead of our clock. The reason is
-      logged at the first, second, fourth, eighth... rejection.
+      frame, no newer than the one before, sent more than 0.2 s ahead of our clock, or by a second
+      sender, which is not heard while the first sends. The reason is logged at the first, second,
+      fourth, eighth... rejection.
 
     Takes what has come every ``period`` seconds from time 0, in an unrestricted update: discrete
     updates of the same instant see it. All of that is in the Context; outside of it are the
@@ -162,10 +164,21 @@ class MessageSubscriber(LeafSystem):
             )
         if last.utime is not None and header.utime <= last.utime:
             raise ValueError("the message is no newer than the one before")
+        session = getattr(message, "session", 0)  # Images, whose type is Drake's, have none.
+        if last.utime is not None and header.utime - last.utime < RESTART * 1e6:
+            if session != last.session or header.seq < last.seq:
+                raise ValueError("there are two senders on this channel; end one of them")
         value = self._codec.unpack(message, epoch)
         lost = header.seq - last.seq - 1 if last.utime is not None else 0
         gaps = last.gaps + max(lost, 0)
-        return replace(last, value=value, utime=header.utime, seq=header.seq, gaps=gaps)
+        return replace(
+            last,
+            value=value,
+            utime=header.utime,
+            seq=header.seq,
+            session=session,
+            gaps=gaps,
+        )
 
     def _unix_time(self, context: Context) -> float:
         return float(np.asarray(self.get_input_port().Eval(context))[0])

@@ -31,7 +31,9 @@ class HypothesisSelector(LeafSystem):
     `state` the 13 numbers [p_WB, v_WB, q_WB, w_WB_B]. `waypoint` (3) is p_WR [m], W frame: where
     the cheapest trajectory wants the vehicle at `now + lookahead`, interpolated linearly between
     its waypoints. A plan that has run out holds its last waypoint; before the first plan the
-    waypoint is the present position, so that the vehicle hovers. Stateless, no rate of its own.
+    waypoint is the present position, so that the vehicle hovers; it is NaN if the lowest
+    cost is infinite or a cost is NaN, since then no trajectory is the cheapest. Stateless, no rate
+    of its own.
     """
 
     hypotheses_input_port = input_port("hypotheses")
@@ -70,6 +72,8 @@ class HypothesisSelector(LeafSystem):
         if plan is None:
             state = np.asarray(self._state_port.Eval(context))
             output.SetFromVector(QuadrotorState.of(state).p_WB)
+        elif not np.isfinite(plan.costs.min()):
+            output.SetFromVector(np.full(3, np.nan))
         else:
             time = context.get_time() + self._lookahead
             output.SetFromVector(plan.position_W(time, plan.best))

@@ -16,6 +16,7 @@ from splatpilot.systems.messaging.unix_clock import time_of_reading
 from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.px4.mavlink import (
     ARM,
+    OFFBOARD,
     SET_MODE,
     Attitude,
     Granted,
@@ -151,6 +152,7 @@ class Px4Telemetry(LeafSystem):
         - armed
         - mode
         - granted
+        - vehicle_status
         - rejected
 
     - ``unix_time`` (1): [s].
@@ -160,6 +162,8 @@ class Px4Telemetry(LeafSystem):
     - ``age`` (1): [s] since then; infinity before both have come.
     - ``heartbeat_age`` (1): [s] since the last HEARTBEAT; infinity before the first.
     - ``armed`` (1), ``mode`` (2): of that; main and sub mode. 0 where it is older than 3 s.
+    - ``vehicle_status`` (2): whether it is armed, and whether it is in offboard mode; NaN where the
+      last HEARTBEAT is older than 3 s. See ``lcmt_vehicle_status``.
     - ``granted`` (2): whether PX4 has ever accepted a command for a mode, and one to arm.
     - ``rejected`` (1): packets and messages that were not MAVLink, of others than the senders that
       are named, no newer than the message before, or with values that are not finite; the reason
@@ -184,6 +188,7 @@ class Px4Telemetry(LeafSystem):
     armed_output_port = output_port("armed")
     mode_output_port = output_port("mode")
     granted_output_port = output_port("granted")
+    vehicle_status_output_port = output_port("vehicle_status")
     rejected_output_port = output_port("rejected")
 
     def __init__(
@@ -215,6 +220,7 @@ class Px4Telemetry(LeafSystem):
             "armed": (1, lambda said, now: _is_known(said, now) and said.heartbeat.armed),
             "mode": (2, lambda said, now: _is_known(said, now) * np.array(said.heartbeat.mode)),
             "granted": (2, lambda said, now: [SET_MODE in said.granted, ARM in said.granted]),
+            "vehicle_status": (2, _vehicle_status),
             "rejected": (1, lambda said, now: said.rejected),
         }
         for name, (size, value) in outputs.items():
@@ -259,3 +265,9 @@ class Px4Telemetry(LeafSystem):
 
 def _is_known(said: _Said, now: float) -> bool:
     return now - said.heard <= HEARTBEAT_TIMEOUT
+
+
+def _vehicle_status(said: _Said, now: float) -> list[float]:
+    if not _is_known(said, now):
+        return [math.nan, math.nan]
+    return [said.heartbeat.armed, said.heartbeat.mode[0] == OFFBOARD[0]]

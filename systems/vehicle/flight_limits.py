@@ -1,4 +1,4 @@
-"""How fast a vehicle may fly where: what nobody who flies it may exceed."""
+"""How fast a vehicle may fly where, whatever a policy decides."""
 
 import math
 from dataclasses import dataclass
@@ -8,31 +8,30 @@ import numpy as np
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
-REACTION_TIME = 0.6
-"""[s] that passes before a vehicle brakes that was told to: its answer to velocities."""
-
 LEVEL = 0.7
-"""[-] z of the normal of surfaces that can be landed on, at least."""
+"""[-] Min z of the normal of surfaces that can be landed on."""
 
+RETURN_SPEED = 1.0
+"""[m/s] Max speed back to where a vehicle may be."""
 
-_SLOW = 0.1  # [m/s], below which nothing lies ahead.
-_STEP = 0.1  # [m], at least, between places that are looked at.
+_STEP = 0.05  # [m] Between points of a path that are checked; more on paths
+_MAX_STEPS = 1000  # [-] that would have more, which only states have that cannot be true.
 
 
 @dataclass
 class FlightLimits:
     """What is kept whatever a policy decides."""
 
-    # [m/s] Greatest speed.
+    # [m/s] Max speed.
     max_speed: float = 6.0
-    # [rad] Greatest angle between body z and vertical.
+    # [rad] Max angle between body z and vertical.
     max_tilt: float = 1.0
-    # [m/s^2] With which the vehicle can brake in time, along each axis at once.
-    deceleration: float = 3.0
-    # [m] Between the vehicle's hull and what is known of the world.
+    # [m/s^2] With which the vehicle is sure to brake; the controller commands up to 6.
+    deceleration: float = 5.0
+    # [m] Min distance from the collision sphere to what is known of the world.
     min_clearance: float = 0.1
-    # [m] Corners of the box in which the hull stays, the lower one first; the world's where left
-    # out.
+    # [m] Corners of the box in which the collision sphere stays, the lower one first; the world's
+    # box if left out.
     geofence: list[list[float]] | None = None
 
     def validate(self) -> None:
@@ -43,71 +42,111 @@ class FlightLimits:
         _check("min_clearance", self.min_clearance, 0.0 <= self.min_clearance <= 5.0, "0 to 5 m")
         if self.geofence is not None:
             fence = np.array(self.geofence, dtype=float)
-            valid = fence.shape == (2, 3) and bool((fence[0] < fence[1]).all())
-            _check("geofence", self.geofence, valid, "two corners of a box, the lower one first")
+            min_side = 2.0 * (VEHICLE_RADIUS + self.min_clearance)
+            valid = fence.shape == (2, 3) and bool((fence[1] - fence[0] >= min_side).all())
+            limit = (
+                "two corners of a box, the lower one first, with sides of at least "
+                f"{min_side:.2f} m: those of the collision sphere and min_clearance"
+            )
+            _check("geofence", self.geofence, valid, limit)
 
 
 def limit_speed(velocity: np.ndarray, max_speed: float) -> np.ndarray:
-    """The velocity (3,) [m/s], shortened to `max_speed` [m/s]."""
+    """Shortens a velocity (3,) [m/s] to `max_speed` [m/s]."""
     size = float(np.linalg.norm(velocity))
     return velocity * min(1.0, max_speed / size) if size > 0.0 else velocity
 
 
-def limit_approach(
-    velocity: np.ndarray, away: np.ndarray, room: float, deceleration: float
+def stopping_displacement(
+    velocity: np.ndarray, response_time: float, deceleration: float
 ) -> np.ndarray:
     """
-    The velocity (3,) [m/s] with which a vehicle can still stop within the room that it has.
+    Predicts by how much (3,) [m] a vehicle moves on after it is told to stop.
 
-    Of v only the part towards the obstacle is lessened, to the largest with
-    v REACTION_TIME + v² / (2 deceleration) <= room; where there is none left it leads away, by
-    room / REACTION_TIME.
+    Its velocity v takes up a commanded velocity u as v' = (u - v) / T, with T the response time,
+    but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
+    point p + T v at which it would rest then moves with exactly the commanded velocity, since
+    (p + T v)' = v + (u - v) = u.
+
+    Args:
+        velocity: (3,) [m/s].
+        response_time: T [s].
+        deceleration: a [m/s^2].
+    """
+    speed, exponential = float(np.linalg.norm(velocity)), deceleration * response_time
+    if speed <= exponential:
+        return response_time * velocity
+    return velocity * ((speed + exponential**2 / speed) / (2.0 * deceleration))
+
+
+def limit_approach(
+    velocity: np.ndarray, away: np.ndarray, room: float, reaction_time: float
+) -> np.ndarray:
+    """
+    Limits a commanded velocity (3,) [m/s] so that the point of rest stays off an obstacle.
+
+    Only the part towards the obstacle is reduced, to at most room / reaction_time; if the room is
+    negative it leads away, by at most `RETURN_SPEED`. A point that obeys after a dead time t
+    approaches without overshoot if reaction_time >= e t.
 
     Args:
         away: (3,) unit vector that leads away from the obstacle.
-        room: [m] left towards it.
-        deceleration: [m/s^2].
+        room: [m] from the point of rest to the obstacle, see `stopping_displacement`.
+        reaction_time: [s].
     """
-    reaction = deceleration * REACTION_TIME
-    fastest = math.sqrt(reaction**2 + 2.0 * deceleration * max(room, 0.0)) - reaction
-    fastest += min(room, 0.0) / REACTION_TIME
+    fastest = max(room / reaction_time, -RETURN_SPEED)
     return velocity + away * max(0.0, -float(velocity.dot(away)) - fastest)
 
 
 def limit_ahead(
-    velocity: np.ndarray, p: np.ndarray, field: Distances, limits: FlightLimits
+    velocity: np.ndarray,
+    p: np.ndarray,
+    stop: np.ndarray,
+    field: Distances,
+    min_clearance: float,
+    reaction_time: float,
 ) -> np.ndarray:
-    """The velocity (3,) [m/s], shortened so that a vehicle at p (3,) [m] can stop before the first
-    place on its way that is too near to what the field knows."""
-    speed = float(np.linalg.norm(velocity))
-    if speed < _SLOW:
-        return velocity
-    way = velocity / speed
-    reach = speed * REACTION_TIME + speed**2 / (2.0 * limits.deceleration)
-    here = float(field.distance(p)) - VEHICLE_RADIUS
-    least = min(limits.min_clearance, here)  # Who is too near may leave.
-    ahead, clearance = 0.0, here
-    # Beyond what is known, where distances are NaN, nothing is known to be in the way.
-    while ahead < reach and clearance >= least:
-        ahead += max(clearance - least, _STEP)
-        clearance = float(field.distance(p + ahead * way)) - VEHICLE_RADIUS
-    if ahead < reach and clearance < least:
-        return limit_approach(velocity, -way, ahead, limits.deceleration)
+    """
+    Limits a commanded velocity (3,) [m/s] by what lies on the path: straight to the point of rest,
+    and from there on along the velocity.
+
+    Args:
+        p: (3,) [m] position of the vehicle.
+        stop: (3,) [m] from there to the point of rest.
+        field: what is known of the world. Beyond it, where distances are NaN, the path is free.
+        min_clearance: [m]. A vehicle that is nearer than that may leave.
+        reaction_time: [s].
+    """
+    nearest = min(min_clearance, float(field.distance(p)) - VEHICLE_RADIUS)
+    for start, path in ((p, stop), (p + stop, velocity * reaction_time)):
+        length = float(np.linalg.norm(path))
+        if length < 1e-6:
+            continue
+        steps = math.ceil(min(length / _STEP, _MAX_STEPS))
+        along = np.linspace(0.0, length, steps + 1)  # (N,) [m]
+        points = start + path * (along / length)[:, None]
+        blocked = field.distance(points) - VEHICLE_RADIUS < nearest - 1e-9
+        if blocked.any():
+            free = along[max(int(np.argmax(blocked)) - 1, 0)]
+            room = free - length if path is stop else free
+            return limit_approach(velocity, -path / length, room, reaction_time)
     return velocity
 
 
 def limit_to_box(
-    velocity: np.ndarray, p: np.ndarray, lower: np.ndarray, upper: np.ndarray, deceleration: float
+    velocity: np.ndarray,
+    rest: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    reaction_time: float,
 ) -> np.ndarray:
-    """The velocity (3,) [m/s] with which a vehicle at p (3,) stays in a box [m]."""
-    for axis in range(3):
-        away = np.zeros(3)
-        away[axis] = 1.0
-        velocity = limit_approach(velocity, away, p[axis] - lower[axis], deceleration)
-        velocity = limit_approach(velocity, -away, upper[axis] - p[axis], deceleration)
+    """Limits a commanded velocity (3,) [m/s] so that the point of rest (3,) [m] stays in a box."""
+    for axis, away in enumerate(np.eye(3)):
+        velocity = limit_approach(velocity, away, rest[axis] - lower[axis], reaction_time)
+        velocity = limit_approach(velocity, -away, upper[axis] - rest[axis], reaction_time)
     return velocity
 
 
 def _check(name: str, value: object, valid: bool, limit: str) -> None:
     if not valid:
-        raise ValueError(f"limits.{name} is {value}; it must be {limit}")
+        raise ValueError(f"limits.{name} must be {limit}, got {value}")

@@ -345,3 +345,13 @@ def test_over_velocities_the_camera_looks_along_a_curve(chain, decision, speed, 
         along = np.arctan2(state.v_WB[1], state.v_WB[0])
         assert np.linalg.norm(state.v_WB[:2]) == pytest.approx(0.8, abs=0.1)
         assert np.cos(along - state.heading) > np.cos(np.radians(10.0))
+
+
+def test_a_vehicle_below_its_fence_is_armed_and_takes_off_into_it(chain):
+    flight = chain()
+    flight.px4.state[2] = -0.3
+    flight.advance(3.0)
+    assert (flight.px4.mode, flight.px4.armed) == (OFFBOARD, True)
+    flight.advance(5.0)
+    assert flight.status()[0] == lcmt_bridge_status.FLYING
+    assert flight.px4.state[2] > 0.35

@@ -16,6 +16,7 @@ from splatpilot.systems.messaging.codecs import (
     HypothesesCodec,
     MotionCaptureCodec,
     StateCodec,
+    VehicleStatusCodec,
     VelocitySetpointCodec,
 )
 from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec
@@ -35,6 +36,7 @@ def _codecs() -> list[tuple[Codec, np.ndarray]]:
         (StateCodec(), _STATE),
         (CommandCodec(), np.array([9.0, 0, 0, 0])),
         (VelocitySetpointCodec(), np.array([1.0, 0, 0, np.nan])),
+        (VehicleStatusCodec(), np.array([1.0, 0.0])),
         (MotionCaptureCodec("drone"), _STATE[[0, 1, 2, 6, 7, 8, 9]]),
         (DepthGridCodec(4, 3, 5.0, "tof"), np.full(12, 0.5)),
         (HypothesesCodec(2), plan),
@@ -46,7 +48,10 @@ def _codecs() -> list[tuple[Codec, np.ndarray]]:
 def _message(codec: Codec, value: np.ndarray) -> bytes:
     header = lcmt_header()
     header.seq, header.utime, header.frame_name = 1, 1_800_000_000_000_000, codec.frame
-    return codec.pack(value, header, 0.0).encode()
+    message = codec.pack(value, header, 0.0)
+    if codec.image is None:
+        message.session = 1  # The same packets in every run.
+    return message.encode()
 
 
 def _write_messages(folder: Path) -> None:

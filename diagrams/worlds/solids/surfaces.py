@@ -71,8 +71,8 @@ def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> Gau
 
 def merge(scenes: list[GaussianScene]) -> GaussianScene:
     """The Gaussians of all `scenes`, which share one degree of harmonics, in order."""
-    names = [f.name for f in fields(GaussianScene)]
-    return GaussianScene(**{n: np.concatenate([getattr(s, n) for s in scenes]) for n in names})
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return GaussianScene(*(np.concatenate([getattr(s, n) for s in scenes]) for n in names))
 
 
 def perpendicular(d: ArrayLike) -> NDArray[np.float64]:

@@ -10,4 +10,5 @@ from .lcmt_depth_grid import lcmt_depth_grid as lcmt_depth_grid
 from .lcmt_motion_capture_pose import lcmt_motion_capture_pose as lcmt_motion_capture_pose
 from .lcmt_quadrotor_state import lcmt_quadrotor_state as lcmt_quadrotor_state
 from .lcmt_trajectory_hypotheses import lcmt_trajectory_hypotheses as lcmt_trajectory_hypotheses
+from .lcmt_vehicle_status import lcmt_vehicle_status as lcmt_vehicle_status
 from .lcmt_velocity_setpoint import lcmt_velocity_setpoint as lcmt_velocity_setpoint

@@ -12,17 +12,23 @@ import drake
 class lcmt_body_rate_command(object):
     """ What a quadrotor's rate controller is to do, until the next one comes. B is the body (x forward, y left, z up). """
 
-    __slots__ = ["header", "thrust", "w_cmd_B"]
+    __slots__ = ["header", "session", "thrust", "w_cmd_B"]
 
-    __typenames__ = ["drake.lcmt_header", "double", "double"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "double", "double"]
 
-    __dimensions__ = [None, None, [3]]
+    __dimensions__ = [None, None, None, [3]]
 
     def __init__(self):
         self.header = drake.lcmt_header()
         """
         utime is when it was decided, frame_name is "body".
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.thrust = 0.0
@@ -47,7 +53,7 @@ class lcmt_body_rate_command(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
-        buf.write(struct.pack(">d", self.thrust))
+        buf.write(struct.pack(">id", self.session, self.thrust))
         buf.write(struct.pack('>3d', *self.w_cmd_B[:3]))
 
     @staticmethod
@@ -64,7 +70,7 @@ class lcmt_body_rate_command(object):
     def _decode_one(buf):
         self = lcmt_body_rate_command()
         self.header = drake.lcmt_header._decode_one(buf)
-        self.thrust = struct.unpack(">d", buf.read(8))[0]
+        self.session, self.thrust = struct.unpack(">id", buf.read(12))
         self.w_cmd_B = struct.unpack('>3d', buf.read(24))
         return self
 
@@ -72,7 +78,7 @@ class lcmt_body_rate_command(object):
     def _get_hash_recursive(parents):
         if lcmt_body_rate_command in parents: return 0
         newparents = parents + [lcmt_body_rate_command]
-        tmphash = (0x3342b7f72c06705b+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xffb7d95d6de2a079+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -12,11 +12,11 @@ import drake
 class lcmt_bridge_status(object):
     """ How the process is that flies a vehicle by messages. """
 
-    __slots__ = ["header", "mode", "reason", "state_age", "observation_age", "num_gaps", "num_rejected", "num_overruns"]
+    __slots__ = ["header", "session", "mode", "reason", "state_age", "observation_age", "num_gaps", "num_rejected", "num_overruns"]
 
-    __typenames__ = ["drake.lcmt_header", "int8_t", "int8_t", "double", "double", "int64_t", "int64_t", "int64_t"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "int8_t", "int8_t", "double", "double", "int64_t", "int64_t", "int64_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None]
 
     WAITING = 0
     """ For the first state or observation. """
@@ -25,10 +25,10 @@ class lcmt_bridge_status(object):
     HOLDING = 2
     """ Brakes and hovers. """
     LANDING = 3
-    """ Descends, whatever comes. """
+    """ Descends, whatever comes, until it is not in charge any more. """
     NONE = 0
     STATE_OLD = 1
-    """ The state is older than allowed, or does not change though the vehicle moves. """
+    """ The state is older than allowed, or its content has not changed for as long. """
     STATE_FROZEN = 2
     OBSERVATION_OLD = 3
     """ The observation is older than allowed. """
@@ -49,12 +49,22 @@ class lcmt_bridge_status(object):
     """
     LIMITED_GEOFENCE = 11
     LIMITED_CLEARANCE = 12
+    STATE_JUMPED = 13
+    """ The state does not follow from those before: position, velocity and attitude do not agree. """
+    POLICY_FAILED = 14
+    """ The policy raised an exception instead of deciding; the log has it. """
 
     def __init__(self):
         self.header = drake.lcmt_header()
         """
         utime is when it was so, frame_name is empty.
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.mode = 0
@@ -109,7 +119,7 @@ class lcmt_bridge_status(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
-        buf.write(struct.pack(">bbddqqq", self.mode, self.reason, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns))
+        buf.write(struct.pack(">ibbddqqq", self.session, self.mode, self.reason, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns))
 
     @staticmethod
     def decode(data: bytes):
@@ -125,14 +135,14 @@ class lcmt_bridge_status(object):
     def _decode_one(buf):
         self = lcmt_bridge_status()
         self.header = drake.lcmt_header._decode_one(buf)
-        self.mode, self.reason, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns = struct.unpack(">bbddqqq", buf.read(42))
+        self.session, self.mode, self.reason, self.state_age, self.observation_age, self.num_gaps, self.num_rejected, self.num_overruns = struct.unpack(">ibbddqqq", buf.read(46))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_bridge_status in parents: return 0
         newparents = parents + [lcmt_bridge_status]
-        tmphash = (0x8368d8f9c2a49e10+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x2bad85a3796547c2+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -12,11 +12,11 @@ import drake
 class lcmt_depth_grid(object):
     """ A coarse picture of what is near, as policies see it: the nearest in each cell. """
 
-    __slots__ = ["header", "width", "height", "min_range", "max_range", "encoding", "num_values", "values"]
+    __slots__ = ["header", "session", "width", "height", "min_range", "max_range", "encoding", "num_values", "values"]
 
-    __typenames__ = ["drake.lcmt_header", "int32_t", "int32_t", "float", "float", "int8_t", "int32_t", "float"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "int32_t", "int32_t", "float", "float", "int8_t", "int32_t", "float"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, ["num_values"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, ["num_values"]]
 
     DEPTH = 0
     """ [m], along the optical axis. """
@@ -30,6 +30,12 @@ class lcmt_depth_grid(object):
         """
         utime is when the sensor exposed, frame_name names the sensor.
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.width = 0
@@ -72,7 +78,7 @@ class lcmt_depth_grid(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
-        buf.write(struct.pack(">iiffbi", self.width, self.height, self.min_range, self.max_range, self.encoding, self.num_values))
+        buf.write(struct.pack(">iiiffbi", self.session, self.width, self.height, self.min_range, self.max_range, self.encoding, self.num_values))
         buf.write(struct.pack('>%df' % self.num_values, *self.values[:self.num_values]))
 
     @staticmethod
@@ -89,7 +95,7 @@ class lcmt_depth_grid(object):
     def _decode_one(buf):
         self = lcmt_depth_grid()
         self.header = drake.lcmt_header._decode_one(buf)
-        self.width, self.height, self.min_range, self.max_range, self.encoding, self.num_values = struct.unpack(">iiffbi", buf.read(21))
+        self.session, self.width, self.height, self.min_range, self.max_range, self.encoding, self.num_values = struct.unpack(">iiiffbi", buf.read(25))
         self.values = struct.unpack('>%df' % self.num_values, buf.read(self.num_values * 4))
         return self
 
@@ -97,7 +103,7 @@ class lcmt_depth_grid(object):
     def _get_hash_recursive(parents):
         if lcmt_depth_grid in parents: return 0
         newparents = parents + [lcmt_depth_grid]
-        tmphash = (0x9abe97877dc17ca8+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xccd5e8d35bf4c1d3+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

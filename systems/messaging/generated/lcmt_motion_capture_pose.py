@@ -15,17 +15,23 @@ class lcmt_motion_capture_pose(object):
     it. B is the body (x forward, y left, z up).
     """
 
-    __slots__ = ["header", "body", "tracked", "p_WB", "q_WB"]
+    __slots__ = ["header", "session", "body", "tracked", "p_WB", "q_WB"]
 
-    __typenames__ = ["drake.lcmt_header", "string", "boolean", "double", "double"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "string", "boolean", "double", "double"]
 
-    __dimensions__ = [None, None, None, [3], [4]]
+    __dimensions__ = [None, None, None, None, [3], [4]]
 
     def __init__(self):
         self.header = drake.lcmt_header()
         """
         utime is when the cameras exposed, frame_name is "world".
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.body = ""
@@ -62,6 +68,7 @@ class lcmt_motion_capture_pose(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
+        buf.write(struct.pack(">i", self.session))
         __body_encoded = self.body.encode('utf-8')
         buf.write(struct.pack('>I', len(__body_encoded)+1))
         buf.write(__body_encoded)
@@ -84,6 +91,7 @@ class lcmt_motion_capture_pose(object):
     def _decode_one(buf):
         self = lcmt_motion_capture_pose()
         self.header = drake.lcmt_header._decode_one(buf)
+        self.session = struct.unpack(">i", buf.read(4))[0]
         __body_len = struct.unpack('>I', buf.read(4))[0]
         self.body = buf.read(__body_len)[:-1].decode('utf-8', 'replace')
         self.tracked = bool(struct.unpack('b', buf.read(1))[0])
@@ -95,7 +103,7 @@ class lcmt_motion_capture_pose(object):
     def _get_hash_recursive(parents):
         if lcmt_motion_capture_pose in parents: return 0
         newparents = parents + [lcmt_motion_capture_pose]
-        tmphash = (0xffe8a0c98b4442b7+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x23bdaee0d9577682+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

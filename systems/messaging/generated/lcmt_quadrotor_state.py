@@ -15,17 +15,23 @@ class lcmt_quadrotor_state(object):
     body (x forward, y left, z up).
     """
 
-    __slots__ = ["header", "p_WB", "v_WB", "q_WB", "w_WB_B"]
+    __slots__ = ["header", "session", "p_WB", "v_WB", "q_WB", "w_WB_B"]
 
-    __typenames__ = ["drake.lcmt_header", "double", "double", "double", "double"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "double", "double", "double", "double"]
 
-    __dimensions__ = [None, [3], [3], [4], [3]]
+    __dimensions__ = [None, None, [3], [3], [4], [3]]
 
     def __init__(self):
         self.header = drake.lcmt_header()
         """
         utime is when the vehicle was in this state, frame_name is "world".
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.p_WB = [ 0.0 for dim0 in range(3) ]
@@ -62,6 +68,7 @@ class lcmt_quadrotor_state(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
+        buf.write(struct.pack(">i", self.session))
         buf.write(struct.pack('>3d', *self.p_WB[:3]))
         buf.write(struct.pack('>3d', *self.v_WB[:3]))
         buf.write(struct.pack('>4d', *self.q_WB[:4]))
@@ -81,6 +88,7 @@ class lcmt_quadrotor_state(object):
     def _decode_one(buf):
         self = lcmt_quadrotor_state()
         self.header = drake.lcmt_header._decode_one(buf)
+        self.session = struct.unpack(">i", buf.read(4))[0]
         self.p_WB = struct.unpack('>3d', buf.read(24))
         self.v_WB = struct.unpack('>3d', buf.read(24))
         self.q_WB = struct.unpack('>4d', buf.read(32))
@@ -91,7 +99,7 @@ class lcmt_quadrotor_state(object):
     def _get_hash_recursive(parents):
         if lcmt_quadrotor_state in parents: return 0
         newparents = parents + [lcmt_quadrotor_state]
-        tmphash = (0x74472a92c82a3f29+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xca9b38037bca4f5+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -15,17 +15,23 @@ class lcmt_trajectory_hypotheses(object):
     up) where it was when they were planned.
     """
 
-    __slots__ = ["header", "plan_utime", "waypoint_period", "p_WP", "q_WP", "num_hypotheses", "waypoints_P", "costs"]
+    __slots__ = ["header", "session", "plan_utime", "waypoint_period", "p_WP", "q_WP", "num_hypotheses", "waypoints_P", "costs"]
 
-    __typenames__ = ["drake.lcmt_header", "int64_t", "double", "double", "double", "int32_t", "double", "double"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "int64_t", "double", "double", "double", "int32_t", "double", "double"]
 
-    __dimensions__ = [None, None, None, [3], [4], None, ["num_hypotheses", 10, 3], ["num_hypotheses"]]
+    __dimensions__ = [None, None, None, None, [3], [4], None, ["num_hypotheses", 10, 3], ["num_hypotheses"]]
 
     def __init__(self):
         self.header = drake.lcmt_header()
         """
         utime is when they were sent, frame_name is "world".
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.plan_utime = 0
@@ -76,7 +82,7 @@ class lcmt_trajectory_hypotheses(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
-        buf.write(struct.pack(">qd", self.plan_utime, self.waypoint_period))
+        buf.write(struct.pack(">iqd", self.session, self.plan_utime, self.waypoint_period))
         buf.write(struct.pack('>3d', *self.p_WP[:3]))
         buf.write(struct.pack('>4d', *self.q_WP[:4]))
         buf.write(struct.pack(">i", self.num_hypotheses))
@@ -99,7 +105,7 @@ class lcmt_trajectory_hypotheses(object):
     def _decode_one(buf):
         self = lcmt_trajectory_hypotheses()
         self.header = drake.lcmt_header._decode_one(buf)
-        self.plan_utime, self.waypoint_period = struct.unpack(">qd", buf.read(16))
+        self.session, self.plan_utime, self.waypoint_period = struct.unpack(">iqd", buf.read(20))
         self.p_WP = struct.unpack('>3d', buf.read(24))
         self.q_WP = struct.unpack('>4d', buf.read(32))
         self.num_hypotheses = struct.unpack(">i", buf.read(4))[0]
@@ -115,7 +121,7 @@ class lcmt_trajectory_hypotheses(object):
     def _get_hash_recursive(parents):
         if lcmt_trajectory_hypotheses in parents: return 0
         newparents = parents + [lcmt_trajectory_hypotheses]
-        tmphash = (0xe7045285d326166d+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x23ef8be8c4d5306d+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -12,17 +12,23 @@ import drake
 class lcmt_velocity_setpoint(object):
     """ What an autopilot's velocity controller is to do, until the next one comes. W is the world (z up), B the body (x forward). """
 
-    __slots__ = ["header", "v_WB", "heading"]
+    __slots__ = ["header", "session", "v_WB", "heading"]
 
-    __typenames__ = ["drake.lcmt_header", "double", "double"]
+    __typenames__ = ["drake.lcmt_header", "int32_t", "double", "double"]
 
-    __dimensions__ = [None, [3], None]
+    __dimensions__ = [None, None, [3], None]
 
     def __init__(self):
         self.header = drake.lcmt_header()
         """
         utime is when it was decided, frame_name is "world".
         LCM Type: drake.lcmt_header
+        """
+
+        self.session = 0
+        """
+        Tells senders apart: a number that each draws when it starts.
+        LCM Type: int32_t
         """
 
         self.v_WB = [ 0.0 for dim0 in range(3) ]
@@ -47,6 +53,7 @@ class lcmt_velocity_setpoint(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == drake.lcmt_header._get_packed_fingerprint()
         self.header._encode_one(buf)
+        buf.write(struct.pack(">i", self.session))
         buf.write(struct.pack('>3d', *self.v_WB[:3]))
         buf.write(struct.pack(">d", self.heading))
 
@@ -64,6 +71,7 @@ class lcmt_velocity_setpoint(object):
     def _decode_one(buf):
         self = lcmt_velocity_setpoint()
         self.header = drake.lcmt_header._decode_one(buf)
+        self.session = struct.unpack(">i", buf.read(4))[0]
         self.v_WB = struct.unpack('>3d', buf.read(24))
         self.heading = struct.unpack(">d", buf.read(8))[0]
         return self
@@ -72,7 +80,7 @@ class lcmt_velocity_setpoint(object):
     def _get_hash_recursive(parents):
         if lcmt_velocity_setpoint in parents: return 0
         newparents = parents + [lcmt_velocity_setpoint]
-        tmphash = (0x38cfc91c92aa4b25+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xc1bd2e011dbe28ba+ drake.lcmt_header._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

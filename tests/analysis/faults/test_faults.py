@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import socket
+import struct
 
 import lcm
 import numpy as np
@@ -10,21 +12,32 @@ import pytest
 from drake import lcmt_header
 
 from splatpilot.analysis.cli import main
-from splatpilot.analysis.faults.fault import DELAY, KINDS, Fault
-from splatpilot.analysis.faults.relay import Relay
+from splatpilot.analysis.faults.fault import DELAY, KINDS, Fault, Trial
+from splatpilot.analysis.faults.relay import GridStream, Relay
 from splatpilot.analysis.faults.run import FaultsConfig, summarize
-from splatpilot.systems.messaging.codecs import CommandCodec, StateCodec
+from splatpilot.analysis.faults.trial import fly_trial
+from splatpilot.diagrams.policies import policy_named
+from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.messaging.codecs import (
+    CommandCodec,
+    DepthGridCodec,
+    MotionCaptureCodec,
+    StateCodec,
+)
+from splatpilot.systems.vehicle.flight_limits import FlightLimits
 from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
 
 
 class Line:
     """States sent through a relay every 20 ms, and what arrives of them."""
 
-    def __init__(self, kind: str, part: float = 1.0, size: float = 2.0):
+    def __init__(self, *kinds: str, size: float = 2.0):
         near, far = lcm.LCM("memq://"), lcm.LCM("memq://")
-        fault = Fault(kind, begin=1.0, duration=1.0, part=part, size=size)
+        faults = tuple(Fault(kind, 1.0, duration=1.0, fraction=1.0, size=size) for kind in kinds)
         random = np.random.default_rng(0)
-        relay = Relay(near, far, [StateCodec()], [CommandCodec()], fault, random)
+        relay = Relay(near, far, [StateCodec()], [CommandCodec()], faults, random)
         self.heard = []
         far.subscribe("QUADROTOR_STATE", lambda _, data: self.heard.append((now, data)))
         self.sent = []
@@ -86,11 +99,84 @@ def test_contents_are_spoilt_as_they_are_called():
     assert not {data for _, data in spoilt.during} & set(spoilt.sent)
 
 
-def test_kinds_take_turns_and_repeat():
-    """Every kind is tried as often as the others, and a trial's fault is that of its number."""
-    draw = [Fault.draw(n, np.random.default_rng([0, n])) for n in range(2 * len(KINDS))]
-    assert [fault.kind for fault in draw] == [*KINDS, *KINDS]
-    assert draw[3] == Fault.draw(3, np.random.default_rng([0, 3])) != draw[3 + len(KINDS)]
+def test_a_state_that_jumps_is_meters_away_and_of_two_faults_both_happen():
+    jumped = [StateCodec.message.decode(data) for _, data in Line("state_jumped").during]
+    assert {message.p_WB[1] for message in jumped} == {3.0}
+    both = [
+        (now, StateCodec.message.decode(data))
+        for now, data in Line("delayed", "state_frozen").heard
+    ]
+    hit = [(now, message) for now, message in both if 50 <= message.header.seq < 100]
+    assert {message.p_WB for _, message in hit} == {(5.0, 0.0, 2.0)}
+    late = [now - 0.02 * message.header.seq for now, message in hit]
+    np.testing.assert_allclose(late, DELAY, atol=0.021)
+
+
+@pytest.mark.parametrize(
+    ("kind", "tracked"), [("body_lost", [False]), ("body_dropped", []), ("grid_dropped", [True])]
+)
+def test_motion_capture_is_lost_as_it_is_called(kind, tracked):
+    near, far, heard, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), [], MotionCaptureCodec("a")
+    fault = Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0)
+    relay = Relay(near, far, [codec], [], (fault,), np.random.default_rng(0))
+    far.subscribe(codec.channel, lambda _, data: heard.append(codec.message.decode(data).tracked))
+    header = lcmt_header()
+    header.frame_name = "world"
+    near.publish(codec.channel, codec.pack(np.array([1.0, 2, 3, 1, 0, 0, 0]), header, 0.0).encode())
+    relay.step(0.5)
+    while far.handle_timeout(0):
+        pass
+    assert heard == tracked
+
+
+@pytest.mark.parametrize(("kind", "came"), [("body_lost", True), ("grid_dropped", False)])
+def test_grids_travel_as_packets_of_the_sensor(kind, came):
+    codec, near = DepthGridCodec(16, 9, 5.0, "policy_camera"), lcm.LCM("memq://")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inbox:
+        inbox.bind(("127.0.0.1", 0))
+        inbox.settimeout(0.2)
+        fault = Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0)
+        stream = GridStream(inbox.getsockname()[1])
+        random = np.random.default_rng(0)
+        relay = Relay(near, lcm.LCM("memq://"), [codec], [], (fault,), random, stream)
+        header = lcmt_header()
+        header.seq, header.utime, header.frame_name = 3, 7, codec.frame
+        near.publish(codec.channel, codec.pack(np.full(144, 0.25), header, 0.0).encode())
+        relay.step(0.5)
+        try:
+            packet = inbox.recv(65536)
+        except TimeoutError:
+            packet = b""
+    expected = struct.pack("<IIQ144f", 0x544F4632, 3, 7000, *[0.25] * 144)
+    assert packet == (expected if came else b"")
+
+
+def test_kinds_interfaces_and_policies_take_turns_and_repeat():
+    count = 4 * len(KINDS)
+    trials = [Trial.draw(n, np.random.default_rng([0, n])) for n in range(count)]
+    for number, trial in enumerate(trials):
+        kinds = [fault.kind for fault in trial.faults]
+        assert KINDS[number % len(KINDS)] in kinds and len(set(kinds)) == len(kinds)
+        grids = any(kind.startswith("grid") for kind in kinds)
+        assert (trial.policy == "diffaero_tof") == grids
+    assert {trial.setpoints for trial in trials} == {"velocity", "body_rates"}
+    assert {trial.policy for trial in trials} == {"straight", "reactive", "diffaero_tof"}
+    pairs = sum(len(trial.faults) == 2 for trial in trials)
+    assert 0.3 * count < pairs < 0.7 * count
+    assert trials[3] == Trial.draw(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
+
+
+@pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
+def test_a_state_that_freezes_while_images_are_lost_ends_in_no_accident(setpoints):
+    scenario = Scenario(
+        world=ForestConfig(length=12.0, width=6.0), policy=policy_named("straight", 2.0)
+    )
+    world = make_world(scenario.world, 0)
+    faults = tuple(Fault(kind, 1.5, 2.0, 1.0, 1.0) for kind in ("dropped", "state_frozen"))
+    trial = Trial(faults, "straight", setpoints)
+    row = fly_trial(scenario, world, trial, FlightLimits(max_speed=2.5), 0)
+    assert row["safe"]
+    assert row["min_clearance"] >= 0.09
 
 
 def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
@@ -115,7 +201,7 @@ def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
 
 def test_accidents_are_counted():
     """A trial that was not safe is no safe one in the summary."""
-    row = {"kind": "dropped", "safe": True, "outcome": "hover"}
+    row = {"faults": [{"kind": "dropped"}], "safe": True, "outcome": "hover"}
     summary = summarize([row, {**row, "safe": False, "outcome": "collision"}])
     assert (summary["trials"], summary["safe"]) == (2, 1)
     assert summary["kinds"]["dropped"]["outcomes"] == {"collision": 1, "hover": 1}

@@ -138,6 +138,49 @@ def test_outputs_are_the_systems():
     assert triggered.HasDirectFeedthrough(0, 3) and not triggered.HasDirectFeedthrough(0, 2)
 
 
+class Fragile(Policy):
+    """A policy that raises an exception while `broken` says where."""
+
+    broken = ""
+
+    def _update(self, context, discrete_state):
+        if self.broken == "update":
+            raise RuntimeError("the network ran out of memory")
+        super()._update(context, discrete_state)
+
+    def _double(self, context, output):
+        if self.broken == "output":
+            raise ArithmeticError("the plan overflows")
+        super()._double(context, output)
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"), [("update", "ran out of memory"), ("output", "the plan overflows")]
+)
+def test_what_the_system_raises_is_told_and_logged_once(caplog, broken, said):
+    policy = Fragile()
+    triggered = ArrivalTriggered(policy, TICK)
+    simulator = Simulator(triggered)
+    context = simulator.get_mutable_context()
+    triggered.GetInputPort("image").FixValue(context, [3.0])
+    triggered.observation_age_input_port().FixValue(context, [0.0])
+
+    def out(name: str) -> float:
+        return triggered.GetOutputPort(name).Eval(context)[0]
+
+    simulator.AdvanceTo(0.3)
+    assert (out("failed"), out("seen")) == (0.0, 3.0)
+    policy.broken = broken
+    triggered.GetInputPort("image").FixValue(context, [4.0])
+    simulator.AdvanceTo(0.9)
+    assert (out("failed"), out("seen")) == (1.0, 3.0)
+    assert math.isnan(out("double")) == (broken == "output")
+    assert [said in record.exc_text for record in caplog.records] == [True]
+    policy.broken = ""
+    simulator.AdvanceTo(1.2)
+    assert (out("failed"), out("double")) == (0.0, 8.0)
+
+
 def test_what_cannot_be_triggered_is_an_error():
     """A system without a periodic update is refused by name."""
     with pytest.raises(ValueError, match=r"LeafSystem cannot be triggered"):

@@ -11,6 +11,7 @@ from splatpilot.systems.messaging.codecs import (
     MotionCaptureCodec,
     StateCodec,
     StatusCodec,
+    VehicleStatusCodec,
     VelocitySetpointCodec,
 )
 from splatpilot.systems.policies.hypotheses import no_plan
@@ -27,6 +28,7 @@ SIGNALS = [
     (MotionCaptureCodec("drone"), [1.0, 2, 3, *UNIT]),
     (DepthGridCodec(2, 3, 5.0, "tof"), [0.0, 0.25, 0.5, 0.75, 1.0, 0.125]),
     (StatusCodec(), [1.0, 0.0, 0.01, np.inf, 2, 3, 4]),
+    (VehicleStatusCodec(), [1.0, 0.0]),
 ]
 
 
@@ -70,9 +72,17 @@ def test_plans_keep_their_time_between_clocks():
     assert there[0] == pytest.approx(102.5, abs=1e-6)
 
 
-def test_no_plan_is_no_message():
-    """A policy that has not planned yet sends nothing."""
-    assert HypothesesCodec(3).pack(no_plan(3), lcmt_header(), EPOCH) is None
+@pytest.mark.parametrize(
+    ("codec", "unknown"), [(HypothesesCodec(3), no_plan(3)), (VehicleStatusCodec(), [np.nan] * 2)]
+)
+def test_what_is_unknown_is_no_message(codec, unknown):
+    assert codec.pack(np.array(unknown), lcmt_header(), EPOCH) is None
+
+
+def test_each_sender_has_a_session_of_its_own():
+    codec, other = StateCodec(), StateCodec()
+    sessions = [sent(each, SIGNALS[0][1]).session for each in (codec, codec, other)]
+    assert sessions[0] == sessions[1] != sessions[2]
 
 
 def change(field, value):

@@ -16,3 +16,11 @@ def test_signal_is_whole_or_zero(signal, finite):
     context = system.CreateDefaultContext()
     system.signal_input_port().FixValue(context, signal)
     np.testing.assert_array_equal(system.finite_output_port().Eval(context), finite)
+
+
+def test_what_is_not_finite_becomes_the_substitute():
+    system = FiniteVector(1, substitute=np.nan)
+    context = system.CreateDefaultContext()
+    for signal, finite in ((0.5, 0.5), (np.inf, np.nan), (np.nan, np.nan)):
+        system.signal_input_port().FixValue(context, [signal])
+        np.testing.assert_array_equal(system.finite_output_port().Eval(context), [finite])

@@ -20,11 +20,11 @@ CHANNEL = CommandCodec.channel
 
 def commands(count: int) -> list[bytes]:
     """Messages that are sent 0.02 s apart from now on, of which the fourth is missing."""
-    now, messages = time.time(), []
+    now, messages, codec = time.time(), [], CommandCodec()
     for k in range(count):
         header = lcmt_header()
         header.seq, header.utime, header.frame_name = k, round((now + 0.02 * k) * 1e6), "body"
-        messages.append(CommandCodec().pack(np.array([k, 0.1, 0.2, 0.3]), header, 0.0).encode())
+        messages.append(codec.pack(np.array([k, 0.1, 0.2, 0.3]), header, 0.0).encode())
     return messages[:3] + messages[4:]
 
 
@@ -85,6 +85,20 @@ def test_lcms_own_programs_read_our_log(listener, udp_url, tmp_path):
     while transport.handle_timeout(200):
         pass
     assert heard == messages
+
+
+def test_a_full_disk_ends_the_log_with_one_warning_and_nothing_else(caplog):
+    transport, heard = lcm.LCM("memq://"), []
+    transport.subscribe(CHANNEL, lambda _, data: heard.append(data))
+    with recorded(transport, Path("/dev/full"), overwrite=True):
+        for _ in range(100):
+            transport.publish(CHANNEL, bytes(1000))
+            while transport.handle_timeout(0):
+                pass
+    assert len(heard) == 100
+    assert [record.message for record in caplog.records] == [
+        "/dev/full cannot be written, the log ends here: No space left on device"
+    ]
 
 
 def test_bad_logs_are_errors(listener, tmp_path):

@@ -14,11 +14,15 @@ from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
 EPOCH = 1_800_000_000.25  # [s], that of the listener.
 
 
-def command(seq: int, time: float, thrust: float = 9.0, frame: str = "body") -> bytes:
+def command(
+    seq: int, time: float, thrust: float = 9.0, frame: str = "body", session: int = 0
+) -> bytes:
     """A message that was sent at the listener's `time` [s]."""
     header = lcmt_header()
     header.seq, header.utime, header.frame_name = seq, round((EPOCH + time) * 1e6), frame
-    return CommandCodec().pack(np.array([thrust, 0.1, 0.2, 0.3]), header, EPOCH).encode()
+    message = CommandCodec().pack(np.array([thrust, 0.1, 0.2, 0.3]), header, EPOCH)
+    message.session = session
+    return message.encode()
 
 
 def counts(listener) -> tuple[float, float]:
@@ -50,10 +54,31 @@ def test_last_message_and_its_age(listener):
 def test_gaps_are_counted(listener):
     """Each sequence number that never came is one gap; a sender that starts again leaves none."""
     listener = listener(CommandCodec())
-    for k, seq in enumerate([7, 8, 11, 12, 14, 0, 1, 3]):
+    for k, seq in enumerate([7, 8, 11, 12, 14]):
         listener.lcm.publish("BODY_RATE_COMMAND", command(seq, 0.01 * k))
         listener.advance_to(0.01 * k)
+    listener.advance_to(1.09)
+    for k, seq in enumerate([0, 1, 3]):
+        listener.lcm.publish("BODY_RATE_COMMAND", command(seq, 1.1 + 0.01 * k, session=1))
+        listener.advance_to(1.1 + 0.01 * k)
     assert counts(listener) == (2 + 1 + 1, 0)
+
+
+@pytest.mark.parametrize(("session", "first"), [(1, 0), (1, 500), (0, -500)])
+def test_of_two_senders_the_first_is_heard_and_the_other_counted(listener, caplog, session, first):
+    listener = listener(CommandCodec())
+    for k in range(20):
+        listener.lcm.publish("BODY_RATE_COMMAND", command(k, 0.02 * k, thrust=8.0))
+        other = command(first + k, 0.02 * k + 0.01, thrust=9.0, session=session)
+        listener.lcm.publish("BODY_RATE_COMMAND", other)
+        listener.advance_to(0.02 * k + 0.01)
+        assert listener.value[0] == 8.0
+    assert counts(listener) == (0, 20)
+    assert "two senders on this channel" in caplog.text
+    listener.advance_to(1.49)
+    listener.lcm.publish("BODY_RATE_COMMAND", command(600, 1.5, thrust=9.0, session=session))
+    listener.advance_to(1.5)
+    assert listener.value[0] == 9.0
 
 
 def test_a_burst_loses_nothing(listener):

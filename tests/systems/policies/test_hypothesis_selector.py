@@ -32,6 +32,13 @@ def test_follows_the_cheapest_a_lookahead_ahead():
     np.testing.assert_allclose(got, X_WB @ (0.43 * velocities_B[1]), atol=1e-12)
 
 
+@pytest.mark.parametrize("costs", [[1.0, np.nan], [np.nan, 1.0], [np.inf, np.inf], [0.0, -np.inf]])
+def test_without_a_cheapest_hypothesis_there_is_no_waypoint(costs):
+    plan = Hypotheses(0.0, RigidTransform(), np.ones((2, 10, 3)), np.array(costs))
+    got = waypoint(HypothesisSelector(2), plan.to_vector(), 0.1)
+    np.testing.assert_array_equal(got, np.full(3, np.nan))
+
+
 @pytest.mark.parametrize("lookahead", [0.0, -0.1, 1.01, np.nan])
 def test_a_lookahead_beyond_the_plan_is_refused(lookahead):
     """The lookahead must lie within the second that a plan spans."""

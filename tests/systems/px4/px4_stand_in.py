@@ -146,7 +146,8 @@ class Px4StandIn:
     def _tell(self, now: float) -> None:
         milliseconds = round((now - BOOT) * 1e3)
         if self.tick % 2 == 0:
-            p, v = HALF_TURN.apply(self.state[:3]), HALF_TURN.apply(self.state[3:6])
+            noise = 1e-4 * np.sin(now)  # [m]: an estimate is never the same for long.
+            p, v = HALF_TURN.apply(self.state[:3] + noise), HALF_TURN.apply(self.state[3:6])
             R_WB = Rotation.from_quat(np.roll(self.state[6:10], -1))
             x, y, z, w = (HALF_TURN * R_WB * HALF_TURN.inv()).as_quat()
             rates = HALF_TURN.apply(self.state[10:13])

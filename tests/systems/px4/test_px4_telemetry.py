@@ -225,3 +225,16 @@ def test_what_px4_grants_is_remembered(link):
     link.send(dialect.MAVLink_command_ack_message(400, dialect.MAV_RESULT_DENIED))
     link.advance(0.02)
     assert link.out("granted").tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1]), (1, 3, [0, 0])]
+)
+def test_vehicle_status_is_that_of_the_last_heartbeat_unless_it_is_old(link, base, mode, told):
+    link.advance(0.1)
+    assert np.isnan(link.out("vehicle_status")).all()
+    link.send(dialect.MAVLink_heartbeat_message(2, 12, base, mode << 16, 4, 3))
+    link.advance(2.9)
+    assert link.out("vehicle_status").tolist() == told
+    link.advance(0.2)
+    assert np.isnan(link.out("vehicle_status")).all()
