@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import KDTree
-from tqdm import tqdm
 
 from splatpilot.analysis.path_lengths import (
     SPACING,
@@ -38,6 +37,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SENSING_RANGE = 4.0
@@ -227,7 +227,7 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
         world_config = load_config(Scenario(), file).world
         rows, spent = [], []
         try:
-            for seed in tqdm(range(seeds), desc=file.stem, leave=False, disable=None):
+            for seed in Progress(range(seeds), f"measuring {file.stem}", unit="world", leave=False):
                 started = time.process_time()
                 world = make_world(world_config, seed)
                 spent.append(time.process_time() - started)

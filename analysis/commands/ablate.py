@@ -36,6 +36,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _ablate(options: argparse.Namespace) -> None:
     for capture in options.captures:
         require_existing(capture, "the folder of a capture, or a scene,")
+    from splatpilot.systems.progress import say
+
+    say(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")
     from splatpilot.analysis.reconstruction import ablation
     from splatpilot.systems.configuration import load_config
 

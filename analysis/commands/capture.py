@@ -53,6 +53,9 @@ def _check_defaults(options: argparse.Namespace) -> Any:
 
 def _check(options: argparse.Namespace) -> Any:
     require_existing(options.capture, "the folder of a capture")
+    from splatpilot.systems.progress import say
+
+    say(f"checking {options.capture}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import check
 
@@ -96,6 +99,9 @@ def _render_defaults(options: argparse.Namespace) -> Any:
 
 def _render(options: argparse.Namespace) -> None:
     check_place(options.world, "a .gltf, an .obj or a scenario")
+    from splatpilot.systems.progress import say
+
+    say(f"rendering {options.world} to {options.out}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import render_capture
 

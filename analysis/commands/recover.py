@@ -48,6 +48,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _recover(options: argparse.Namespace) -> None:
     check_config(options.config)
+    from splatpilot.systems.progress import say
+
+    say(f"training {options.policy} with recovery in {options.out}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies import recovery

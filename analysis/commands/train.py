@@ -82,6 +82,9 @@ def _train(options: argparse.Namespace) -> None:
         if twice := [one for k, one in enumerate(given) if one in given[:k]]:
             raise ValueError(f"the {what} {twice[0]} is given twice; leave one out")
     check_config(options.config)
+    from splatpilot.systems.progress import say
+
+    say(f"training {', '.join(options.policies)} in {options.out}")
     from splatpilot.analysis.benchmark import run as benchmark
     from splatpilot.analysis.benchmark.study import StudyConfig
     from splatpilot.systems.configuration import load_config

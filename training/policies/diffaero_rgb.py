@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from splatpilot.systems.policies.diffaero_inference import FARTHEST, NEAREST
 from splatpilot.systems.policies.diffaero_rgb_inference import DIFFAERO_RGB_NETWORK
 from splatpilot.systems.policies.monocular_depth import HEIGHT, WIDTH, rays_B, require_view
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
@@ -95,6 +95,7 @@ class DiffAeroRgbTrainer:
 
     policy = "diffaero_rgb"
     spec = DIFFAERO_RGB_NETWORK
+    evaluated = "cells"
     measures = f"""\
 Of cells of images, not of flights: those whose nearest depth is below {_NEAR:g} m. `success` is the
 part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken for farther than 5;
@@ -187,7 +188,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         h, w = spec.image_height, spec.image_width
         blocks = (-1, h, HEIGHT // h, w, WIDTH // w)
         kept = []
-        for shard in tqdm(self._data.shards, desc="depths", unit="shard", disable=None):
+        for shard in Progress(self._data.shards, desc="reading depth", unit="shard"):
             depth = shard.arrays["depth"][:, self._rows()]
             kept.append(depth.reshape(blocks).min((2, 4)).astype(np.float32))
         return np.concatenate(kept)

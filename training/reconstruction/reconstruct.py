@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
@@ -14,6 +13,7 @@ from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
@@ -119,7 +119,7 @@ def reconstruct(
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
     frames = ShrunkFrames(capture, fitted, factor)
-    thinned = [ThinnedFrame.of(f) for f in tqdm(frames, "comparing brightness", unit="frame")]
+    thinned = [ThinnedFrame.of(f) for f in Progress(frames, "comparing brightness", unit="frame")]
     photometry = estimate_photometry(thinned, config.seed)
     without_depth = _without_depth(capture, fitted, thinned)
     del thinned
