@@ -120,7 +120,7 @@ def study_scene(
         )
     # As beside the path, nothing is left out.
     on_path = (views.measure(views.frame(i)) for i in views.measured)
-    on_path_psnr_db = mean_measure(on_path, "psnr_db")
+    on_path_psnr_db, _ = mean_measure(on_path, "psnr_db")
     assert on_path_psnr_db is not None
     camera = find_camera(Path(views.metadata.capture))
     if camera is not None:
