@@ -115,7 +115,7 @@ class AgileAutonomyTraining:
         for name in ("rounds", "round_updates", "environments", "steps", "ask_every", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        validate_training_noise(self.noise, "noise")
+        validate_training_noise(self.noise, "noise", of_depth=True, of_colors=False, of_time=True)
         self.validation.validate()
         validate_speeds(self.speeds, "speeds")
 

@@ -27,7 +27,7 @@ from splatpilot.training.policies.observation import (
     heading_frame,
     inverse_depth,
     noisy_color,
-    validate_color_noise,
+    validate_training_noise,
 )
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import Appearance, relit
@@ -86,7 +86,7 @@ class DiffAeroRgbTraining:
         for name in ("batch", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        validate_color_noise(self.noise, "noise")
+        validate_training_noise(self.noise, "noise", of_depth=False, of_colors=True, of_time=False)
         self.appearance.validate("appearance")
 
 
