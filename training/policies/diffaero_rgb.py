@@ -52,7 +52,7 @@ class DiffAeroRgbTraining:
     # Folders of what is learned from, as `splatpilot corpus make` writes them.
     corpora: list[str] = field(default_factory=lambda: ["out/corpus"])
     # [-] Part of the corpora's worlds, by name, that choose among checkpoints instead.
-    held_out: float = 0.05
+    held_out: float = 0.1
     # [-] Held-out samples that are looked at, evenly spaced.
     validation_samples: int = 2000
     schedule: Schedule = field(
