@@ -10,6 +10,7 @@ import torch
 from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world, place_config
 from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.world_batch import TrainingWorld, WorldBatch
@@ -82,20 +83,25 @@ def training_worlds(
     Raises:
         ValueError: if the seed is not 0 to 999.
     """
-    worlds = _make_worlds(selection, selection.count, first_training_seed(seed))
+    first = first_training_seed(seed)
+    worlds = _make_worlds(selection, selection.count, first, "training worlds")
     return WorldBatch(worlds, selection.voxel_size, device)
 
 
 def validation_worlds(selection: WorldSelection, device: torch.device | str = "cpu") -> WorldBatch:
     """The held-out worlds, the same for every run."""
-    return WorldBatch(_make_worlds(selection, selection.held_out, VALIDATION_SEEDS), None, device)
+    worlds = _make_worlds(selection, selection.held_out, VALIDATION_SEEDS, "held-out worlds")
+    return WorldBatch(worlds, None, device)
 
 
-def _make_worlds(selection: WorldSelection, count: int, first: int) -> list[TrainingWorld]:
-    turns, places = selection.turns, {scene: _Place.read(scene) for scene in selection.scenes}
+def _make_worlds(
+    selection: WorldSelection, count: int, first: int, what: str
+) -> list[TrainingWorld]:
+    places = {scene: _Place.read(scene) for scene in selection.scenes}
+    seeds = Progress(range(first, first + count), f"making {what}", unit="world")
     return [
         places[turn].world(seed) if turn in places else make_training_world(turn, seed)
-        for seed, turn in zip(range(first, first + count), cycle(turns), strict=False)
+        for seed, turn in zip(seeds, cycle(selection.turns), strict=False)
     ]
 
 
