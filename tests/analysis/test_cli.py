@@ -145,7 +145,11 @@ def test_long_commands_say_what_they_do_before_anything_slow_is_imported(words, 
         f"main({words.split()})"
     )
     ended = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"TMPDIR": str(tmp_path)},  # of the report
     )
     said, *failure = ended.stderr.splitlines()
     assert said and not said.startswith("splatpilot") and "ing " in said
