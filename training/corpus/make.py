@@ -57,12 +57,14 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     checked = Progress(there, "checking worlds", unit="world", leave=False, delay=1.0)
     damage = {k: reason for k in checked if (reason := _damage(out, sources[k], config))}
     missing = sorted(set(range(worlds)) - set(there) | set(damage))
+    program = revision()
     if missing:
-        _require_same_program(out)
-    for k, reason in damage.items():
-        say(f"{reason}: {sources[k].name} is collected again")
+        _require_same_program(out, program)
+    for k in missing:
+        if k in damage:
+            say(f"{damage[k]}: {sources[k].name} is collected again")
         _remove(out, sources[k].name)
-    gather = partial(_gather, out, config, revision())
+    gather = partial(_gather, out, config, program)
     bar = Progress(total=worlds, initial=worlds - len(missing), desc="collecting", unit="world")
 
     def kept() -> str:
@@ -102,22 +104,23 @@ def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
     return ""
 
 
-def _require_same_program(out: Path) -> None:
+def _require_same_program(out: Path, program: str) -> None:
     """Raises ValueError if another program collected what is there, except for recovery."""
     for path in entries(out / "shards"):
         try:
             shard = Shard(path)
         except ValueError:  # it is damaged
             continue
-        if shard.source != RECOVERY and shard.revision != revision():
+        if shard.source != RECOVERY and shard.revision != program:
             raise ValueError(
                 f"{shard.path} was collected by revision {shard.revision} of the program, this is "
-                f"{revision()}, and one corpus is collected by one program; go back to that "
-                "revision, or collect more worlds with another seed in another --out"
+                f"{program}, and one corpus is collected by one program; go back to that revision, "
+                "or collect more worlds with another seed in another --out"
             )
 
 
 def _remove(out: Path, world: str) -> None:
+    """Removes what an interruption or damage has left of a world."""
     shutil.rmtree(out / "worlds" / world, ignore_errors=True)
     for source in (OFF_PATH, EXPERT):
         shutil.rmtree(shard_folder(out, world, source), ignore_errors=True)

@@ -188,6 +188,15 @@ def test_a_kind_that_has_changed_is_not_added_to(small, gathered, tmp_path):
         make.run(config=config, out=tmp_path / "corpus", worlds=2, jobs=1)
 
 
+def test_what_an_interruption_left_of_a_world_is_not_used(small, gathered, tmp_path):
+    out = shutil.copytree(gathered.folder, tmp_path / "corpus")
+    other, world = (record.path.name for record in gathered.worlds)
+    shutil.rmtree(out / "shards" / gathered.shards[1].path.name)
+    shutil.copy(out / "worlds" / other / "esdf.npz", out / "worlds" / world / "esdf.npz")
+    make.run(config=small, out=out, worlds=2, jobs=1)
+    assert all_bytes(out) == all_bytes(gathered.folder)
+
+
 def test_another_corpus_is_not_added_to(small, gathered):
     """A folder keeps to the configuration that it was begun with."""
     folder = gathered.shards[0].path.parents[1]
