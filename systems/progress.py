@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,6 +12,7 @@ from tqdm import tqdm
 _PERIOD = 60.0  # [s] between two lines that are not for a terminal
 _SHORT = 5.0  # [s] that work must have taken for a line at its end
 _COLUMNS, _ROWS = 80, 24  # of terminals that do not tell theirs
+_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"  # room for figures
 _KEEP_PERIOD = 30.0  # [s] between two checkpoints, unless writing one takes long
 _KEEP_SHARE = 0.02  # of the time, at most, that checkpoints take
 
@@ -48,6 +49,8 @@ class Progress(tqdm):
         self._begun_at = time.monotonic()
         if self._lines:
             keywords |= {"mininterval": 0.0, "leave": False}  # `display` has a clock of its own
+        elif total is not None or isinstance(iterable, Sized):
+            keywords = {"bar_format": _BAR} | keywords
         columns, rows = _terminal_size()
         super().__init__(
             iterable,

@@ -85,8 +85,6 @@ def _train(options: argparse.Namespace) -> None:
     from splatpilot.systems.progress import resumable, say
 
     say(f"training {', '.join(options.policies)} in {options.out}")
-    from splatpilot.analysis.benchmark import run as benchmark
-    from splatpilot.analysis.benchmark.study import StudyConfig
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies.registry import TRAINERS
@@ -111,6 +109,9 @@ def _train(options: argparse.Namespace) -> None:
     with resumable(lambda: f"checkpoints are in {options.out}; the same command resumes"):
         summaries = run_side_by_side(runs, options.jobs or available_cores())
     if scenarios:
+        from splatpilot.analysis.benchmark import run as benchmark
+        from splatpilot.analysis.benchmark.study import StudyConfig
+
         weights = [
             str(run.out / f"{summary['policy']}.npz")
             for run, summary in zip(runs, summaries, strict=True)

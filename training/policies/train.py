@@ -192,11 +192,11 @@ def _run[Config: TrainingConfig](
 
 def _shown(progress: _Position, trainer: Trainer) -> str:
     """Formats the loss, and the success measured last and best."""
-    shown = f"loss {progress.means['loss']:.3f}"
+    shown = f"loss {progress.means['loss']:.3g}"
     if progress.best:
         last = next(row["success"] for row in reversed(progress.curves) if "success" in row)
         best = progress.best["success"]
-        shown += f", success in {last:.0%} of {_evaluated(trainer)} (best {best:.0%})"
+        shown += f", success {last:.0%} of {_evaluated(trainer)}, best {best:.0%}"
     return shown
 
 
