@@ -1,4 +1,4 @@
-"""What long commands say while they work: bars in a terminal, a line a minute elsewhere."""
+"""Progress of long commands: bars in a terminal, a line a minute elsewhere."""
 
 import os
 import sys
@@ -120,7 +120,7 @@ class CheckpointClock:
 
     @property
     def is_due(self) -> bool:
-        """Whether it is time for another."""
+        """True when another should be written."""
         return time.monotonic() >= self._next
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""What depth is worth to a reconstruction, step by step, for two representations.
+"""Compares reconstructions that use depth more and more, for two representations.
 
 The paper's Table II compares the first and the last step; those between tell apart what changes
 from one to the other.
@@ -61,7 +61,7 @@ _SETTINGS = {
     "surfaces": {"initialization": "depth", "depth_weight": 0.0},
     "depth_term": {"initialization": "depth"},
 }
-"""Of each step, where it departs from the configuration of the study."""
+"""Settings of each step that depart from the configuration of the study."""
 _DRAWN = "2dgs_points", "3dgs_points", "2dgs_depth_term", "3dgs_depth_term"
 
 

@@ -29,7 +29,7 @@ STEPS = {
     "surfaces": "+ surface and outline losses",
     "depth_term": "+ depth term",
 }
-"""What each arm of a representation adds to the one before it, by the end of its key."""
+"""Titles of the steps from one arm of a representation to the next, by the end of its key."""
 
 _PAPER = {
     "3dgs_points": (29.35, 0.8706, 0.215, 0.974, 0.115),

@@ -1,4 +1,4 @@
-"""What long commands say while they work."""
+"""Progress of long commands, in a terminal and in a file."""
 
 import os
 import subprocess

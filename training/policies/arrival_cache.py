@@ -1,4 +1,4 @@
-"""Ways to the goals of training worlds, kept in the user's cache: they take longest to make."""
+"""Times of arrival in training worlds, kept in the user's cache: they take longest to make."""
 
 import contextlib
 import os
@@ -90,7 +90,7 @@ def _content(surfaces: Sequence[Shape] | Esdf) -> list[np.ndarray | float | byte
 
 
 def _read(file: Path, p_WG: np.ndarray, voxel_size: float) -> tuple[Esdf, TimeOfArrival] | None:
-    """Returns what a file holds; None if there is none, or a damaged one."""
+    """Reads a file; returns None if it is missing or damaged."""
     try:
         kept = read_archive(file)
         os.utime(file)

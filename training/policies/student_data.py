@@ -22,7 +22,7 @@ _PARTS = 1 << 20
 """[-] That a chance is counted in."""
 
 _DIGESTS = 1 << 64
-"""How many digests of names there are."""
+"""Number of digests that a name may have."""
 
 
 class Labels(NamedTuple):

@@ -72,7 +72,7 @@ class WorldBatch:
         self._times = None
         if voxel_size is not None:
             cache = ArrivalCache()
-            shown = Progress(worlds, "finding ways to the goals", unit="world")
+            shown = Progress(worlds, "finding paths to the goals", unit="world")
             grids = [_march(world, voxel_size, n, cache) for n, world in enumerate(shown)]
             cache.prune()
             self.maps = [(grid.esdf, grid.toa) for grid in grids]

@@ -158,7 +158,7 @@ def fit_exposure(
 
     The corners are darkened by the vignetting of the capture, and all pixels multiplied by the one
     number that brings those `seen` (H, W), or all, closest to the true image (least squares): how a
-    camera exposed a frame says nothing of the place, and for a held-out frame it is unknown.
+    camera exposed a frame says nothing about the scene, and for a held-out frame it is unknown.
     """
     image = _darken_corners(color, vignetting)
     x, y = (image, truth) if seen is None else (image[seen], truth[seen])

@@ -1,4 +1,4 @@
-"""Ways to the goals of training worlds, made once."""
+"""Times of arrival in training worlds, made once."""
 
 import os
 from pathlib import Path

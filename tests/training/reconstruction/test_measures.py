@@ -211,14 +211,14 @@ def test_pixels_that_are_left_out_make_no_structure_right(share):
     assert ssim(a, b, seen) == pytest.approx(ssim(a, b), abs=0.03)
 
 
-def view_of(color: np.ndarray, image: np.ndarray) -> tuple[RenderedView, CaptureFrame]:
+def make_view(color: np.ndarray, image: np.ndarray) -> tuple[RenderedView, CaptureFrame]:
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
     view = RenderedView(color.astype(np.float32), depth, np.ones_like(depth))
     return view, CaptureFrame(np.round(255 * image).astype(np.uint8), depth, RigidTransform(), K)
 
 
 def test_a_view_of_which_nothing_was_seen_has_no_measures():
-    view, frame = view_of(noise(0), noise(1))
+    view, frame = make_view(noise(0), noise(1))
     nothing = np.zeros((HEIGHT, WIDTH), bool)
     blind = measure_view(view, (0.0, 0.0, 0.0), frame, seen=nothing, lpips=never)
     seeing = measure_view(view, (0.0, 0.0, 0.0), frame)
@@ -235,7 +235,7 @@ def never(*_args) -> None:
 
 
 def test_without_a_gain_brightness_counts():
-    view, frame = view_of(np.full((HEIGHT, WIDTH, 3), 0.4), np.full((HEIGHT, WIDTH, 3), 0.5))
+    view, frame = make_view(np.full((HEIGHT, WIDTH, 3), 0.4), np.full((HEIGHT, WIDTH, 3), 0.5))
     strict = measure_view(view, (0.0, 0.0, 0.0), frame, fit_gain=False)
     fitted = measure_view(view, (0.0, 0.0, 0.0), frame)
     assert strict.gain == 1.0
