@@ -62,7 +62,6 @@ _SETTINGS = {
     "depth_term": {"initialization": "depth"},
 }
 """Settings of each step that depart from the configuration of the study."""
-_DRAWN = "2dgs_points", "3dgs_points", "2dgs_depth_term", "3dgs_depth_term"
 
 
 @dataclass
@@ -156,7 +155,7 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
         recipe = f"capture: {capture.folder}\n{dump_config(arm_config(arm, config))}"
         file = scene / _RECIPE
         if not file.is_file() or file.read_text() != recipe:
-            print(f"{capture.name}: {arm.title}")
+            print(f"{capture.name}: {arm.title}", flush=True)
             seen = capture
             if arm.step == "points":
                 if points is None:
@@ -178,7 +177,7 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
         "",
         f"Every {config.hold_out}th frame held out; {config.iterations} steps; images "
         f"{config.image_width or 'of full'} px wide. The paper's figures are of another scene (its "
-        "LPIPS of another network), for the order of the arms.",
+        "LPIPS of another network), and of recipes without surface and outline losses.",
         "",
         "| " + " | ".join(heading) + " |",
         "|" + "---|" * len(heading),
@@ -210,8 +209,10 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
     frames = arms["3dgs_points"].frames
     ordered = sorted(frames, key=lambda i: frames[i].floater_fraction or 0.0)
     i = ordered[len(ordered) // 2]
-    scenes = {key: SceneViews(out / key, capture) for key in _DRAWN}
-    frame = scenes[_DRAWN[0]].frame(i)
+    of_paper = (arm for arm, _ in paper_rows())
+    drawn = sorted(of_paper, key=lambda arm: (arm.step != "points", arm.key))
+    scenes = {arm.key: SceneViews(out / arm.key, capture) for arm in drawn}
+    frame = scenes[drawn[0].key].frame(i)
     truth, known = frame.image / 255, has_true_depth(frame.depth)
     depths, errors = depth_scale([frame.depth]), error_scale(_ERROR_LIMIT)
     true_depth = Panel(colorize(frame.depth, depths, known))
@@ -226,6 +227,6 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
         rows[1].append(Panel(mark_floaters(image, mask), f"{fraction:.1%}"))
         rows[2].append(Panel(colorize(view.depth, depths, view.alpha > 0)))
         rows[3].append(Panel(colorize(error, errors, known), f"{mae:.2f} m"))
-    columns = ["captured", "2DGS", "3DGS", "2DGS + depth", "3DGS + depth"]
+    columns = ["captured", *(arm.title.partition(",")[0] for arm in drawn)]
     titles = [f"frame {i}", "floaters", "depth", "depth error"]
     write_sheet(path, rows, columns, titles, [None, None, depths, errors])

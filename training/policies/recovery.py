@@ -106,6 +106,7 @@ def run[Config: CorpusTraining](
     claim_folder(out / "recovery.yaml", decisive)
     pilot, first = flown_by, {}
     if not flown_by:
+        say(f"first stage, in {out / 'stage_1'}")
         first = train.run(config=config, out=out / "stage_1", make=make)
         pilot = str(out / "stage_1" / f"{first['policy']}.npz")
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
@@ -126,6 +127,7 @@ def run[Config: CorpusTraining](
         outcomes += ended
         add_recovery(folder, flown, jobs)
     both = replace(config, corpora=[str(folder) for folder in folders])
+    say(f"second stage, in {out / 'stage_2'}")
     second = train.run(config=both, out=out / "stage_2", make=make)
     ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
     ledger |= {"flown_by": flown_by} if flown_by else {"stage_1": first}

@@ -44,7 +44,7 @@ class WorldSelection:
     count: int = 180
     # [-] Held-out worlds that choose among checkpoints.
     held_out: int = 72
-    # [m] Of the grids of the time of arrival.
+    # [m] Of the grids of the time of arrival, which are kept in the user's cache, up to 1 GiB.
     voxel_size: float = 0.25
 
     def validate(self) -> None:
