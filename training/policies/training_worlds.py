@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import torch
 
-from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world, place_config
+from splatpilot.diagrams.worlds.make_world import make_world, place_config
 from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.progress import Progress
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.world_batch import TrainingWorld, WorldBatch
+from splatpilot.training.policies.world_cache import WorldCache
 from splatpilot.training.world_kinds import (
     PROCEDURAL,
     ROUNDABOUT,
@@ -68,11 +69,10 @@ class WorldSelection:
         return [*self.kinds, *self.scenes]
 
 
-def make_training_world(kind: str, seed: int) -> TrainingWorld:
-    """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
-    plan = make_blueprint(world_of(kind), seed)
-    shapes = [solid.shape for solid in plan.solids]
-    return TrainingWorld(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
+def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
+    """Makes the world of a scenario and seed as the benchmark flies it, without what cameras
+    see."""
+    return TrainingWorld(*cache.blueprint(world_of(kind), seed))
 
 
 def training_worlds(
@@ -99,8 +99,9 @@ def _make_worlds(
 ) -> list[TrainingWorld]:
     places = {scene: _Place.read(scene) for scene in selection.scenes}
     seeds = Progress(range(first, first + count), f"making {what}", unit="world")
+    cache = WorldCache()
     return [
-        places[turn].world(seed) if turn in places else make_training_world(turn, seed)
+        places[turn].world(seed) if turn in places else make_training_world(turn, seed, cache)
         for seed, turn in zip(seeds, cycle(selection.turns), strict=False)
     ]
 

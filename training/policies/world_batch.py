@@ -14,13 +14,13 @@ from splatpilot.systems.collision.shapes import HalfSpace, Shape
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival
 from splatpilot.systems.progress import Progress
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.arrival_cache import ArrivalCache
 from splatpilot.training.policies.ray_casting import (
     Geometry,
     Grids,
     MixedGeometry,
     ShapeGeometry,
 )
+from splatpilot.training.policies.world_cache import WorldCache
 
 STARTS = 256
 """Places that flights of training start from, in each world."""
@@ -71,7 +71,7 @@ class WorldBatch:
         self.geometry: Geometry = MixedGeometry(self._surfaces)
         self._times = None
         if voxel_size is not None:
-            cache = ArrivalCache()
+            cache = WorldCache()
             shown = Progress(worlds, "finding paths to the goals", unit="world")
             grids = [_march(world, voxel_size, n, cache) for n, world in enumerate(shown)]
             cache.prune()
@@ -127,7 +127,7 @@ class _Arrival(NamedTuple):
     starts_W: np.ndarray  # (STARTS, 3) [m]
 
 
-def _march(world: TrainingWorld, voxel_size: float, seed: int, cache: ArrivalCache) -> _Arrival:
+def _march(world: TrainingWorld, voxel_size: float, seed: int, cache: WorldCache) -> _Arrival:
     """The time of arrival at the goal of a world, and free places from which it can be reached."""
     volume = world.lower_W, world.upper_W
     esdf, toa = cache.arrival(world.surfaces, *volume, world.p_WG, voxel_size)

@@ -1,4 +1,4 @@
-"""Times of arrival in training worlds, made once."""
+"""Training worlds and the times of arrival in them, made once."""
 
 import os
 from pathlib import Path
@@ -8,8 +8,9 @@ import pytest
 
 from splatpilot.systems.collision.shapes import Capsule, HalfSpace
 from splatpilot.systems.environment import cache_folder
-from splatpilot.training.policies import arrival_cache
-from splatpilot.training.policies.arrival_cache import ArrivalCache
+from splatpilot.training.policies import world_cache
+from splatpilot.training.policies.world_cache import WorldCache
+from splatpilot.training.world_kinds import world_of
 
 GROUND = HalfSpace([0, 0, 1], 0.0)
 VOLUME = np.zeros(3), np.array([6.0, 4.0, 3.0])
@@ -18,12 +19,12 @@ VOLUME = np.zeros(3), np.array([6.0, 4.0, 3.0])
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return cache_folder("arrivals")
+    return cache_folder("worlds")
 
 
 def arrival(goal: float = 1.5, radius: float = 0.3):
     post = Capsule([3.0, 2.0, 0.0], [3.0, 2.0, 3.0], radius)
-    return ArrivalCache().arrival([GROUND, post], *VOLUME, np.array([5.0, 2.0, goal]), 0.25)
+    return WorldCache().arrival([GROUND, post], *VOLUME, np.array([5.0, 2.0, goal]), 0.25)
 
 
 def assert_same(a, b) -> None:
@@ -35,12 +36,12 @@ def assert_same(a, b) -> None:
 
 def test_what_was_made_is_read_again(folder, monkeypatch):
     made = arrival()
-    monkeypatch.setattr(arrival_cache, "time_of_arrival", None)
+    monkeypatch.setattr(world_cache, "time_of_arrival", None)
     assert_same(arrival(), made)
     for other in ({"goal": 1.4}, {"radius": 0.4}):
         with pytest.raises(TypeError):
             arrival(**other)
-    monkeypatch.setattr(arrival_cache, "program", lambda: {"splatpilot": "another"})
+    monkeypatch.setattr(world_cache, "program", lambda: {"splatpilot": "another"})
     with pytest.raises(TypeError):
         arrival()
 
@@ -62,12 +63,26 @@ def test_a_cache_that_cannot_be_written_keeps_nothing(folder, tmp_path, monkeypa
 
 
 def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
-    cache = ArrivalCache()
+    cache = WorldCache()
     for goal in (1.2, 1.3, 1.4):
         arrival(goal)
     files = sorted(folder.iterdir())
     for time, file in enumerate(files):
         os.utime(file, (time, time))
-    monkeypatch.setattr(arrival_cache, "_LIMIT", 2 * files[0].stat().st_size)
+    monkeypatch.setattr(world_cache, "_LIMIT", 2 * files[0].stat().st_size)
     cache.prune()
     assert sorted(folder.iterdir()) == files[1:]
+
+
+@pytest.mark.parametrize("kind", ["P02", "P05", "P10", "P11"])
+def test_generated_worlds_are_read_again(folder, monkeypatch, kind):
+    made = WorldCache().blueprint(world_of(kind), 7)
+    monkeypatch.setattr(world_cache, "make_blueprint", None)
+    shapes, *points = WorldCache().blueprint(world_of(kind), 7)
+    for a, b in zip(shapes, made[0], strict=True):
+        assert type(a) is type(b)
+        for x, y in zip(a.parameters(), b.parameters(), strict=True):
+            np.testing.assert_array_equal(x, y)
+    np.testing.assert_array_equal(points, made[1:])
+    with pytest.raises(TypeError):
+        WorldCache().blueprint(world_of(kind), 8)
