@@ -140,10 +140,9 @@ def main(arguments: list[str] | None = None) -> int:
         )
     except OverflowError as error:
         return _say(f"a number given to {verb} is too large ({error}); give a smaller one", 1)
-    except _EndedError as ended:
-        return _say(*_ENDED[ended.number])
-    except KeyboardInterrupt:
-        return _say(*_ENDED[signal.SIGINT])
+    except KeyboardInterrupt as ended:
+        message, status = _ENDED[getattr(ended, "number", signal.SIGINT)]
+        return _say("; ".join([message, *getattr(ended, "__notes__", ())]), status)
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error, verb)):
             return _say(missing, 1)

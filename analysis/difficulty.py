@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import KDTree
-from tqdm import tqdm
 
 from splatpilot.analysis.path_lengths import (
     SPACING,
@@ -40,6 +39,7 @@ from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 SENSING_RANGE = 4.0
@@ -230,7 +230,7 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
         world_config = load_config(Scenario(), file).world
         rows, spent = [], []
         try:
-            for seed in tqdm(range(seeds), desc=file.stem, leave=False, disable=None):
+            for seed in Progress(range(seeds), f"measuring {file.stem}", unit="world", leave=False):
                 started = time.process_time()
                 with suppress(InfeasibleFlightError):
                     try:

@@ -96,7 +96,7 @@ def run(
         load_config(PlaceConfig(), overrides=[*PLACES[name].settings, *overrides]) for name in names
     ]
     for name, source, config in zip(names, sources, configs, strict=True):
-        print(f"== {name}, from {source}")
+        print(f"== {name}, from {source}", flush=True)
         if isinstance(source, Path) and source.is_dir():
             capture = source
         else:

@@ -7,7 +7,6 @@ from typing import cast
 
 import numpy as np
 from pydrake.systems.framework import Diagram
-from tqdm import tqdm
 
 from splatpilot.diagrams.flight import Flight, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
@@ -25,6 +24,7 @@ from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.files import require_unused, require_writable_folder, written_atomically
 from splatpilot.systems.output_folders import holds_folder
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
@@ -113,9 +113,7 @@ def fly_with_bar(
 ) -> Flight:
     """`fly`, with a progress bar of simulated time."""
     layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
-    with tqdm(
-        total=scenario.timeout, desc="flying", bar_format=layout, leave=False, disable=None
-    ) as bar:
+    with Progress(total=scenario.timeout, desc="flying", bar_format=layout, leave=False) as bar:
         return fly(
             diagram,
             scenario,

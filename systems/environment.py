@@ -20,6 +20,12 @@ def scenes_folder() -> Path:
     return Path(os.environ.get(SCENES, "scenes"))
 
 
+def cache_folder(*parts: str) -> Path:
+    """The folder of what takes long to make again, in the user's cache."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home, "splatpilot", *parts)
+
+
 def require_scene(path: str, source: str = "") -> Path:
     """
     Where a scene is: here, or in the folder of scenes.

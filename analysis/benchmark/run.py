@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.foreign_code import foreign_code
 from splatpilot.analysis.benchmark.report import write_report
@@ -28,6 +26,7 @@ from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
 from splatpilot.systems.cores import available_cores
 from splatpilot.systems.output_folders import holds_folder
+from splatpilot.systems.progress import Progress, resumable
 from splatpilot.systems.provenance import program
 
 Row = dict[str, Any]
@@ -164,7 +163,7 @@ def flights_there(
     """The rows by id of the flights that are in the folder, and what is wrong with the files of
     others."""
     rows, damaged = {}, []
-    for spec in tqdm(specs, "checking", leave=False, disable=None):
+    for spec in Progress(specs, "checking flights", unit="flight", leave=False, delay=1.0):
         try:
             rows[spec.id] = folder.read(spec)[0]
         except FileNotFoundError:
@@ -202,7 +201,14 @@ def _keep(
         ValueError: at a fault.
     """
     successes = sum(row["success"] for row in rows.values())
-    with tqdm(total=total, initial=len(rows), desc="flying", unit="flight") as bar:
+    bar = Progress(total=total, initial=len(rows), desc="flying", unit="flight")
+
+    def kept() -> str:
+        return (
+            f"{len(rows)} of {total} flights are in {folder.path}; the same command resumes there"
+        )
+
+    with bar, resumable(kept):
         for flown in flights:
             if isinstance(flown, Fault):
                 raise ValueError(

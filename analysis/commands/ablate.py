@@ -14,10 +14,10 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "ablate",
         _ablate,
-        help="reconstruct captures with and without depth, as 3DGS and 2DGS, and compare",
-        description="The paper's ablation: reconstructs each capture by four recipes, {3DGS, 2DGS} "
-        "x {photometric, with metric depth}, measures them, and writes a table and pictures. "
-        "Interrupted, the same command goes on.",
+        help="reconstruct captures with more and more use of depth, as 3DGS and 2DGS, and compare",
+        description="Extends the paper's ablation: reconstructs each capture as 3DGS and as 2DGS "
+        "from points, from depth, with the surface and outline losses, and with the depth term, "
+        "measures them, and writes a table and pictures. Interrupted, the same command resumes.",
         examples=(
             "ablate data/hospital --out out/ablation",
             "ablate data/hospital data/office --set iterations=500",
@@ -36,6 +36,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _ablate(options: argparse.Namespace) -> None:
     for capture in options.captures:
         require_existing(capture, "the folder of a capture, or a scene,")
+    from splatpilot.systems.progress import say
+
+    say(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")
     from splatpilot.analysis.reconstruction import ablation
     from splatpilot.systems.configuration import load_config
 

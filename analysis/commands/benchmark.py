@@ -99,6 +99,9 @@ def _benchmark(options: argparse.Namespace) -> Any:
         named = [*split_policies(options.policies or ""), *swept]
         for policy in named:
             check_policy(parse_variant(policy))
+    from splatpilot.systems.progress import say
+
+    say(f"flying a study in {options.out}")
     from splatpilot.analysis.benchmark import run as benchmark
     from splatpilot.analysis.benchmark.external import DODGEDRONE, DODGEDRONE_SPEEDS
     from splatpilot.analysis.benchmark.shard import Shard

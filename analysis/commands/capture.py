@@ -54,6 +54,9 @@ def _check_defaults(options: argparse.Namespace) -> Any:
 
 def _check(options: argparse.Namespace) -> Any:
     require_existing(options.capture, "the folder of a capture")
+    from splatpilot.systems.progress import say
+
+    say(f"checking {options.capture}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import check
 
@@ -99,6 +102,9 @@ def _render_defaults(options: argparse.Namespace) -> Any:
 
 def _render(options: argparse.Namespace) -> None:
     check_place(options.world, "a .glb, .gltf, .obj or a scenario")
+    from splatpilot.systems.progress import say
+
+    say(f"rendering {options.world} to {options.out}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.captures import render_capture
 

@@ -57,6 +57,9 @@ def _make_defaults(options: argparse.Namespace) -> Any:
 
 def _make(options: argparse.Namespace) -> None:
     check_config(options.config)
+    from splatpilot.systems.progress import say
+
+    say(f"collecting a corpus of {options.worlds} worlds in {options.out}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.training.corpus import make
 

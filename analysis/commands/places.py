@@ -42,11 +42,16 @@ def _places(options: argparse.Namespace) -> None:
     data = options.data or data_folder()
     if data is not None:
         require_existing(data, "the folder of captures and meshes")
+    from splatpilot.systems.progress import resumable, say
+
+    scenes = options.out or scenes_folder()
+    say(f"making {', '.join(options.names) or 'the scenes of the benchmark'} in {scenes}")
     from splatpilot.analysis import places
 
-    places.run(
-        names=options.names,
-        data=data,
-        scenes=options.out or scenes_folder(),
-        overrides=options.overrides,
-    )
+    with resumable(lambda: f"scenes that are finished are in {scenes}; the same command resumes"):
+        places.run(
+            names=options.names,
+            data=data,
+            scenes=scenes,
+            overrides=options.overrides,
+        )

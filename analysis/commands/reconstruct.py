@@ -40,6 +40,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _reconstruct(options: argparse.Namespace) -> None:
     require_existing(options.capture, "the folder of a capture")
+    from splatpilot.systems.progress import say
+
+    say(f"reconstructing {options.capture} as {options.out}")
     from splatpilot.analysis.reconstruction import run as reconstruction
     from splatpilot.systems.configuration import load_config
 

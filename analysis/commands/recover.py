@@ -48,6 +48,9 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _recover(options: argparse.Namespace) -> None:
     check_config(options.config)
+    from splatpilot.systems.progress import resumable, say
+
+    say(f"training {options.policy} with recovery in {options.out}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies import recovery
@@ -58,14 +61,15 @@ def _recover(options: argparse.Namespace) -> None:
     config = load_config(trainer_defaults(options), options.config, options.overrides)
     jobs = available_cores() if options.jobs is None else options.jobs
     make = TRAINERS.find(options.policy).make
-    ledger = recovery.run(
-        config=config,
-        make=make,
-        out=options.out,
-        flights=options.flights,
-        jobs=jobs,
-        flown_by=options.flown_by,
-    )
+    with resumable(lambda: f"what is finished is in {options.out}; the same command resumes"):
+        ledger = recovery.run(
+            config=config,
+            make=make,
+            out=options.out,
+            flights=options.flights,
+            jobs=jobs,
+            flown_by=options.flown_by,
+        )
     flown = ", ".join(f"{count} {outcome}" for outcome, count in ledger["flights"].items())
     print(
         f"{flown}; {ledger['near_misses']} near-misses; {ledger['recovery_samples']} samples of "

@@ -82,8 +82,9 @@ def _train(options: argparse.Namespace) -> None:
         if twice := [one for k, one in enumerate(given) if one in given[:k]]:
             raise ValueError(f"the {what} {twice[0]} is given twice; leave one out")
     check_config(options.config)
-    from splatpilot.analysis.benchmark import run as benchmark
-    from splatpilot.analysis.benchmark.study import StudyConfig
+    from splatpilot.systems.progress import resumable, say
+
+    say(f"training {', '.join(options.policies)} in {options.out}")
     from splatpilot.systems.configuration import load_config
     from splatpilot.systems.cores import available_cores
     from splatpilot.training.policies.registry import TRAINERS
@@ -105,8 +106,12 @@ def _train(options: argparse.Namespace) -> None:
         require_one_process("several trainings")
     if scenarios:
         require_one_process("--fly")
-    summaries = run_side_by_side(runs, options.jobs or available_cores())
+    with resumable(lambda: f"checkpoints are in {options.out}; the same command resumes"):
+        summaries = run_side_by_side(runs, options.jobs or available_cores())
     if scenarios:
+        from splatpilot.analysis.benchmark import run as benchmark
+        from splatpilot.analysis.benchmark.study import StudyConfig
+
         weights = [
             str(run.out / f"{summary['policy']}.npz")
             for run, summary in zip(runs, summaries, strict=True)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from splatpilot.analysis.faults.fault import KINDS, Trial
 from splatpilot.analysis.faults.trial import fly_trial
@@ -16,6 +15,7 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import make_world
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.output_folders import claim_folder, holds_folder
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.vehicle.flight_limits import FlightLimits
 
 
@@ -69,7 +69,7 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
     lines = out / "trials.jsonl"
     rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
     worlds: dict[int, Any] = {}
-    for number in tqdm(range(len(rows), config.trials), unit="trial", disable=None):
+    for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
         world_seed = config.seed + number % config.worlds
         if world_seed not in worlds:
             worlds[world_seed] = make_world(config.scenario.world, world_seed)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform
-from tqdm import tqdm
 
 from splatpilot.analysis.fidelity.config import FidelityConfig, StudiedScenes
 from splatpilot.analysis.fidelity.figures import write_curves, write_views
@@ -31,8 +30,10 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.output_folders import claim_folder, holds_folder
+from splatpilot.systems.progress import Progress, resumable
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render_capture import true_camera
+from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.measures import mean_measure
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
@@ -72,16 +73,18 @@ def run(
         raise ValueError(f"two scenes have one name ({', '.join(names)}); rename one folder")
     _claim(out, scenes, config, overwrite)
     studies = []
-    for scene, name in zip(scenes, names, strict=True):
-        study = study_scene(scene, out / name, config, find_camera)
-        bounds = store_bounds(scene, study)
-        low, middle, high = np.percentile(bounds.pose_perturbation_bounds, [10, 50, 90])
-        print(study)
-        print(
-            f"perturbation bound {bounds.perturbation_bound:.2f} m; of single poses {low:.2f}, "
-            f"{middle:.2f}, {high:.2f} m (10, 50, 90 %)"
-        )
-        studies.append(study)
+    kept = f"what was reconstructed is in {out}; the same command uses it again"
+    with resumable(lambda: kept):
+        for scene, name in zip(scenes, names, strict=True):
+            study = study_scene(scene, out / name, config, find_camera)
+            bounds = store_bounds(scene, study)
+            low, middle, high = np.percentile(bounds.pose_perturbation_bounds, [10, 50, 90])
+            print(study)
+            print(
+                f"perturbation bound {bounds.perturbation_bound:.2f} m; of single poses {low:.2f}, "
+                f"{middle:.2f}, {high:.2f} m (10, 50, 90 %)"
+            )
+            studies.append(study)
     write_curves(out / "fidelity.png", studies)
     _write_csv(out / "fidelity.csv", studies)
     return studies
@@ -117,7 +120,7 @@ def study_scene(
         )
     # As beside the path, nothing is left out.
     on_path = (views.measure(views.frame(i)) for i in views.measured)
-    on_path_psnr_db = mean_measure(on_path, "psnr_db")
+    on_path_psnr_db, _ = mean_measure(on_path, "psnr_db")
     assert on_path_psnr_db is not None
     camera = find_camera(Path(views.metadata.capture))
     if camera is not None:
@@ -163,7 +166,7 @@ def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
     grid = np.append(np.arange(0, farthest - 1e-9, _GRID), farthest)
     bounds = []
     X_WCs = views.capture.X_WCs
-    for i in tqdm(range(len(X_WCs)), "bounds", unit="pose"):
+    for i in Progress(range(len(X_WCs)), "finding bounds", unit="pose"):
         sides = zip(*(displace_pose(X_WCs, i, offset) for offset in grid), strict=True)
         bounds.append(
             min(
@@ -214,7 +217,7 @@ def _rendered_frames(
     esdf = Esdf.load(scene / "esdf.npz").conservative()
     X_WCs = views.capture.X_WCs
     numbers = views.metadata.held_out or range(len(X_WCs))
-    for i in tqdm(numbers, "rendering", unit="pose"):
+    for i in Progress(numbers, "rendering the truth", unit="pose"):
         for offset in config.offsets:
             for X_WC in displace_pose(X_WCs, i, offset)[: 2 if offset else 1]:
                 way = np.linspace(X_WCs[i].translation(), X_WC.translation(), 11)
@@ -235,8 +238,10 @@ def _withheld_frames(
     file = out / _RECIPE
     part = drop_frames(whole, withheld)
     if not file.is_file() or file.read_text() != recipe:
-        reconstruct(part, out, settings)
+        with resumable(lambda: kept_work(out)):
+            reconstruct(part, out, settings)
         with written_atomically(file) as partial:
             partial.write_text(recipe)
-    frames = ((i, None, whole.frame(i)) for i in tqdm(withheld, "measuring", unit="frame"))
+    measured = Progress(withheld, "measuring held-out frames", unit="frame")
+    frames = ((i, None, whole.frame(i)) for i in measured)
     return SceneViews(out, part), frames

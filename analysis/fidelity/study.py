@@ -24,7 +24,7 @@ class Sample:
     @classmethod
     def of(cls, frame: int, offset: float, unseen: float, found: ViewMeasures) -> "Sample":
         """Returns the sample of a view that has been measured, with true depth."""
-        assert found.depth_mae_m is not None
+        assert found.psnr_db is not None and found.depth_mae_m is not None
         assert found.depth_relative is not None and found.floater_fraction is not None
         return cls(
             frame=frame,

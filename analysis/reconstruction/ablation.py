@@ -1,17 +1,25 @@
-"""What depth supervision is worth: two representations, with and without it, on held-out frames.
+"""Compares reconstructions that use depth more and more, for two representations.
 
-The study of the paper's Table II, over any number of captures.
+The paper's Table II compares the first and the last step; those between tell apart what changes
+from one to the other.
 """
 
 import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from splatpilot.analysis.reconstruction.ablation_result import ARMS, COLUMNS, AblationResult, Arm
+from splatpilot.analysis.reconstruction.ablation_result import (
+    ARMS,
+    COLUMNS,
+    AblationResult,
+    Arm,
+    paper_rows,
+)
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     colorize,
@@ -23,6 +31,7 @@ from splatpilot.analysis.reconstruction.figures import (
 from splatpilot.analysis.reconstruction.measure_scene import measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import (
     SceneMeasures,
+    format_measure,
     read_measures,
 )
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
@@ -30,11 +39,13 @@ from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.configuration import dump_config
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.output_folders import claim_folder, holds_folder
+from splatpilot.systems.progress import resumable
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_of_scene import read_capture_of
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
+from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.initialization import MOST_STEPS, held_out_frames
 from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth
@@ -43,6 +54,14 @@ from splatpilot.training.reconstruction.triangulation import triangulate
 
 _RECIPE = "reconstruct.yaml"
 _ERROR_LIMIT = 0.5  # [m], brightest colour of depth errors
+_NO_DEPTH_LOSSES = {"depth_weight": 0.0, "surface_weight": 0.0, "outline_weight": 0.0}
+_SETTINGS = {
+    "points": {"initialization": "points", "strategy": "default", **_NO_DEPTH_LOSSES},
+    "depth_start": {"initialization": "depth", **_NO_DEPTH_LOSSES},
+    "surfaces": {"initialization": "depth", "depth_weight": 0.0},
+    "depth_term": {"initialization": "depth"},
+}
+"""Settings of each step that depart from the configuration of the study."""
 
 
 @dataclass
@@ -58,23 +77,20 @@ class AblationStudy:
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     """Returns how an arm is reconstructed.
 
-    Arms with depth follow `config`. The geometry of photometric arms sees no metric depth at all:
-    they start from points triangulated between the images, have no depth term, and add and remove
-    Gaussians as Kerbl et al. 2023 do ("default"), which they need where no point is. All arms have
-    the same steps, images, losses of colour, largest number of Gaussians, and the same estimate of
-    the brightness of each image, which is no geometry. The distance field, which is not measured
-    here, is that of the captured depth in all of them.
+    The last arm of each representation follows `config`; that before it differs in `depth_weight`
+    alone, and so isolates the paper's equation 2. The first sees no metric depth at all: it starts
+    from points triangulated between the images and adds and removes Gaussians as Kerbl et al. 2023
+    do ("default"), which it needs where no point is. The second starts from depth instead, and so
+    has the strategy, the learning rates and the scale limits that go with that. All arms have the
+    same steps, images, color losses, largest number of Gaussians, and the same estimate of the
+    brightness of each image. The distance field, which is not measured here, is that of the
+    captured depth in all of them.
     """
-    config = replace(config, representation=arm.representation, distance_field="captured")
-    if arm.depth:
-        return replace(config, initialization="depth")
     return replace(
         config,
-        initialization="points",
-        depth_weight=0.0,
-        surface_weight=0.0,
-        outline_weight=0.0,
-        strategy="default",
+        representation=arm.representation,
+        distance_field="captured",
+        **_SETTINGS[arm.step],
     )
 
 
@@ -82,7 +98,7 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
 def run(
     captures: Sequence[Path], out: Path, config: ReconstructConfig, overwrite: bool = False
 ) -> AblationResult:
-    """Reconstructs each capture in four ways, measures them and writes the study to `out`.
+    """Reconstructs each capture in every arm, measures them and writes the study to `out`.
 
     Every arm is a scene folder `out/CAPTURE/ARM`. Arms that are there already, made of the same
     capture with the same settings, are not made again. `ablation.md` and `ablation.csv` have the
@@ -112,9 +128,10 @@ def run(
             raise ValueError(f"{path}: two captures are called {capture.name}; rename one folder")
     study = AblationStudy([str(path.resolve()) for path in captures], config)
     claim_folder(out / "ablation.yaml", study, overwrite)
-    result = AblationResult(
-        {capture.name: _ablate(capture, out / capture.name, config) for _, capture in opened}
-    )
+    with resumable(lambda: f"arms that are finished are in {out}; the same command resumes"):
+        result = AblationResult(
+            {capture.name: _ablate(capture, out / capture.name, config) for _, capture in opened}
+        )
     for _, capture in opened:
         _write_sheet(out / f"{capture.name}.png", capture, out / capture.name, result)
     _write_tables(out, result, config)
@@ -138,17 +155,18 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
         recipe = f"capture: {capture.folder}\n{dump_config(arm_config(arm, config))}"
         file = scene / _RECIPE
         if not file.is_file() or file.read_text() != recipe:
-            print(f"{capture.name}: {arm.title}")
+            print(f"{capture.name}: {arm.title}", flush=True)
             seen = capture
-            if not arm.depth:
+            if arm.step == "points":
                 if points is None:
                     held_out = held_out_frames(capture, config)
                     fitted = [i for i in range(len(capture)) if i not in held_out]
                     points = triangulate(capture, fitted)
                 seen = replace(capture, points=points)
-            reconstruct(seen, scene, arm_config(arm, config))
-            with written_atomically(file) as partial:
-                partial.write_text(recipe)
+            with resumable(partial(kept_work, scene)):
+                reconstruct(seen, scene, arm_config(arm, config))
+            with written_atomically(file) as written:
+                written.write_text(recipe)
         found[arm.key] = read_measures(scene) or measure_scene(scene, capture)
     return found
 
@@ -163,7 +181,7 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
         "",
         f"{held_out} held out; {config.iterations} steps; images "
         f"{config.image_width or 'of full'} px wide. The paper's figures are of another scene (its "
-        "LPIPS of another network), for the order of the arms.",
+        "LPIPS of another network), and of recipes without surface and outline losses.",
         "",
         "| " + " | ".join(heading) + " |",
         "|" + "---|" * len(heading),
@@ -183,35 +201,36 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
         writer.writerows(
             [name, arm.key, *(arms[arm.key].mean(column) for column in COLUMNS)] for arm in ARMS
         )
-    writer.writerows(["paper", arm.key, *arm.paper] for arm in ARMS)
+    writer.writerows(["paper", arm.key, *known.values()] for arm, known in paper_rows())
     with written_atomically(out / "ablation.csv") as partial:
         partial.write_text(text.getvalue())
 
 
 def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult) -> None:
-    """Draws one held-out frame under all arms: the one whose share of floaters in plain 3DGS is the
-    median, so neither the best nor the worst."""
+    """Draws one held-out frame under the arms that the paper has: the one whose share of floaters
+    in 3DGS from points is the median, so neither the best nor the worst."""
     arms = result.captures[capture.name]
-    frames = arms["3dgs"].frames
+    frames = arms["3dgs_points"].frames
     ordered = sorted(frames, key=lambda i: frames[i].floater_fraction or 0.0)
     i = ordered[len(ordered) // 2]
-    order = (ARMS[1], ARMS[0], ARMS[2], ARMS[3])
-    scenes = [(arm, SceneViews(out / arm.key, capture)) for arm in order]
-    frame = scenes[0][1].frame(i)
+    of_paper = (arm for arm, _ in paper_rows())
+    drawn = sorted(of_paper, key=lambda arm: (arm.step != "points", arm.key))
+    scenes = {arm.key: SceneViews(out / arm.key, capture) for arm in drawn}
+    frame = scenes[drawn[0].key].frame(i)
     truth, known = frame.image / 255, has_true_depth(frame.depth)
     depths, errors = depth_scale([frame.depth]), error_scale(_ERROR_LIMIT)
     true_depth = Panel(colorize(frame.depth, depths, known))
     rows: list[list[Panel | None]] = [[Panel(truth)], [None], [true_depth], [None]]
-    for arm, views in scenes:
-        view, found = views.render(frame), arms[arm.key].frames[i]
+    for key, views in scenes.items():
+        view, found = views.render(frame), arms[key].frames[i]
         image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
         error = np.abs(view.depth - np.where(known, frame.depth, 0))
         mask = floaters(view.depth, frame.depth)
         fraction, mae = found.floater_fraction or 0.0, found.depth_mae_m or 0.0
-        rows[0].append(Panel(image, f"{found.psnr_db:.1f} dB"))
+        rows[0].append(Panel(image, format_measure(found.psnr_db, "{:.1f} dB")))
         rows[1].append(Panel(mark_floaters(image, mask), f"{fraction:.1%}"))
         rows[2].append(Panel(colorize(view.depth, depths, view.alpha > 0)))
         rows[3].append(Panel(colorize(error, errors, known), f"{mae:.2f} m"))
-    columns = ["captured", "2DGS", "3DGS", "2DGS + depth", "3DGS + depth (ours)"]
+    columns = ["captured", *(arm.title.partition(",")[0] for arm in drawn)]
     titles = [f"frame {i}", "floaters", "depth", "depth error"]
     write_sheet(path, rows, columns, titles, [None, None, depths, errors])

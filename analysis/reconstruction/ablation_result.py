@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,23 +23,43 @@ COLUMNS = (
 )
 
 
+STEPS = {
+    "points": "from points, photometric",
+    "depth_start": "from depth, photometric",
+    "surfaces": "+ surface and outline losses",
+    "depth_term": "+ depth term",
+}
+"""Titles of the steps from one arm of a representation to the next, by the end of its key."""
+
+_PAPER = {
+    "3dgs_points": (29.35, 0.8706, 0.215, 0.974, 0.115),
+    "2dgs_points": (29.07, 0.8656, 0.228, 1.466, 0.130),
+    "2dgs_depth_term": (28.26, 0.8518, 0.213, 0.212, 0.015),
+    "3dgs_depth_term": (28.89, 0.8676, 0.184, 0.085, 0.004),
+}
+"""The paper's figures for its one scene, in the order of the first of COLUMNS: of its vanilla and
+its "+ depth" arms, whose initialization it does not state."""
+
+
 @dataclass(frozen=True)
 class Arm:
-    """One way to reconstruct, and what the paper found for it on its one scene."""
+    """One way to reconstruct: a representation, and the last of the `STEPS` that it takes."""
 
-    key: str
-    title: str
     representation: str
-    depth: bool
-    paper: tuple[float, float, float, float, float]  # in the order of the first of COLUMNS
+    step: str
+
+    @property
+    def key(self) -> str:
+        """The name of its folder."""
+        return f"{self.representation}_{self.step}"
+
+    @property
+    def title(self) -> str:
+        """Its name in tables."""
+        return f"{self.representation.upper()} {STEPS[self.step]}"
 
 
-ARMS = (
-    Arm("3dgs", "Vanilla 3DGS", "3dgs", False, (29.35, 0.8706, 0.215, 0.974, 0.115)),
-    Arm("2dgs", "Vanilla 2DGS", "2dgs", False, (29.07, 0.8656, 0.228, 1.466, 0.130)),
-    Arm("2dgs_depth", "2DGS + depth", "2dgs", True, (28.26, 0.8518, 0.213, 0.212, 0.015)),
-    Arm("3dgs_depth", "3DGS + depth (ours)", "3dgs", True, (28.89, 0.8676, 0.184, 0.085, 0.004)),
-)
+ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") for step in STEPS)
 
 
 @dataclass(frozen=True)
@@ -53,15 +74,17 @@ class AblationResult:
         return [value for value in found if value is not None]
 
     def verdicts(self) -> list[str]:
-        """Returns what depth supervision did to 3DGS and 2DGS on each capture."""
+        """Returns what each step did to the arm before it on each capture."""
         lines = []
         for name, arms in self.captures.items():
-            for plain, ours in (("3dgs", "3dgs_depth"), ("2dgs", "2dgs_depth")):
-                before, after = arms[plain], arms[ours]
+            for plain, other in pairwise(ARMS):
+                if plain.representation != other.representation:
+                    continue
+                before, after = arms[plain.key], arms[other.key]
                 gain = (after.mean("psnr_db") or 0) - (before.mean("psnr_db") or 0)
                 lines.append(
-                    f"{name}, {plain.upper()}: depth supervision divides the depth error by "
-                    f"{_ratio(before, after, 'depth_mae_m')} and floaters by "
+                    f"{name}, {other.title}: depth error divided by "
+                    f"{_ratio(before, after, 'depth_mae_m')}, floaters by "
                     f"{_ratio(before, after, 'floater_fraction')}, PSNR {gain:+.2f} dB"
                 )
         return lines
@@ -79,8 +102,7 @@ class AblationResult:
             for arm in ARMS:
                 cells = [_spread(self.values(arm, name), NAMES[name][1]) for name in COLUMNS]
                 rows.append(["mean ± spread", arm.title, *cells])
-        for arm in ARMS:
-            known = dict(zip(COLUMNS, arm.paper, strict=False))
+        for arm, known in paper_rows():
             cells = [format_measure(known.get(name), NAMES[name][1]) for name in COLUMNS]
             rows.append(["paper", arm.title, *cells])
         return rows
@@ -90,6 +112,15 @@ class AblationResult:
         widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
         lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
         return "\n".join([*lines, "", *self.verdicts()])
+
+
+def paper_rows() -> list[tuple[Arm, dict[str, float]]]:
+    """Returns the arms of the paper with its figures by column."""
+    return [
+        (arm, dict(zip(COLUMNS, _PAPER[arm.key], strict=False)))
+        for arm in ARMS
+        if arm.key in _PAPER
+    ]
 
 
 def _ratio(before: SceneMeasures, after: SceneMeasures, name: str) -> str:

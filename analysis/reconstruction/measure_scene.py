@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
@@ -15,10 +14,15 @@ from splatpilot.analysis.reconstruction.figures import (
     error_scale,
     write_sheet,
 )
-from splatpilot.analysis.reconstruction.scene_measures import METRICS, SceneMeasures
+from splatpilot.analysis.reconstruction.scene_measures import (
+    METRICS,
+    SceneMeasures,
+    format_measure,
+)
 from splatpilot.analysis.reconstruction.scene_views import SceneViews
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.files import require_unused, written_atomically
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.reconstruction.lpips import Lpips
@@ -49,13 +53,14 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
     """
     views = SceneViews(scene, capture)
     lpips, missing = load_lpips()
-    frames, size = {}, (0, 0)
-    for i in tqdm(views.measured, "measuring", unit="frame"):
+    frames, strict, size = {}, {}, (0, 0)
+    for i in Progress(views.measured, "measuring frames", unit="frame"):
         frame = views.frame(i)
         size = frame.depth.shape
         frames[i] = views.measure(frame, views.seen(frame), lpips)
+        strict[i] = views.measure(frame, lpips=lpips, fit_gain=False)
     height, width = size
-    measures = SceneMeasures(bool(views.metadata.held_out), width, height, frames, missing)
+    measures = SceneMeasures(bool(views.metadata.held_out), width, height, frames, strict, missing)
     _write_views(scene / SHEET, views, measures)
     with written_atomically(scene / METRICS) as partial:  # Last: it says that all is there.
         partial.write_text(json.dumps(measures.as_json(), indent=2))
@@ -97,7 +102,8 @@ def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None
         found = measures.frames[i]
         vignetting = views.metadata.vignetting
         image, _ = fit_exposure(view.color, frame.image / 255, vignetting, frame.valid)
-        row = [Panel(frame.image / 255), Panel(image, f"{found.psnr_db:.1f} dB")]
+        label = format_measure(found.psnr_db, "{:.1f} dB")
+        row = [Panel(frame.image / 255), Panel(image, label)]
         rows.append(row + depth_panels(frame, view, found.depth_mae_m, depths, errors))
     columns = ["captured", "scene", "captured depth", "depth of the scene", "depth error"]
     scales = [depths] + [errors] * (len(rows) - 1)

@@ -9,11 +9,12 @@ from splatpilot.diagrams.worlds.scene_folder import check_scene_target
 from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
 from splatpilot.systems.files import require_unused
 from splatpilot.systems.output_folders import held_folder
+from splatpilot.systems.progress import resumable
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.check import doubts
 from splatpilot.training.captures.read_capture import read_capture
 from splatpilot.training.device import require_renderer
-from splatpilot.training.reconstruction.checkpoint import work_folder
+from splatpilot.training.reconstruction.checkpoint import kept_work, work_folder
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, reconstruct
 
@@ -48,10 +49,12 @@ def run(
     for doubt in doubted:  # Said at once, for what follows takes long, and again in the end.
         print(f"warning: {doubt}", flush=True)
     with held_folder(work_folder(Path(out))):
-        summary = reconstruct(opened, out, config, restart=restart)
+        with resumable(lambda: kept_work(Path(out))):
+            summary = reconstruct(opened, out, config, restart=restart)
         summary = replace(summary, warnings=(*doubted, *summary.warnings))
         print(summary)
-        measures = measure_scene(Path(out), opened)
+        with resumable(lambda: f"{out} is made, but not measured; the same command measures it"):
+            measures = measure_scene(Path(out), opened)
         print(measures)
     return summary, measures
 

@@ -30,12 +30,19 @@ class SceneMeasures:
     width: int  # [px], at which it was measured: images are shrunk as they were for the making
     height: int
     frames: dict[int, ViewMeasures]
+    """In the pixels that show what the scene was made from, exposed to fit."""
+    strict_frames: dict[int, ViewMeasures]
+    """In all pixels, with a gain of 1."""
     lpips_missing: str
     """Why there is no LPIPS; empty if there is."""
 
     def mean(self, name: str) -> float | None:
         """Returns the mean of a measure over the frames that have it; None if none has."""
-        return mean_measure(self.frames.values(), name)
+        return mean_measure(self.frames.values(), name)[0]
+
+    def strict_mean(self, name: str) -> float | None:
+        """Returns the same in all pixels, with a gain of 1."""
+        return mean_measure(self.strict_frames.values(), name)[0]
 
     @property
     def worst_hole_fraction(self) -> float | None:
@@ -44,22 +51,34 @@ class SceneMeasures:
         return max((share for share in found if share is not None), default=None)
 
     def as_json(self) -> dict:
-        """Returns the content of `metrics.json`: means, and the measures of each frame."""
+        """Returns the content of `metrics.json`: means, over how many frames, and the measures of
+        each frame."""
         return {
             **{name: self.mean(name) for name in NAMES},
+            "counts": {name: mean_measure(self.frames.values(), name)[1] for name in NAMES},
+            "strict": {name: self.strict_mean(name) for name in NAMES},
             "worst_hole_fraction": self.worst_hole_fraction,
             "held_out": self.held_out,
             "width": self.width,
             "height": self.height,
             "lpips_missing": self.lpips_missing,
             "frames": {str(i): asdict(frame) for i, frame in self.frames.items()},
+            "strict_frames": {str(i): asdict(f) for i, f in self.strict_frames.items()},
         }
 
     def __str__(self) -> str:
         kind = "held-out frames" if self.held_out else "frames the scene was made from"
-        lines = [f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}"]
+        lines = [
+            f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}",
+            f"{'':<22} {'seen pixels, gain fitted':<26} all pixels, no gain",
+        ]
         for name, (title, form) in NAMES.items():
-            lines.append(f"{title:<22} {format_measure(self.mean(name), form)}")
+            mean, count = mean_measure(self.frames.values(), name)
+            told = format_measure(mean, form)
+            if 0 < count < len(self.frames):
+                told += f" ({count} of {len(self.frames)} frames)"
+            strict = format_measure(self.strict_mean(name), form)
+            lines.append(f"{title:<22} {told:<26} {strict}")
         worst = format_measure(self.worst_hole_fraction, NAMES["hole_fraction"][1])
         lines.append(f"{'holes, worst frame':<22} {worst}")
         if self.lpips_missing:
@@ -84,7 +103,8 @@ def read_measures(scene: Path) -> SceneMeasures | None:
     try:
         content = json.loads(file.read_text())
         said = {field.name: content[field.name] for field in fields(SceneMeasures)}
-        said["frames"] = {int(i): ViewMeasures(**frame) for i, frame in said["frames"].items()}
+        for name in ("frames", "strict_frames"):
+            said[name] = {int(i): ViewMeasures(**frame) for i, frame in said[name].items()}
         return SceneMeasures(**said)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: {error!r}; delete the file and measure again") from error

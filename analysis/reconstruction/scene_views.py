@@ -88,10 +88,14 @@ class SceneViews:
         frame: CaptureFrame,
         seen: NDArray[np.bool_] | None = None,
         lpips: Lpips | None = None,
+        *,
+        fit_gain: bool = True,
     ) -> ViewMeasures:
-        """Compares both, in the pixels `seen` or in all."""
+        """Compares both, in the pixels `seen` or in all, see `measure_view`."""
         on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
-        return measure_view(on_black, self.background, frame, vignetting, seen, lpips)
+        return measure_view(
+            on_black, self.background, frame, vignetting, seen, lpips, fit_gain=fit_gain
+        )
 
     def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
         height, width = frame.depth.shape

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform
-from tqdm import tqdm
 
 from splatpilot.systems.collision.depth_fusion import DepthFusion, ray_slopes
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy
+from splatpilot.systems.progress import Progress
 
 
 def esdf_from_depth_images(
@@ -99,7 +99,7 @@ def _pair(
 ) -> Iterator[tuple[np.ndarray, RigidTransform]]:
     """Pairs images, pixels that say nothing set to 0, with poses; checks and shows progress."""
     shape, count = None, 0
-    for depth in tqdm(depths, desc=what, total=len(X_WCs), unit="image", delay=2.0):
+    for depth in Progress(depths, desc=what, total=len(X_WCs), unit="image", delay=2.0):
         depth = np.asarray(depth, dtype=np.float32)
         shape = depth.shape if shape is None else shape
         if depth.ndim != 2 or depth.shape != shape:

@@ -2,10 +2,10 @@
 
 import numpy as np
 from scipy.ndimage import binary_dilation
-from tqdm import tqdm
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy, grid_shape
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 # Standard deviations beyond which a Gaussian counts as zero.
@@ -91,7 +91,7 @@ def density_on_grid(
     boxes, group = np.unique(extent[touching], axis=0, return_inverse=True)
     order = touching[np.argsort(group, kind="stable")]
     counts = np.bincount(group, minlength=len(boxes))
-    with tqdm(total=len(order), desc="density of Gaussians", unit="", delay=2.0) as progress:
+    with Progress(total=len(order), desc="density of Gaussians", unit="", delay=2.0) as progress:
         for box, group_end, count in zip(boxes, counts.cumsum(), counts, strict=True):
             voxel = np.stack(np.unravel_index(np.arange(box.prod()), box), -1)  # (V, 3)
             step = max(1, _CHUNK // len(voxel))

@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
+from splatpilot.analysis import places
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.policies.straight import StraightConfig
+from splatpilot.systems.progress import resumable
 from splatpilot.systems.splats.gaussian_ply import write_ply
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
@@ -117,6 +119,41 @@ def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path
     loaded = set(loaded)
     assert "splatpilot" in loaded
     assert not loaded & {"numpy", "pydrake", "scipy", "torch", "matplotlib", "cv2", "yaml", "tqdm"}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train diffaero --out run",
+        "recover student_rgb --out run",
+        "corpus make --out corpus --worlds 2",
+        "places forest_splat --out scenes",
+        "reconstruct . --out scene",
+        "ablate . --out study",
+        "fidelity . --out study",
+        "measure .",
+        "capture check .",
+        "capture render P02 --out capture",
+        "benchmark --out study --quick",
+    ],
+)
+def test_long_commands_say_what_they_do_before_anything_slow_is_imported(words, tmp_path):
+    script = (
+        "import sys; from splatpilot.analysis.cli import main\n"
+        # Importing these fails.
+        "sys.modules |= dict.fromkeys(['numpy', 'pydrake', 'torch', 'yaml'])\n"
+        f"main({words.split()})"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"TMPDIR": str(tmp_path)},  # of the report
+    )
+    said, *failure = ended.stderr.splitlines()
+    assert said and not said.startswith("splatpilot") and "ing " in said
+    assert failure and "\r" not in ended.stderr
 
 
 def test_version(capsys):
@@ -358,6 +395,17 @@ def test_what_is_said_stands_below_progress_bars(how, status, message, tmp_path)
     last = ended.stderr.replace("\r", "\n").splitlines()[-1]
     assert last == f"splatpilot: {message}".replace("FILE", str(tmp_path / "working.py"))
     assert "/3" in ended.stderr
+
+
+def test_an_interruption_says_what_is_kept(tmp_path, capsys, monkeypatch):
+    def interrupted(**_keywords):
+        with resumable(lambda: "one scene is in scenes; the same command resumes"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(places, "run", interrupted)
+    assert main(["places", "forest_splat", "--out", str(tmp_path)]) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "splatpilot: interrupted; one scene is in scenes; the same command resumes"
 
 
 def test_drake_says_nothing_but_warnings(tmp_path):

@@ -1,10 +1,10 @@
 """Where captures keep what takes long to make of their files."""
 
 import hashlib
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from splatpilot.systems import environment
 from splatpilot.systems.files import remove_leftovers
 from splatpilot.training.captures.capture_config import CaptureConfig
 
@@ -13,8 +13,7 @@ def cache_folder(config: CaptureConfig, *parts: str) -> Path:
     """The folder that a capture keeps what is made of it in: what it names, or in the user's."""
     if config.cache:
         return Path(config.cache)
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home, "splatpilot", *parts)
+    return environment.cache_folder(*parts)
 
 
 def cache_key(files: Iterable[Path], *others: object) -> str:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from tqdm import tqdm
 
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 
@@ -52,7 +52,7 @@ def _points_from_depth(
     pixels = len(frames) * capture.width * capture.height
     step = max(1, int(np.ceil(np.sqrt(pixels / _MAX_POINTS))))
     points, colors = [], []
-    for i in tqdm(frames, "reading depth", unit="frame", delay=2.0):
+    for i in Progress(frames, "reading depth", unit="frame", delay=2.0):
         frame = capture.frame(i)
         depth = frame.depth[::step, ::step]
         rows, columns = np.nonzero((depth > 0) & np.isfinite(depth))

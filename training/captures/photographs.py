@@ -7,11 +7,11 @@ import shutil
 from pathlib import Path
 
 from PIL import Image
-from tqdm import tqdm
 
 from splatpilot.systems.cores import available_cores
 from splatpilot.systems.files import folder_written_atomically
 from splatpilot.systems.processes import run_apart
+from splatpilot.systems.progress import Progress, resumable
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -107,7 +107,10 @@ def _register(folder: Path, names: list[str], one_camera: bool, partners: int, m
     prepare_cache(model.parent)
     with folder_written_atomically(model) as written:
         work = folder, names, one_camera, partners, written
-        run_apart(f"{model}: registration", _write_model, work)
+        with resumable(
+            lambda: "nothing is kept of the registration; the same command starts again"
+        ):
+            run_apart(f"{model}: registration", _write_model, work)
 
 
 def _write_model(work: tuple[Path, list[str], bool, int, Path]) -> None:
@@ -135,7 +138,7 @@ def _write_model(work: tuple[Path, list[str], bool, int, Path]) -> None:
         if (masks := mask_folder(folder)).is_dir():
             reader.mask_path = masks
         threads = available_cores()
-        with tqdm(total=len(names), desc="features", unit="photo") as progress:
+        with Progress(total=len(names), desc="extracting features", unit="photo") as progress:
             for start in range(0, len(names), threads):
                 some = names[start : start + threads]
                 pycolmap.extract_features(
@@ -146,7 +149,7 @@ def _write_model(work: tuple[Path, list[str], bool, int, Path]) -> None:
         verification.ransac.random_seed = _SEED
         pairs = _pairs(database, names, partners)
         block = max(1, len(pairs) // 20)
-        with tqdm(total=len(pairs), desc="matching", unit="pair") as progress:
+        with Progress(total=len(pairs), desc="matching pairs", unit="pair") as progress:
             for start in range(0, len(pairs), block):
                 some = pairs[start : start + block]
                 listed = kept / "pairs.txt"
@@ -162,7 +165,7 @@ def _write_model(work: tuple[Path, list[str], bool, int, Path]) -> None:
         options.mapper.random_seed = options.triangulation.random_seed = _SEED
         options.mapper.num_threads = 1
         options.min_model_size = min(options.min_model_size, len(names))
-        with tqdm(total=len(names), desc="registering", unit="photo") as progress:
+        with Progress(total=len(names), desc="registering photographs", unit="photo") as progress:
             models = pycolmap.incremental_mapping(
                 database,
                 folder,
@@ -195,5 +198,5 @@ def _pairs(database: Path, names: list[str], partners: int) -> list[tuple[int, i
         opened.close()
 
 
-def _advance(progress: tqdm, count: int) -> None:
+def _advance(progress: Progress, count: int) -> None:
     progress.update(count)

@@ -15,8 +15,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.sparse import coo_matrix, csc_matrix, eye, kron
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
+from splatpilot.systems.progress import Progress
 from splatpilot.training.captures.frame_comparison import (
     REACH,
     ComparedFrame,
@@ -80,7 +80,7 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
     pairs = _pairs(frames, poses)
     spreads = _SPREADS
     history = []
-    with tqdm(range(_ROUNDS), "refining poses", unit="round") as rounds:
+    with Progress(range(_ROUNDS), "refining poses", unit="round") as rounds:
         for number in rounds:
             reach = _REACHES[min(number, len(_REACHES) - 1)]
             terms, differences = [], []
@@ -121,7 +121,7 @@ def _pairs(
     nearest in the sequence, and ever fewer of those farther off, which keep the whole together."""
     X_CWs = np.array([X_WC.inverse().GetAsMatrix34() for X_WC in X_WCs])
     pairs = []
-    for i in tqdm(range(len(frames)), "comparing", unit="frame"):
+    for i in Progress(range(len(frames)), "comparing frames", unit="frame"):
         p_WQ = X_WCs[i].multiply(frames[i].p_CQ[:_PROBES].T)
         if p_WQ.size < 3 * _PROBES:
             continue

@@ -1,15 +1,14 @@
 """A capture with refined poses, which are kept in a cache, as refining takes a minute."""
 
 import hashlib
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from tqdm import tqdm
 
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.progress import Progress, say
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -44,13 +43,13 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
     if not file.is_file():
         prepare_cache(file.parent)
         factor = shrink_factor(capture.width, WIDTH)
-        numbers = tqdm(range(len(capture)), "loading", unit="frame")
+        numbers = Progress(range(len(capture)), "loading frames", unit="frame")
         frames = [ComparedFrame.of(shrink(capture.frame(i), factor)) for i in numbers]
         try:
             refined = refine_poses(frames, capture.X_WCs)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        tqdm.write(f"{path}: {refined}", file=sys.stderr)
+        say(f"{path}: {refined}")
         with written_atomically(file) as written, written.open("wb") as stream:
             np.save(stream, np.array([X_WC.GetAsMatrix34() for X_WC in refined.X_WCs]))
     return replace(capture, X_WCs=[_pose(matrix) for matrix in np.load(file)])

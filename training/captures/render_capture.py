@@ -9,7 +9,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from tqdm import tqdm
 
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
@@ -23,6 +22,7 @@ from splatpilot.systems.collision.esdf_from_occupancy import grid_shape
 from splatpilot.systems.configuration import dump_config, load_config
 from splatpilot.systems.files import require_writable_folder, written_atomically
 from splatpilot.systems.output_folders import held_folder
+from splatpilot.systems.progress import Progress, resumable
 from splatpilot.systems.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.training.captures.camera_path import move_left, poses_along, resample, visiting_path
 from splatpilot.training.captures.capture import CaptureFrame
@@ -74,7 +74,13 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
     out = Path(out).absolute()
     world = benchmark_scenarios().get(str(world)) or Path(world).absolute()
     partial = out.with_name(f".{out.name}.partial")
-    with held_folder(partial):
+    images = partial / "image_left"
+
+    def kept() -> str:
+        count = len(list(images.glob("*.png")))
+        return f"{count} frames are in {partial}; the same command resumes there"
+
+    with held_folder(partial), resumable(kept):
         _render(world, out, partial, config, seed)
 
 
@@ -125,7 +131,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
     def view(X_WC: RigidTransform) -> CaptureFrame:
         return renderer.frame(X_WC, K, config.width, config.height)
 
-    _write_frames(partial, "rendering", X_WCs, view)
+    _write_frames(partial, "rendering frames", X_WCs, view)
     for offset in config.offsets:
         moved = [move_left(X_WC, offset) for X_WC in X_WCs]
         room = [X_WC for X_WC in moved if _has_room(esdf, X_WC.translation(), config.clearance)]
@@ -284,7 +290,7 @@ def _write_frames(
     for part in (images, depths):
         require_writable_folder(part)
     rows = []
-    for i, X_WC in enumerate(tqdm(X_WCs, what, unit="frame")):
+    for i, X_WC in enumerate(Progress(X_WCs, what, unit="frame")):
         rows.append(_row(X_WC))
         image = images / f"{i:06d}_left.png"
         depth = depths / f"{i:06d}_left_depth.npy"

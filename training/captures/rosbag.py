@@ -19,10 +19,10 @@ from typing import Any
 import cv2
 import numpy as np
 from pydrake.math import RigidTransform
-from tqdm import tqdm
 
 from splatpilot.systems.extras import import_extra
 from splatpilot.systems.files import folder_written_atomically
+from splatpilot.systems.progress import Progress
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -217,7 +217,7 @@ class _Bag:
         count = sum(c.msgcount for c in self._reader.connections if c.topic == topic)
         times = []
         with (folder / f"{name}.txt").open("w") as file:
-            for message in tqdm(self._messages(topic), topic, count, unit="image"):
+            for message in Progress(self._messages(topic), topic, count, unit="image"):
                 times.append(_time(message))
                 try:
                     image = write(message, folder / name / f"{times[-1]:.9f}")

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import cv2
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from splatpilot.systems.files import folder_written_atomically
+from splatpilot.systems.progress import Progress
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -49,7 +49,7 @@ def _extract(path: Path, rate: float, folder: Path) -> None:
         best: NDArray | None = None
         sharpest, interval, index = -1.0, 0, 0
         total = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0) or None
-        with tqdm(total=total, desc="video", unit="frame") as progress:
+        with Progress(total=total, desc="video", unit="frame") as progress:
             while True:
                 there, frame = video.read()
                 if best is not None and (not there or int(index * rate / fps) > interval):

@@ -8,6 +8,7 @@ ledger.csv       where everything comes from, a row for each flight
 
 import csv
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,23 @@ class Corpus:
 def entries(folder: Path) -> list[Path]:
     """The folders in a folder by name, without those that are only being written."""
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+
+
+def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
+    """Returns the worlds of corpora by name, each once.
+
+    Raises:
+        ValueError: if two worlds of one name differ in their distances.
+    """
+    records: dict[str, WorldRecord] = {}
+    for world in chain.from_iterable(corpus.worlds for corpus in corpora):
+        first = records.setdefault(world.name, world)
+        if not first.has_distances_of(world):
+            raise ValueError(
+                f"{first.path} and {world.path} are different worlds of one name; collect one of "
+                "the corpora again, with another seed or another name of the file of its kind"
+            )
+    return records
 
 
 def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:

@@ -15,8 +15,10 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from splatpilot.diagrams.scenario import Scenario
+from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.cores import available_cores
 from splatpilot.systems.processes import map_processes
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.provenance import revision
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus
@@ -28,7 +30,7 @@ from splatpilot.training.corpus.world_record import WorldRecord
 from splatpilot.training.policies.expert import Labeller
 
 NEAR = 1.2
-"""[m], clearance below which the least of a while is a near-miss."""
+"""[m], clearance from obstacles below which the least of a while is a near-miss."""
 
 BEFORE = 0.5, 2.5
 """[s], how long before a near-miss states are taken."""
@@ -39,6 +41,10 @@ APART = 1.0
 
 LOST = 0.8
 """[s], between two states of a flight that did not reach its goal."""
+
+_LEVEL = 0.87  # [-], least vertical part of the normal of the ground and of ceilings
+_STEPS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])  # [m]
+_AWAY = 0.2  # [m], by which such a step leads away from them at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +68,20 @@ class StudentFlight:
         arrays = self.p_WG, self.times, self.states
         whole = b"".join(np.ascontiguousarray(array, float).tobytes() for array in arrays)
         return hashlib.sha256(whole).hexdigest()[:16]
+
+
+def obstacle_clearances(flight: StudentFlight, field: DistanceField) -> np.ndarray:
+    """Returns the clearances (N,) [m] of a flight; infinite where ground or ceiling are nearest.
+
+    That is a surface whose normal is vertical, and from which a horizontal step leads away in no
+    direction; it does from a wire, a wall's top or a table.
+    """
+    p_WB = flight.states[:, :3]
+    nearest = field.query(p_WB)
+    level = np.abs(nearest.gradient[:, 2]) > _LEVEL
+    for step in _STEPS:
+        level &= ~(field.distance(p_WB + step) - nearest.distance > _AWAY)
+    return np.where(level, np.inf, flight.clearances)
 
 
 def near_misses(times: np.ndarray, clearances: np.ndarray) -> np.ndarray:
@@ -136,8 +156,9 @@ def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | Non
         if not path.exists():
             work.append((path, records[world], flown))
     add = partial(_add_world, corpus.config, revision())
-    for _ in map_processes(add, work, jobs or available_cores()):
-        pass
+    with Progress(total=len(work), desc="labelling near-misses", unit="world") as bar:
+        for _ in map_processes(add, work, jobs or available_cores()):
+            bar.update()
     corpus = Corpus(folder)
     write_ledger(folder, corpus)
     return corpus
@@ -154,7 +175,8 @@ def _add_world(
         goal = flight.p_WG.tobytes()
         if goal not in labellers:
             labellers[goal] = Labeller(world.esdf, flight.p_WG, config.expert)
-        events = near_misses(flight.times, flight.clearances)
+        clearances = obstacle_clearances(flight, world.distance_field)
+        events = near_misses(flight.times, clearances)
         states = flight.states[rows_to_recover(flight, events, config.expert.period)]
         labeller, bound = labellers[goal], source.perturbation_bound
         demonstrations = keep_clear(labeller.labels(states), labeller.field)

@@ -56,6 +56,13 @@ class WorldRecord:
         """
         return self._esdf
 
+    def has_distances_of(self, other: "WorldRecord") -> bool:
+        """Tells whether another record has the same distances."""
+        if (self.path / _ESDF).samefile(other.path / _ESDF):
+            return True
+        own, others = Esdf.load(self.path / _ESDF), Esdf.load(other.path / _ESDF)
+        return _are_same(own, others)
+
     def make(self) -> World:
         """Makes the world again, to see and fly in.
 
@@ -63,7 +70,7 @@ class WorldRecord:
             FileNotFoundError, ValueError: see `make_world`; or if it is not what it was.
         """
         world = make_world(self.source.world, self.source.seed)
-        if not np.array_equal(world.esdf.distances, self.esdf().distances):
+        if not _are_same(world.esdf, self.esdf()):
             raise ValueError(
                 f"the world {self.name} is no longer what {self.path} recorded: its scene or the "
                 "program has changed; restore it, or gather anew in another folder"
@@ -73,6 +80,15 @@ class WorldRecord:
     @cached_property
     def _esdf(self) -> Esdf:
         return Esdf.load(self.path / _ESDF)
+
+
+def _are_same(a: Esdf, b: Esdf) -> bool:
+    return (
+        a.voxel_size == b.voxel_size
+        and np.array_equal(a.lower_W, b.lower_W)
+        and np.array_equal(a.distances, b.distances)
+        and np.array_equal(a.states, b.states)
+    )
 
 
 def record_world(path: Path, source: WorldSource, esdf: Esdf) -> WorldRecord:

@@ -15,6 +15,7 @@ which the published cost has at 0.3 m, at the vehicle's own radius; a metre towa
 worth 0.1 of cost when a hypothesis is chosen, without which the chosen one was often to stay.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,6 +32,7 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -113,7 +115,7 @@ class AgileAutonomyTraining:
         for name in ("rounds", "round_updates", "environments", "steps", "ask_every", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        validate_training_noise(self.noise, "noise")
+        validate_training_noise(self.noise, "noise", of_depth=True, of_colors=False, of_time=True)
         self.validation.validate()
         validate_speeds(self.speeds, "speeds")
 
@@ -139,7 +141,9 @@ class AgileAutonomyTrainer:
         number, within = divmod(update, config.round_updates)
         if within == 0 and number < config.rounds:
             student = number / config.rounds  # part of the vehicles that the student flies
-            new = self._collect(student, first_world=number * config.environments)
+            what = f"collecting round {number + 1} of {config.rounds}"
+            steps = Progress(range(config.steps), what, unit="step", leave=False)
+            new = self._collect(student, number * config.environments, steps)
             if self._data:
                 new = {name: torch.cat([self._data[name], new[name]]) for name in new}
             self._data = new
@@ -191,7 +195,7 @@ class AgileAutonomyTrainer:
         return collision_cost(clearance).reshape(N, M, -1).mean(2)
 
     @torch.no_grad()
-    def _collect(self, student: float, first_world: int) -> dict[str, Tensor]:
+    def _collect(self, student: float, first_world: int, steps: Iterable[int]) -> dict[str, Tensor]:
         """Observations, and what the expert would do, while both fly."""
         config, worlds = self._config, self._worlds
         N, device = config.environments, config.device
@@ -205,7 +209,7 @@ class AgileAutonomyTrainer:
         frames = draw_frames(config.noise, N, self._generator)
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
-        for step in range(config.steps):
+        for step in steps:
             distances, _ = worlds.geometry.nearest(vehicle.p, world, 1)
             ended = (distances[:, 0] < VEHICLE_RADIUS) | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
             inside = (vehicle.p > worlds.lower_W[world]) & (vehicle.p < worlds.upper_W[world])

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from splatpilot.systems.policies.diffaero_inference import FARTHEST, NEAREST
 from splatpilot.systems.policies.diffaero_rgb_inference import DIFFAERO_RGB_NETWORK
 from splatpilot.systems.policies.monocular_depth import HEIGHT, WIDTH, rays_B, require_view
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
@@ -27,7 +27,7 @@ from splatpilot.training.policies.observation import (
     heading_frame,
     inverse_depth,
     noisy_color,
-    validate_color_noise,
+    validate_training_noise,
 )
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import Appearance, relit
@@ -52,7 +52,7 @@ class DiffAeroRgbTraining:
     # Folders of what is learned from, as `splatpilot corpus make` writes them.
     corpora: list[str] = field(default_factory=lambda: ["out/corpus"])
     # [-] Part of the corpora's worlds, by name, that choose among checkpoints instead.
-    held_out: float = 0.05
+    held_out: float = 0.1
     # [-] Held-out samples that are looked at, evenly spaced.
     validation_samples: int = 2000
     schedule: Schedule = field(
@@ -86,7 +86,7 @@ class DiffAeroRgbTraining:
         for name in ("batch", "validation_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        validate_color_noise(self.noise, "noise")
+        validate_training_noise(self.noise, "noise", of_depth=False, of_colors=True, of_time=False)
         self.appearance.validate("appearance")
 
 
@@ -95,6 +95,7 @@ class DiffAeroRgbTrainer:
 
     policy = "diffaero_rgb"
     spec = DIFFAERO_RGB_NETWORK
+    evaluated = "cells"
     measures = f"""\
 Of cells of images, not of flights: those whose nearest depth is below {_NEAR:g} m. `success` is the
 part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken for farther than 5;
@@ -187,7 +188,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         h, w = spec.image_height, spec.image_width
         blocks = (-1, h, HEIGHT // h, w, WIDTH // w)
         kept = []
-        for shard in tqdm(self._data.shards, desc="depths", unit="shard", disable=None):
+        for shard in Progress(self._data.shards, desc="reading depth", unit="shard"):
             depth = shard.arrays["depth"][:, self._rows()]
             kept.append(depth.reshape(blocks).min((2, 4)).astype(np.float32))
         return np.concatenate(kept)

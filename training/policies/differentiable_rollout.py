@@ -91,7 +91,9 @@ class RolloutConfig:
                 raise ValueError(
                     f"rollout.{name} is {limits}; it must be two positive numbers, the lesser first"
                 )
-        validate_training_noise(self.noise, "rollout.noise")
+        validate_training_noise(
+            self.noise, "rollout.noise", of_depth=True, of_colors=False, of_time=True
+        )
         if not 0.0 <= self.gradient_decay <= 1.0:
             raise ValueError(
                 f"rollout.gradient_decay is {self.gradient_decay}; it must be between 0 and 1"

@@ -1,6 +1,7 @@
 """What depth policies are told, in torch; see `systems.policies.observation` for each formula."""
 
 import math
+from dataclasses import fields
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,13 @@ from splatpilot.systems.sensing.observation_noise import (
 )
 from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH
 from splatpilot.training.policies.vehicles import Vehicle
+
+_OF_DEPTH = "depth_multiplicative", "depth_additive", "depth_dropout"
+_OF_TIME = "latency", "frame_rate", "jitter", "frame_dropout"
+_OF_COLORS = tuple(
+    field.name for field in fields(ObservationNoise) if field.name not in _OF_DEPTH + _OF_TIME
+)
+"""Fields of `ObservationNoise`."""
 
 
 class Observation(NamedTuple):
@@ -30,34 +38,32 @@ def training_noise() -> ObservationNoise:
     return ObservationNoise(depth_multiplicative=0.03, depth_additive=0.02, depth_dropout=0.01)
 
 
-def validate_training_noise(noise: ObservationNoise, name: str) -> None:
-    """Raises ValueError on noise out of range, or of colours, naming the field of `name`."""
-    noise.validate(name)
-    of_colors = (
-        "color_noise",
-        "brightness_jitter",
-        "hue_jitter",
-        "blur",
-        "exposure_error",
-        "full_well",
-    )
-    for field in of_colors:
-        if getattr(noise, field) > 0.0:
-            raise ValueError(
-                f"{name}.{field} is {getattr(noise, field)}, but training has images of depth "
-                "alone; it must be 0"
-            )
+def validate_training_noise(
+    noise: ObservationNoise, name: str, *, of_depth: bool, of_colors: bool, of_time: bool
+) -> None:
+    """Checks the noise of a trainer.
 
+    Args:
+        noise: to check.
+        name: of the field that holds it.
+        of_depth, of_colors, of_time: what the trainer's images have noise of; late and lost images
+            are of time.
 
-def validate_color_noise(noise: ObservationNoise, name: str) -> None:
-    """Raises ValueError on noise out of range, or such that images of the moment do not have,
-    naming the field of `name`."""
+    Raises:
+        ValueError: if a value is out of range, or would have no effect.
+    """
     noise.validate(name)
-    if noise.latency > 0.0:
-        raise ValueError(
-            f"{name}.latency is {noise.latency}, but training has images of the moment; it must "
-            "be 0"
-        )
+    for has, names, images in (
+        (of_depth, _OF_DEPTH, "of colors alone"),
+        (of_colors, _OF_COLORS, "of depth alone"),
+        (of_time, _OF_TIME, "of the moment"),
+    ):
+        for of in names:
+            value = getattr(noise, of)
+            if value and not has:
+                raise ValueError(
+                    f"{name}.{of} must be left out, got {value}: training has images {images}"
+                )
 
 
 def noisy_depth(depth: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:

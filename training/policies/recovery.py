@@ -19,12 +19,14 @@ from typing import Any, ClassVar, Protocol
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.systems.files import written_atomically
 from splatpilot.systems.output_folders import claim_folder, holds_folder
-from splatpilot.training.corpus.corpus import Corpus, distinct_shards
+from splatpilot.systems.progress import say
+from splatpilot.systems.provenance import revision
+from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.linked_corpus import link_corpus
 from splatpilot.training.corpus.recovery import add_recovery
 from splatpilot.training.corpus.sample import EXPERT, RECOVERY
 from splatpilot.training.policies import train
-from splatpilot.training.policies.student_data import held_out_names
+from splatpilot.training.policies.student_data import is_held_out
 from splatpilot.training.policies.student_flights import fly_worlds, tasks_of
 from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 
@@ -98,21 +100,26 @@ def run[Config: CorpusTraining](
     # What is not there is refused before anything is written.
     if flown_by:
         policy_named(flown_by)
-    for source in config.corpora:
-        Corpus(Path(source))
+    worlds = distinct_worlds([Corpus(Path(source)) for source in config.corpora])
     digest = _digest(Path(flown_by)) if flown_by.endswith(".npz") else ""
     decisive = RecoveryFlights(flights, flown_by, digest, list(config.corpora), config.held_out)
     claim_folder(out / "recovery.yaml", decisive)
     pilot, first = flown_by, {}
     if not flown_by:
+        say(f"first stage, in {out / 'stage_1'}")
         first = train.run(config=config, out=out / "stage_1", make=make)
         pilot = str(out / "stage_1" / f"{first['policy']}.npz")
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
     for source, folder in zip(config.corpora, folders, strict=True):
         link_corpus(Path(source), folder)
     corpora = [Corpus(folder) for folder in folders]
-    names = sorted({world.name for corpus in corpora for world in corpus.worlds})
-    held_out = held_out_names(names, config.held_out)
+    others = {s.revision for corpus in corpora for s in corpus.shards} - {revision()}
+    if others:
+        say(
+            f"what the corpora hold was labelled by revision {', '.join(sorted(others))} of the "
+            f"program, recovery by {revision()}; ledger.csv tells which"
+        )
+    held_out = {name for name in worlds if is_held_out(name, config.held_out)}
     outcomes: Counter[str] = Counter()
     for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
         tasks = tasks_of([shard for shard in shards if shard.world not in held_out], flights)
@@ -120,6 +127,7 @@ def run[Config: CorpusTraining](
         outcomes += ended
         add_recovery(folder, flown, jobs)
     both = replace(config, corpora=[str(folder) for folder in folders])
+    say(f"second stage, in {out / 'stage_2'}")
     second = train.run(config=both, out=out / "stage_2", make=make)
     ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
     ledger |= {"flown_by": flown_by} if flown_by else {"stage_1": first}
@@ -139,6 +147,7 @@ def _ledger(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]
     recovered = [shard for shard in shards if shard.source == RECOVERY]
     return {
         "flights": dict(sorted(outcomes.items())),
+        "revisions": sorted({shard.revision for shard in shards}),
         "near_misses": sum(f["near_misses"] for shard in recovered for f in shard.flights),
         "expert_samples": sum(len(shard) for shard in shards if shard.source == EXPERT),
         "recovery_samples": sum(map(len, recovered)),

@@ -53,6 +53,7 @@ _LOTS = 1 << 24
 class StudentTrainer:
     """See `splatpilot.training.policies.trainer.Trainer`."""
 
+    evaluated = "samples"
     measures = f"""\
 Of samples, not of flights. The hypothesis of least predicted cost is chosen; `success` is the part
 in which it keeps the vehicle's radius clear and stays within {_CLOSE} m, root mean square, of a

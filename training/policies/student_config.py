@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.training.policies.observation import validate_color_noise
+from splatpilot.training.policies.observation import validate_training_noise
 from splatpilot.training.policies.student_images import Appearance
 from splatpilot.training.policies.student_network import IMAGE_MODULES
 from splatpilot.training.policies.trainer import Schedule
@@ -136,8 +136,15 @@ class StudentTraining:
                 f"frozen is {self.frozen}, but what was not trained yet cannot stay as it is; set "
                 "pretrained=true or frozen=0"
             )
-        validate_color_noise(self.noise, "noise")
+        sees_depth = self.observation == "depth"
+        validate_training_noise(
+            self.noise, "noise", of_depth=sees_depth, of_colors=not sees_depth, of_time=False
+        )
         self.appearance.validate("appearance")
+        if sees_depth and self.appearance != Appearance(0.0, 0.0):
+            raise ValueError(
+                f"appearance must be left out, got {self.appearance}: depth has no appearance"
+            )
 
 
 @dataclass

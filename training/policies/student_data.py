@@ -1,9 +1,10 @@
 """What the student learns from: samples of several corpora, and the distances in their worlds."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
+from math import ceil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,13 +15,16 @@ from torch import Tensor
 from splatpilot.diagrams.worlds.scene import SceneSource
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
-from splatpilot.training.corpus.corpus import Corpus, distinct_shards
+from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.sample import RECOVERY
 from splatpilot.training.policies.ray_casting import EsdfGeometry
 from splatpilot.training.world_kinds import require_untested
 
 _PARTS = 1 << 20
 """[-] That a chance is counted in."""
+
+_DIGESTS = 1 << 64
+"""Number of digests that a name may have."""
 
 
 class Labels(NamedTuple):
@@ -38,13 +42,13 @@ class StudentData:
 
     Args:
         corpora: may share worlds, and shards, which count once.
-        held_out: part of the worlds whose samples are not trained with. Which they are their names
-            decide, so that samples gathered in them later stay on the same side.
+        held_out: part of the worlds whose samples are not trained with, see `is_held_out`.
         device: where labels live; images stay on disk.
         worlds: how many of the others are trained in, all if 0. More of them are the same and more.
 
     Raises:
-        ValueError: if the corpora's samples differ in kind, or too few worlds are left to train in.
+        ValueError: if the corpora's samples differ in kind, two of their worlds have one name and
+            differ, or too few worlds are left to train in.
     """
 
     def __init__(
@@ -65,12 +69,12 @@ class StudentData:
                     f"the corpora's experts flew at {self.speed} and {config.expert.speed} m/s; a "
                     "student has one nominal speed: gather them at the same"
                 )
-        records = {world.name: world for corpus in reversed(corpora) for world in corpus.worlds}
+        records = distinct_worlds(corpora)
         for record in records.values():
             if isinstance(record.source.world, SceneSource):
                 require_untested(record.source.source_digest, str(record.path))
-        self.held_out_worlds = held_out_names(list(records), held_out)
-        others = _ranked(records.keys() - set(self.held_out_worlds))
+        self.held_out_worlds = sorted(name for name in records if is_held_out(name, held_out))
+        others = sorted(records.keys() - set(self.held_out_worlds), key=_digest)
         if worlds > len(others):
             raise ValueError(
                 f"worlds is {worlds}, but of the corpora's {len(records)} worlds {len(others)} are "
@@ -95,10 +99,12 @@ class StudentData:
         """Numbers of those to train with that a student came to."""
         self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
+            least = ceil(100 * min(map(_digest, records)) / _DIGESTS) / 100
             raise ValueError(
                 f"of {len(self.worlds)} worlds {len(self.held_out_worlds)} are held out, which "
                 f"leaves {len(self.training)} samples to train with and {len(self.held_out)} to "
-                "validate with; gather in more worlds, or change held_out"
+                "validate with; collect in more worlds, or change held_out: from "
+                f"{least} on it holds out one of these"
             )
 
         def joined(name: str) -> Tensor:
@@ -172,14 +178,18 @@ class StudentData:
         return EsdfGeometry([_trusted(self._records[name].esdf()) for name in self.worlds])
 
 
-def held_out_names(names: Sequence[str], share: float) -> list[str]:
-    """At least one of the names, about `share` of them: those of the least digests."""
-    return sorted(_ranked(names)[: max(1, round(share * len(names)))])
+def is_held_out(name: str, share: float) -> bool:
+    """Tells whether a world validates; about `share` of all worlds do.
+
+    Its name alone decides, so that it stays on its side when a corpus grows or another is added,
+    and those of a smaller share are among those of a larger one.
+    """
+    return _digest(name) < share * _DIGESTS
 
 
-def _ranked(names: Iterable[str]) -> list[str]:
-    """In an order that depends on nothing but themselves."""
-    return sorted(names, key=lambda name: blake2b(name.encode()).digest())
+def _digest(name: str) -> int:
+    """Returns a number below `_DIGESTS` that depends on nothing but the name."""
+    return int.from_bytes(blake2b(name.encode()).digest()[:8])
 
 
 def _trusted(esdf: Esdf) -> Esdf:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.files import require_writable_folder, written_atomically
+from splatpilot.systems.progress import Progress, say
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.corpus.shard import Shard
 from splatpilot.training.policies.student_data import StudentData
@@ -77,11 +77,10 @@ class FrozenFeatures:
         what = blake2b(b"".join([settings, *(values.tobytes() for values in weights)]))
         self._files: list[np.ndarray] = []
         for number, shard in enumerate(
-            tqdm(
+            Progress(
                 data.shards,
-                desc=f"features of {frozen}{' in a mirror' if mirrored else ''}",
+                desc=f"encoding {'flipped ' * mirrored}images by {frozen} frozen modules",
                 unit="shard",
-                disable=None,
             )
         ):
             outside = shard.world in data.held_out_worlds
@@ -142,7 +141,7 @@ def _opened(file: Path) -> np.ndarray | None:
     except FileNotFoundError:
         return None
     except (ValueError, EOFError) as error:
-        tqdm.write(f"{file} is damaged ({reason_of(error)}): it is made anew")
+        say(f"{file} is damaged ({reason_of(error)}): it is made anew")
         file.unlink()
         return None
 

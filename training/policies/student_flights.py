@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
@@ -20,6 +19,7 @@ from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
 from splatpilot.systems.policies.student import StudentConfig
 from splatpilot.systems.processes import map_processes
+from splatpilot.systems.progress import Progress, resumable, say
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.recovery import StudentFlight
@@ -69,9 +69,12 @@ def fly_worlds(
     ]
     missing = [piece for piece in work if not _is_whole(piece[2])]
     fly_world = partial(_fly_world, pilot, corpus.config)
-    with tqdm(
-        total=len(work), initial=len(work) - len(missing), desc="flights", unit="world"
-    ) as bar:
+    bar = Progress(total=len(work), initial=len(work) - len(missing), desc="flying", unit="world")
+
+    def kept() -> str:
+        return f"flights in {bar.n} of {len(work)} worlds are in {folder}; the same command resumes"
+
+    with bar, resumable(kept):
         for _ in map_processes(fly_world, missing, min(jobs, max(len(missing), 1))):
             bar.update()
     flown, outcomes = [], Counter()
@@ -91,7 +94,7 @@ def _is_whole(file: Path) -> bool:
     try:
         read_archive(file)
     except ValueError as error:
-        tqdm.write(f"{error}: it is flown again")
+        say(f"{error}: it is flown again")
         file.unlink()
         return False
     return True

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.output_folders import held_folder
+from splatpilot.systems.progress import CheckpointClock, Progress, resumable, say
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.training.device import keep_freed_memory, require_device
 from splatpilot.training.event_log import event_log
@@ -22,7 +22,7 @@ from splatpilot.training.tensor_files import load_tensors, save_tensors
 
 
 @dataclass
-class _Progress:
+class _Position:
     """Where a run is, as its checkpoint holds it."""
 
     update: int = 0
@@ -86,10 +86,19 @@ def _run[Config: TrainingConfig](
         processes.wait()  # until what all of them read is written
     folder = RunFolder.claim(out, config)
     schedule = config.schedule
-    started = time.process_time()
+    checkpoint = out / "checkpoint.pt"
+    started, kept_update = time.process_time(), 0
+
+    def kept() -> str:
+        if not checkpoint.exists():
+            return f"no update is in {out} yet; the same command starts again"
+        update = f"update {kept_update} of {schedule.updates}" if kept_update else "the checkpoint"
+        return f"{update} is in {out}; the same command resumes there"
+
     torch.manual_seed(config.seed)
     try:
-        trainer = make(config)
+        with resumable(kept):
+            trainer = make(config)
     except (ValueError, OSError):  # of what it names, which can be put right in the same folder
         folder.give_up()
         raise
@@ -100,35 +109,38 @@ def _run[Config: TrainingConfig](
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
     )
-    progress = _Progress()
-    checkpoint = out / "checkpoint.pt"
+    progress = _Position()
     if checkpoint.exists():
         progress = _resume(checkpoint, trainer, optimizer)
+        kept_update = progress.update
         if processes.first:
+            say(f"resuming {out} at update {progress.update} of {schedule.updates}")
             folder.write_curves(progress.curves)  # which a kill may have left a row behind
     spent_before = progress.cpu_seconds
 
     def save() -> None:
+        nonlocal kept_update
         progress.cpu_seconds = spent_before + time.process_time() - started
-        save_tensors(
-            {
-                "progress": vars(progress),
-                "network": network.state_dict(),
-                "optimizer": optimizer.state_dict(),
-                "trainer": trainer.state_dict(),
-                "learns_from": _learns_from(trainer),
-            },
-            checkpoint,
-        )
-        folder.write_curves(progress.curves)
+        state = {
+            "progress": vars(progress),
+            "network": network.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "trainer": trainer.state_dict(),
+            "learns_from": _learns_from(trainer),
+        }
+        with clock.writing():
+            save_tensors(state, checkpoint)
+            folder.write_curves(progress.curves)
+        kept_update = progress.update
 
-    bar = tqdm(
+    clock = CheckpointClock()
+    bar = Progress(
         total=schedule.updates, initial=progress.update, unit="update",
-        disable=None if processes.first else True,
-        desc=f"{trainer.policy}, seed {config.seed}", position=bar_line,
+        disable=not processes.first,
+        desc=f"training {trainer.policy}, seed {config.seed}", position=bar_line,
     )  # fmt: skip
     logs = schedule.tensorboard and processes.first
-    with event_log(str(out) if logs else "") as log, bar:
+    with event_log(str(out) if logs else "") as log, resumable(kept), bar:
         while progress.update < schedule.updates:
             for group in optimizer.param_groups:
                 group["lr"] = schedule.learning_rate * schedule.factor(progress.update)
@@ -136,9 +148,9 @@ def _run[Config: TrainingConfig](
             try:
                 terms = step_optimizer(trainer.losses, network, optimizer, schedule.clip, processes)
             except NotFiniteError as error:
-                kept = f"the best weights so far are kept in {out}; " if progress.best else ""
+                best = f"the best weights so far are kept in {out}; " if progress.best else ""
                 raise ValueError(
-                    f"training stopped at update {progress.update}: {error}; {kept}lower "
+                    f"training stopped at update {progress.update}: {error}; {best}lower "
                     "schedule.learning_rate"
                 ) from None
             progress.update += 1
@@ -146,7 +158,7 @@ def _run[Config: TrainingConfig](
             means = progress.means
             for name, value in terms.items():
                 means[name] = value if name not in means else 0.98 * means[name] + 0.02 * value
-            bar.set_postfix(_shown(progress), refresh=False)
+            bar.set_postfix_str(_shown(progress, trainer), refresh=False)
             keep, measure = schedule.due(progress.update)
             if processes.first and (keep or measure):
                 measured = trainer.evaluate() if measure else {}
@@ -156,6 +168,8 @@ def _run[Config: TrainingConfig](
                 if measure and measured["success"] >= progress.best.get("success", -1.0):
                     progress.best = {"update": progress.update, **measured}
                     folder.write_weights(trainer.policy, trainer.spec, network, progress.best)
+                save()
+            elif processes.first and clock.is_due:
                 save()
     progress.best = processes.of_first(progress.best)
     summary = {
@@ -169,20 +183,25 @@ def _run[Config: TrainingConfig](
         return summary
     folder.write_summary(summary, getattr(trainer, "measures", FLIGHTS))
     print(
-        f"{trainer.policy}: success {progress.best['success']:.0%} on held-out worlds after "
-        f"{progress.best['update']} of {progress.update} updates, "
+        f"{trainer.policy}: success in {progress.best['success']:.0%} of {_evaluated(trainer)} "
+        f"after {progress.best['update']} of {progress.update} updates, "
         f"{progress.cpu_seconds / 60.0:.1f} CPU minutes; weights in {out / trainer.policy}.npz"
     )
     return summary
 
 
-def _shown(progress: _Progress) -> dict[str, str]:
-    """What the progress bar says: the loss, and the success measured last and best."""
-    shown = {"loss": f"{progress.means['loss']:.3f}"}
-    measured = (row["success"] for row in reversed(progress.curves) if "success" in row)
+def _shown(progress: _Position, trainer: Trainer) -> str:
+    """Formats the loss, and the success measured last and best."""
+    shown = f"loss {progress.means['loss']:.3g}"
     if progress.best:
-        shown |= {"success": f"{next(measured):.0%}", "best": f"{progress.best['success']:.0%}"}
+        last = next(row["success"] for row in reversed(progress.curves) if "success" in row)
+        best = progress.best["success"]
+        shown += f", success {last:.0%} of {_evaluated(trainer)}, best {best:.0%}"
     return shown
+
+
+def _evaluated(trainer: Trainer) -> str:
+    return f"held-out {getattr(trainer, 'evaluated', 'flights')}"
 
 
 def step_optimizer(
@@ -215,14 +234,14 @@ def step_optimizer(
     return {name: float(term) for name, term in terms.items()}
 
 
-def _resume(path: Path, trainer: Trainer, optimizer: torch.optim.Optimizer) -> _Progress:
+def _resume(path: Path, trainer: Trainer, optimizer: torch.optim.Optimizer) -> _Position:
     try:
         saved = load_tensors(path)
         learns_from = saved["learns_from"]
         trainer.network.load_state_dict(saved["network"])
         optimizer.load_state_dict(saved["optimizer"])
         trainer.load_state_dict(saved["trainer"])
-        progress = _Progress(**saved["progress"])
+        progress = _Position(**saved["progress"])
     except Exception as error:
         raise ValueError(
             f"{path} is no checkpoint to go on from ({type(error).__name__}: {reason_of(error)}); "

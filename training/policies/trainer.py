@@ -74,7 +74,8 @@ the success in worlds of its kind."""
 
 class Trainer(Protocol):
     """What trains one policy, whatever it learns from. It may have `measures`, a text for the model
-    card on what `evaluate` measures, see `FLIGHTS`; and `take_part(rank, count)`, after which
+    card on what `evaluate` measures, see `FLIGHTS`, and `evaluated`, of what `success` is a part:
+    "flights" if it has none; and `take_part(rank, count)`, after which
     `losses` are of one of `count` equal parts of every batch, so that processes learn together; and
     `learns_from`, a text that tells the content of the files that it reads from all others, without
     which an interrupted run would go on with files that have changed."""

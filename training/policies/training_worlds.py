@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import torch
 
-from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world, place_config
+from splatpilot.diagrams.worlds.make_world import make_world, place_config
 from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.world_batch import TrainingWorld, WorldBatch
+from splatpilot.training.policies.world_cache import WorldCache
 from splatpilot.training.world_kinds import (
     PROCEDURAL,
     ROUNDABOUT,
@@ -43,7 +45,7 @@ class WorldSelection:
     count: int = 180
     # [-] Held-out worlds that choose among checkpoints.
     held_out: int = 72
-    # [m] Of the grids of the time of arrival.
+    # [m] Of the grids of the time of arrival, which are kept in the user's cache, up to 1 GiB.
     voxel_size: float = 0.25
 
     def validate(self) -> None:
@@ -67,11 +69,10 @@ class WorldSelection:
         return [*self.kinds, *self.scenes]
 
 
-def make_training_world(kind: str, seed: int) -> TrainingWorld:
-    """The world of a scenario and seed as the benchmark flies it, without what cameras see."""
-    plan = make_blueprint(world_of(kind), seed)
-    shapes = [solid.shape for solid in plan.solids]
-    return TrainingWorld(shapes, plan.lower_W, plan.upper_W, plan.p_WS, plan.p_WG)
+def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
+    """Makes the world of a scenario and seed as the benchmark flies it, without what cameras
+    see."""
+    return TrainingWorld(*cache.blueprint(world_of(kind), seed))
 
 
 def training_worlds(
@@ -82,20 +83,26 @@ def training_worlds(
     Raises:
         ValueError: if the seed is not 0 to 999.
     """
-    worlds = _make_worlds(selection, selection.count, first_training_seed(seed))
+    first = first_training_seed(seed)
+    worlds = _make_worlds(selection, selection.count, first, "training worlds")
     return WorldBatch(worlds, selection.voxel_size, device)
 
 
 def validation_worlds(selection: WorldSelection, device: torch.device | str = "cpu") -> WorldBatch:
     """The held-out worlds, the same for every run."""
-    return WorldBatch(_make_worlds(selection, selection.held_out, VALIDATION_SEEDS), None, device)
+    worlds = _make_worlds(selection, selection.held_out, VALIDATION_SEEDS, "held-out worlds")
+    return WorldBatch(worlds, None, device)
 
 
-def _make_worlds(selection: WorldSelection, count: int, first: int) -> list[TrainingWorld]:
-    turns, places = selection.turns, {scene: _Place.read(scene) for scene in selection.scenes}
+def _make_worlds(
+    selection: WorldSelection, count: int, first: int, what: str
+) -> list[TrainingWorld]:
+    places = {scene: _Place.read(scene) for scene in selection.scenes}
+    seeds = Progress(range(first, first + count), f"making {what}", unit="world")
+    cache = WorldCache()
     return [
-        places[turn].world(seed) if turn in places else make_training_world(turn, seed)
-        for seed, turn in zip(range(first, first + count), cycle(turns), strict=False)
+        places[turn].world(seed) if turn in places else make_training_world(turn, seed, cache)
+        for seed, turn in zip(seeds, cycle(selection.turns), strict=False)
     ]
 
 

@@ -9,11 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import HalfSpace, Shape
-from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.policies.ray_casting import (
     Geometry,
@@ -21,6 +20,7 @@ from splatpilot.training.policies.ray_casting import (
     MixedGeometry,
     ShapeGeometry,
 )
+from splatpilot.training.policies.world_cache import WorldCache
 
 STARTS = 256
 """Places that flights of training start from, in each world."""
@@ -71,7 +71,10 @@ class WorldBatch:
         self.geometry: Geometry = MixedGeometry(self._surfaces)
         self._times = None
         if voxel_size is not None:
-            grids = [_march(world, voxel_size, seed) for seed, world in enumerate(worlds)]
+            cache = WorldCache()
+            shown = Progress(worlds, "finding paths to the goals", unit="world")
+            grids = [_march(world, voxel_size, n, cache) for n, world in enumerate(shown)]
+            cache.prune()
             self.maps = [(grid.esdf, grid.toa) for grid in grids]
 
             def on_grids(values: list[np.ndarray]) -> Grids:
@@ -124,13 +127,10 @@ class _Arrival(NamedTuple):
     starts_W: np.ndarray  # (STARTS, 3) [m]
 
 
-def _march(world: TrainingWorld, voxel_size: float, seed: int) -> _Arrival:
+def _march(world: TrainingWorld, voxel_size: float, seed: int, cache: WorldCache) -> _Arrival:
     """The time of arrival at the goal of a world, and free places from which it can be reached."""
-    field = world.surfaces
-    if not isinstance(field, Esdf):
-        field = AnalyticDistanceField(field, world.lower_W, world.upper_W)
-    esdf = esdf_from_distance_field(field, voxel_size).conservative()
-    toa = time_of_arrival(esdf, world.p_WG)
+    volume = world.lower_W, world.upper_W
+    esdf, toa = cache.arrival(world.surfaces, *volume, world.p_WG, voxel_size)
     roomy = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
     cells = np.argwhere(roomy)
     if len(cells) == 0:

@@ -35,6 +35,13 @@ def _checkpoint_file(out: Path) -> Path:
     return work_folder(out) / "checkpoint.pt"
 
 
+def kept_work(out: Path) -> str:
+    """Tells what is kept of an unfinished scene folder `out`, and how to resume."""
+    if _checkpoint_file(out).exists():
+        return f"the last checkpoint is in {work_folder(out)}; the same command resumes from it"
+    return "nothing is kept yet; the same command starts again"
+
+
 class Checkpoint:
     """The one file in which an optimisation is kept while it runs, in a work folder beside `out`.
 

@@ -1,14 +1,13 @@
 """The Gaussians from which a reconstruction starts: from depth, from points, or at random."""
 
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from tqdm import tqdm
 
+from splatpilot.systems.progress import Progress, say
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
@@ -153,7 +152,7 @@ def gaussians_from_depth(
     # everywhere.
     contrast, max_cell, max_extent = detail.contrast, detail.max_cell, detail.max_extent
     some = range(0, len(frames), _SOME)
-    progress = tqdm(desc="Gaussians", unit="frame")
+    progress = Progress(desc="placing Gaussians", unit="frame")
     while True:
         # Some of the frames tell when it is far too many.
         parts = {k: gaussians_of(k, frames[k]) for k in some}
@@ -188,11 +187,10 @@ def gaussians_from_depth(
         areas = np.trace(covariances, axis1=1, axis2=2)
         covered = areas[kept].sum() / areas.sum()
         if covered < _ENOUGH:
-            tqdm.write(
+            say(
                 f"{len(kept)} Gaussians cover {covered:.0%} of the surfaces that the frames show, "
                 f"and leave holes in the rest; {len(p_WQ)} would cover them: set initial_gaussians "
-                "nearer to that, or use frames of a smaller part of the place",
-                file=sys.stderr,
+                "nearer to that, or use frames of a smaller part of the place"
             )
         p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
     quats, scales = principal_axes(covariances)

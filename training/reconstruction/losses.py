@@ -149,6 +149,13 @@ def depth_edge_weights(
 
 def photometric_loss_torch(rendered: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     """`photometric_loss` by torch alone, on any device and dtype, unchecked."""
+    l1 = (rendered - target).abs().mean()
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(rendered, target).mean())
+
+
+def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
+    """Computes the structural similarity (N, C, H, W) about each pixel of N images (..., H, W, C),
+    with the window of `photometric_loss`."""
     height, width, channels = rendered.shape[-3:]
     x, y = (t.reshape(-1, height, width, channels).movedim(-1, 1) for t in (rendered, target))
     offset = torch.arange(WINDOW, dtype=x.dtype, device=x.device) - WINDOW // 2
@@ -161,10 +168,9 @@ def photometric_loss_torch(rendered: Tensor, target: Tensor, ssim_weight: float)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = maps.chunk(5, dim=1)
     variances = mean_xx + mean_yy - mean_x**2 - mean_y**2
     covariance = mean_xy - mean_x * mean_y
-    ssim = ((2 * mean_x * mean_y + C1) * (2 * covariance + C2)) / (
+    return ((2 * mean_x * mean_y + C1) * (2 * covariance + C2)) / (
         (mean_x**2 + mean_y**2 + C1) * (variances + C2)
     )
-    return (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - ssim.mean())
 
 
 def log_depth_loss_torch(

@@ -8,7 +8,7 @@ from pickle import UnpicklingError
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d
+from torch.nn.functional import adaptive_avg_pool2d, conv2d
 
 from splatpilot.training.reconstruction.squeezenet import squeezenet_features
 
@@ -47,12 +47,14 @@ class Lpips:
         self._source = _find(weights)
         _load(self._source, torch.device("cpu"))
 
-    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+    def __call__(self, a: Tensor, b: Tensor, weights: Tensor | None = None) -> Tensor:
         """
         Returns the distance of two images, a scalar at least 0, differentiable in `a`.
 
         Args:
             a, b: (..., H, W, 3) float32, red, green, blue in [0, 1]; of several the mean is taken.
+            weights: (..., H, W) of the pixels; a cell of a layer has the mean weight of the pixels
+                that it stands for. Equal weights, as published, if None.
 
         Raises:
             ValueError: the shapes differ, are none of images, or smaller than 17 pixels.
@@ -67,10 +69,20 @@ class Lpips:
         with torch.no_grad():
             other_features = _features(layers, b)
         distances = [
-            conv2d((x - y).square(), w).mean()
+            _mean(conv2d((x - y).square(), w), weights)
             for x, y, w in zip(features, other_features, linear, strict=True)
         ]
         return torch.stack(distances).sum()
+
+
+def _mean(distances: Tensor, weights: Tensor | None) -> Tensor:
+    """Returns the mean of a layer's distances (N, 1, h, w), weighted by pixels (..., H, W)."""
+    if weights is None:
+        return distances.mean()
+    images = weights.reshape(-1, 1, *weights.shape[-2:])
+    height, width = distances.shape[-2:]
+    shares = adaptive_avg_pool2d(images, (height, width))
+    return (shares * distances).sum() / shares.sum()
 
 
 def _features(layers: nn.Sequential, images: Tensor) -> list[Tensor]:

@@ -12,7 +12,7 @@ from splatpilot.systems.splats.background import FAR, Background, put_behind
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.losses import photometric_loss
+from splatpilot.training.reconstruction.losses import ssim_map
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.splat_rendering import render
 from splatpilot.training.reconstruction.vignette import vignette
@@ -33,12 +33,13 @@ _SHOWN = {
 @dataclass(frozen=True)
 class ViewMeasures:
     """One view against the truth. Depth is not measured where the truth has none, and nothing in
-    pixels that are left out because they are invalid or no camera saw what they show."""
+    pixels that are left out because they are invalid or no camera saw what they show. A measure
+    without any pixel is None."""
 
-    psnr_db: float  # [dB], before the scene's own background
-    psnr_on_black_db: float  # [dB], before black, except where the truth is infinitely far
-    ssim: float
-    lpips: float | None  # LPIPS-squeeze; None without its weights
+    psnr_db: float | None  # [dB], before the scene's own background
+    psnr_on_black_db: float | None  # [dB], before black, except where the truth is infinitely far
+    ssim: float | None
+    lpips: float | None  # LPIPS-squeeze; None without its weights, too
     depth_mae_m: float | None  # [m]
     depth_relative: float | None  # mean of |error| / true depth
     floater_fraction: float | None  # of the pixels with true depth
@@ -49,40 +50,49 @@ class ViewMeasures:
 
 @dataclass(frozen=True)
 class HeldOutMeasures:
-    """The frames that were withheld from a reconstruction, against what it shows."""
+    """The held-out frames of a reconstruction, against what it shows."""
 
     views: tuple[ViewMeasures, ...]
 
     def means(self) -> dict[str, float]:
         """Returns the mean PSNR and, where there is depth, the mean depth error and share of
-        holes, by name."""
-        found = {name: mean_measure(self.views, name) for name in _SHOWN}
+        holes, by name; see `mean_measure`."""
+        found = {name: mean_measure(self.views, name)[0] for name in _SHOWN}
         return {name: value for name, value in found.items() if value is not None}
 
     def __str__(self) -> str:
         return ", ".join(_SHOWN[name].format(value) for name, value in self.means().items())
 
 
-def mean_measure(views: Iterable[ViewMeasures], name: str) -> float | None:
-    """Returns the mean of a measure over the views that have it; None if none has."""
+def mean_measure(views: Iterable[ViewMeasures], name: str) -> tuple[float | None, int]:
+    """Returns the mean of a measure over the views that have it, None if none has, and their
+    number."""
     known = [value for view in views if (value := getattr(view, name)) is not None]
-    return float(np.mean(known)) if known else None
+    return (float(np.mean(known)) if known else None), len(known)
 
 
-def psnr_db(image: NDArray, truth: NDArray) -> float:
-    """Returns -10 log10 of the mean squared difference of images in [0, 1]; infinite if equal."""
+def psnr_db(image: NDArray, truth: NDArray) -> float | None:
+    """Returns -10 log10 of the mean squared difference of images in [0, 1]; infinite if equal, None
+    if there are no pixels."""
+    if not np.size(truth):
+        return None
     with np.errstate(divide="ignore"):
         difference = np.asarray(image, np.float64) - truth
         return float(-10 * np.log10(np.mean(difference**2)))
 
 
-def ssim(image: NDArray, truth: NDArray) -> float:
+def ssim(image: NDArray, truth: NDArray, seen: NDArray[np.bool_] | None = None) -> float | None:
     """Returns the mean structural similarity of images (H, W, 3) in [0, 1], 1 if they are equal.
 
-    As in `photometric_loss`: a Gaussian window of 11 pixels, zeros outside the image.
+    As in `photometric_loss`: a Gaussian window of 11 pixels, zeros outside the image. The mean is
+    over the pixels `seen` (H, W), or all; windows about them reach over others as they are. None
+    if there are no pixels.
     """
+    if seen is not None and not seen.any():
+        return None
     a, b = (torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (image, truth))
-    return 1 - photometric_loss(a, b, ssim_weight=1.0).item()
+    values = ssim_map(a, b)[0].mean(0).numpy()
+    return float((values if seen is None else values[seen]).mean(dtype=np.float64))
 
 
 def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
@@ -148,15 +158,18 @@ def fit_exposure(
 
     The corners are darkened by the vignetting of the capture, and all pixels multiplied by the one
     number that brings those `seen` (H, W), or all, closest to the true image (least squares): how a
-    camera exposed a frame says nothing of the place, and for a frame that is withheld from the fit
-    nobody knows it.
+    camera exposed a frame says nothing about the scene, and for a held-out frame it is unknown.
     """
-    height, width = color.shape[:2]
-    image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
+    image = _darken_corners(color, vignetting)
     x, y = (image, truth) if seen is None else (image[seen], truth[seen])
     energy = float((x * x).sum())
     gain = float((x * y).sum()) / energy if energy > 0 else 1.0
     return np.clip(gain * image, 0, 1), gain
+
+
+def _darken_corners(color: NDArray, vignetting: float) -> NDArray:
+    height, width = color.shape[:2]
+    return np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
 
 
 def measure_view(
@@ -166,37 +179,43 @@ def measure_view(
     vignetting: float = 0.0,
     seen: NDArray[np.bool_] | None = None,
     lpips: Lpips | None = None,
+    *,
+    fit_gain: bool = True,
 ) -> ViewMeasures:
     """Compares a rendered view with what its camera saw.
-
-    Colours are compared as `fit_exposure` exposes them.
 
     Args:
         on_black: what was rendered, before black.
         background: of the scene.
         frame: the truth, of the same size.
         vignetting: of the capture, see `vignette`.
-        seen: (H, W), the pixels to measure, if they are valid, see `seen_pixels`; all if None. For
-            structure and perception, whose windows reach over others, these are as they should be.
+        seen: (H, W), the pixels to measure, if they are valid, see `seen_pixels`; all if None. SSIM
+            and LPIPS are means over these, although their windows reach over others.
         lpips: the perceptual distance; None leaves it out.
+        fit_gain: compares colors as `fit_exposure` exposes them; otherwise the gain is 1.
     """
+
+    def expose(color: NDArray) -> tuple[NDArray, float]:
+        if fit_gain:
+            return fit_exposure(color, truth, vignetting, seen)
+        return _darken_corners(color, vignetting).clip(max=1), 1.0
+
     truth, far = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
     true_depth = np.where(seen, frame.depth, 0)
     view = put_behind(on_black, background, frame.K, frame.X_WC)
     before_black = np.where(far[..., None], view.color, on_black.color)
-    exposed, gain = fit_exposure(view.color, truth, vignetting, seen)
-    exposed_before_black, _ = fit_exposure(before_black, truth, vignetting, seen)
-    whole = np.where(seen[..., None], exposed, truth)
+    exposed, gain = expose(view.color)
+    exposed_before_black, _ = expose(before_black)
     distance = None
-    if lpips is not None:
+    if lpips is not None and seen.any():
         with torch.no_grad():
-            a, b = (torch.from_numpy(x.astype(np.float32)) for x in (whole, truth))
-            distance = lpips(a, b).item()
+            tensors = (torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth, seen))
+            distance = lpips(*tensors).item()
     return ViewMeasures(
         psnr_db=psnr_db(exposed[seen], truth[seen]),
         psnr_on_black_db=psnr_db(exposed_before_black[seen], truth[seen]),
-        ssim=ssim(whole, truth),
+        ssim=ssim(exposed, truth, seen),
         lpips=distance,
         depth_mae_m=depth_mae_m(view.depth, true_depth),
         depth_relative=depth_relative(view.depth, true_depth),

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from splatpilot.systems.progress import CheckpointClock, Progress, resumable
 from splatpilot.systems.splats.background import FAR, Background
 from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
@@ -94,25 +94,33 @@ class Optimization:
             OSError: if a checkpoint cannot be written.
         """
         config, splats = self._config, self.splats
-        progress = tqdm(
-            total=config.iterations,
-            initial=self.step,
-            desc="optimising",
-            unit="step",
-            mininterval=1,
+        clock, kept_step = CheckpointClock(), self.step
+
+        def kept() -> str:
+            if not kept_step:
+                return "no step is kept yet; the same command starts again"
+            folder = self._checkpoint.folder
+            return (
+                f"step {kept_step} of {config.iterations} is in {folder}; the same command resumes"
+            )
+
+        progress = Progress(
+            total=config.iterations, initial=self.step, desc="optimizing", unit="step"
         )
-        with progress, event_log(config.tensorboard) as log:
+        with progress, event_log(config.tensorboard) as log, resumable(kept):
             while self.step < config.iterations:
                 self.take_step()
                 progress.update()
                 if self.step % config.measure_every == 0:
                     found = self.measure()
                     log(self.step, {"gaussians": len(splats), **(found.means() if found else {})})
-                    progress.set_postfix_str(
-                        f"{len(splats)} Gaussians" + (f", {found}" if found else "")
-                    )
-                if self.step % config.checkpoint_every == 0 or self.step == config.iterations:
-                    self._save()
+                    told = f"{len(splats)} Gaussians" + (f", held-out {found}" if found else "")
+                    progress.set_postfix_str(told, refresh=False)
+                every = self.step % config.checkpoint_every == 0
+                if every or self.step == config.iterations or clock.is_due:
+                    with clock.writing():
+                        self._save()
+                    kept_step = self.step
 
     def take_step(self) -> None:
         """Fits one image a little better.

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from tqdm import tqdm
 
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.splats.background import FAR
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.lens import back_project
@@ -98,7 +98,7 @@ def find_new_pixels(
     overlapping = [_overlapping(view, views) for view in views]
 
     fine = []  # pixels that are nearly the finest
-    for i, view in enumerate(tqdm(views, "comparing", unit="frame")):
+    for i, view in enumerate(Progress(views, "comparing frames", unit="frame")):
         p_WQ, pixel = points[i]
         finest = np.full(view.depth.size, np.inf, dtype=np.float32)
         for j in overlapping[i]:
@@ -111,7 +111,7 @@ def find_new_pixels(
     far = [float(np.median(size)) if len(size) else np.inf for size in sizes]
     order = sorted(range(len(views)), key=lambda i: (i in last, far[i]))
     new: dict[int, NDArray[np.bool_]] = {}
-    for i in tqdm(order, "choosing", unit="frame"):
+    for i in Progress(order, "choosing frames", unit="frame"):
         view = views[i]
         p_WQ, pixel = points[i]
         covered = np.zeros(view.depth.size, dtype=bool)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
@@ -15,6 +14,7 @@ from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
@@ -124,7 +124,7 @@ def reconstruct(
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
     digests: set[str] = set()
     frames = ShrunkFrames(_digested(capture, digests), fitted, factor)
-    thinned = [ThinnedFrame.of(f) for f in tqdm(frames, "comparing brightness", unit="frame")]
+    thinned = [ThinnedFrame.of(f) for f in Progress(frames, "comparing brightness", unit="frame")]
     source, split = _source_and_split(capture, digests, config.split)
     photometry = estimate_photometry(thinned, config.seed)
     without_depth = _without_depth(capture, fitted, thinned)

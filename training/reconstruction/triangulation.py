@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from splatpilot.systems.processes import run_apart
+from splatpilot.systems.progress import Progress, say
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.colmap import import_pycolmap
 
@@ -37,7 +37,7 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
         for part in (images, images.parent / "masks"):
             part.mkdir()
         names = [f"{k:06d}.png" for k in range(len(numbers))]
-        for name, i in zip(tqdm(names, "copying", unit="frame"), numbers, strict=True):
+        for name, i in zip(Progress(names, "copying frames", unit="frame"), numbers, strict=True):
             image = capture.load_image(i)
             if not cv2.imwrite(str(images / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
                 raise OSError(f"{images / name}: cannot be written; is the disk full?")
@@ -49,6 +49,7 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
             name: capture.X_WCs[i].inverse().GetAsMatrix34()
             for name, i in zip(names, numbers, strict=True)
         }
+        say(f"triangulating points between {len(names)} images")
         work = Path(folder), capture.K, poses
         p_WQ, colors = run_apart(f"{folder}: triangulation", _triangulated, work)
     if len(p_WQ) < 100:

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from torch import Tensor
-from tqdm import tqdm
 
+from splatpilot.systems.progress import Progress
 from splatpilot.systems.splats.background import FAR
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.captures.shrink_frame import shrink
@@ -64,7 +64,7 @@ class ReconstructionViews:
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
         images, depths, edges, valid, viewmats = [], [], [], [], []
-        for frame in tqdm(frames, "loading", len(frames), unit="frame"):
+        for frame in Progress(frames, "loading frames", len(frames), unit="frame"):
             images.append(torch.from_numpy(frame.image))
             depths.append(torch.from_numpy(frame.depth))
             edges.append(depth_edge_weights(depths[-1]).half())

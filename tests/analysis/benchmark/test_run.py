@@ -208,7 +208,7 @@ def test_bad_command_is_one_message(study, arguments, message, capsys):
     words = [word.format(out=out, scenario=config.scenarios[0]) for word in arguments]
     assert main(words) == 1
     error = capsys.readouterr().err
-    assert error.startswith("splatpilot: ")
+    assert error.splitlines()[-1].startswith("splatpilot: ")
     assert message in error
 
 

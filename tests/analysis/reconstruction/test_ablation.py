@@ -1,5 +1,6 @@
 import csv
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -23,16 +24,20 @@ def ablate(place, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
 
 
 def test_ablation_end_to_end(place, capsys, monkeypatch):
-    """Four arms are made and measured on held-out frames, the paper's table stands beside ours, and
-    a second run makes nothing again."""
+    """Eight arms are made and measured on held-out frames, the paper's table is beside ours, and a
+    second run makes nothing again."""
     assert ablate(place) == 0
     printed = capsys.readouterr().out
-    assert "paper    3DGS + depth (ours)  28.89      0.8676  0.184" in printed
+    assert "paper    3DGS + depth term" in printed
     table = (place.folder / "out" / "ablation.md").read_text()
-    assert "| paper | Vanilla 2DGS | 29.07 | 0.8656 | 0.228 | 1.466 | 13.00% |" in table
+    paper = "| paper | 2DGS from points, photometric | 29.07 | 0.8656 | 0.228 | 1.466 | 13.00% |"
+    assert paper in table
     with open(place.folder / "out" / "ablation.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["arm"] for row in rows] == [arm.key for arm in ARMS] * 2
+    assert [row["arm"] for row in rows[:8]] == [arm.key for arm in ARMS]
+    assert {row["arm"] for row in rows[8:]} == {
+        *("3dgs_points", "3dgs_depth_term", "2dgs_points", "2dgs_depth_term")
+    }
     for arm, row in zip(ARMS, rows, strict=False):
         metadata = read_scene_metadata(place.folder / "out" / "room" / arm.key)
         assert metadata.representation == arm.representation
@@ -50,7 +55,7 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
     assert titles in printed
     assert capsys.readouterr().out == printed.replace(titles, "")
     # An arm that is missing would be made.
-    (place.folder / "out" / "room" / "2dgs" / "reconstruct.yaml").unlink()
+    (place.folder / "out" / "room" / "2dgs_points" / "reconstruct.yaml").unlink()
     assert ablate(place) == 70
     assert "a mistake of the program (AssertionError)" in capsys.readouterr().err
 
@@ -79,26 +84,28 @@ def test_studies_are_not_mixed(place, monkeypatch, capsys):
     assert len(made) == 2 * len(ARMS)
 
 
-def test_photometric_arms_see_no_depth():
-    """Only the arms with depth start from it and have a depth term; all share steps and sizes."""
+def test_each_arm_adds_what_its_name_says():
     config = ReconstructConfig(iterations=123)
-    for arm in ARMS:
-        settings = arm_config(arm, config)
-        assert settings.representation == arm.representation
-        assert (settings.iterations, settings.hold_out) == (123, config.hold_out)
-        assert (settings.depth_weight > 0) == (settings.surface_weight > 0) == arm.depth
-        assert (settings.outline_weight > 0) == arm.depth
-        assert settings.initialization == ("depth" if arm.depth else "points")
-        changed = {k for k, v in asdict(config).items() if asdict(settings)[k] != v}
-        assert changed <= {
-            "representation",
-            "initialization",
-            "depth_weight",
-            "surface_weight",
-            "outline_weight",
-            "strategy",
-            "distance_field",
-        }
+    for representation in ("3dgs", "2dgs"):
+        arms = [arm_config(arm, config) for arm in ARMS if arm.representation == representation]
+        differences = [
+            {name for name, value in asdict(a).items() if asdict(b)[name] != value}
+            for a, b in pairwise(arms)
+        ]
+        assert differences == [
+            {"initialization", "strategy"},
+            {"surface_weight", "outline_weight"},
+            {"depth_weight"},
+        ]
+        assert (arms[0].initialization, arms[0].depth_weight) == ("points", 0.0)
+        assert asdict(arms[-1]) == asdict(
+            replace(
+                config,
+                representation=representation,
+                initialization="depth",
+                distance_field="captured",
+            )
+        )
 
 
 def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
@@ -114,30 +121,34 @@ def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
         unseen_fraction=0.0,
         gain=1.0,
     )
-    return SceneMeasures(True, 8, 8, {0: view}, "none")
+    return SceneMeasures(True, 8, 8, {0: view}, {0: view}, "none")
 
 
 def test_means_and_spreads():
     """Over several captures come means with the sample standard deviation, and what depth did."""
     one = {arm.key: measures(30, 1.0, 0.1) for arm in ARMS}
-    one["3dgs_depth"] = measures(29.75, 0.1, 0.005)
+    one["3dgs_depth_term"] = measures(29.75, 0.1, 0.005)
     two = {arm.key: measures(34, 3.0, 0.3) for arm in ARMS}
     result = AblationResult({"one": one, "two": two})
     rows = {(row[0], row[1]): row[2:] for row in result.table()}
-    assert rows["mean ± spread", "Vanilla 3DGS"][0] == "32.00 ± 2.83"
-    assert rows["mean ± spread", "Vanilla 3DGS"][2] == "-"
-    assert rows["one", "3DGS + depth (ours)"] == [
+    photometric = "3DGS from points, photometric"
+    assert rows["mean ± spread", photometric][0] == "32.00 ± 2.83"
+    assert rows["mean ± spread", photometric][2] == "-"
+    assert rows["one", "3DGS + depth term"] == [
         *("29.75", "0.9000", "-", "0.100", "0.50%", "0.05%", "28.75")
     ]
-    assert rows["paper", "Vanilla 3DGS"] == [
+    assert rows["paper", photometric] == [
         *("29.35", "0.8706", "0.215", "0.974", "11.50%"),
         "-",
         "-",
     ]
-    assert result.verdicts()[0] == (
-        "one, 3DGS: depth supervision divides the depth error by 10.0 and floaters by 20.0, "
-        "PSNR -0.25 dB"
-    )
+    assert result.verdicts()[:3] == [
+        "one, 3DGS from depth, photometric: depth error divided by 1.0, floaters by 1.0, "
+        "PSNR +0.00 dB",
+        "one, 3DGS + surface and outline losses: depth error divided by 1.0, floaters by 1.0, "
+        "PSNR +0.00 dB",
+        "one, 3DGS + depth term: depth error divided by 10.0, floaters by 20.0, PSNR -0.25 dB",
+    ]
 
 
 @pytest.mark.parametrize(

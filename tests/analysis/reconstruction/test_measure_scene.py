@@ -47,7 +47,7 @@ def test_a_curtain_is_a_floater(place):
     far = truth - to_curtain > 0.1 * np.maximum(1, truth)
     assert found.floater_fraction == pytest.approx(far.mean(), abs=0.05)
     assert far.mean() > 0.4
-    assert found.psnr_db < 20
+    assert found.psnr_db is not None and found.psnr_db < 20
 
 
 def test_metrics_file(place, capsys):
@@ -56,11 +56,15 @@ def test_metrics_file(place, capsys):
     assert main(["measure", str(scene)]) == 0
     printed = capsys.readouterr().out
     content = json.loads((scene / "metrics.json").read_text())
-    frames = content["frames"]
-    assert list(frames) == ["0", "8"]
+    frames, strict = content["frames"], content["strict_frames"]
+    assert list(frames) == list(strict) == ["0", "8"]
     for name in ("psnr_db", "ssim", "depth_mae_m", "floater_fraction"):
         assert content[name] == pytest.approx(np.mean([f[name] for f in frames.values()]))
-    assert f"PSNR [dB]              {content['psnr_db']:.2f}\n" in printed
+        assert content["strict"][name] == pytest.approx(np.mean([f[name] for f in strict.values()]))
+        assert content["counts"][name] == 2
+    assert content["counts"]["lpips"] == 0
+    row = f"PSNR [dB]              {content['psnr_db']:<26.2f} {content['strict']['psnr_db']:.2f}\n"
+    assert row in printed
     assert "measured on            2 held-out frames, 64 x 48\n" in printed
     measures = read_measures(scene)
     assert measures is not None and measures.as_json() == content

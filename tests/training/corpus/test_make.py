@@ -163,6 +163,40 @@ def test_numbers_below_one_are_refused(small, tmp_path, number):
         make.run(config=small, out=tmp_path, **{"worlds": 1, "jobs": 1} | {number: 0})
 
 
+def test_another_program_adds_no_worlds(small, gathered, tmp_path, monkeypatch):
+    out = shutil.copytree(gathered.folder, tmp_path / "corpus")
+    before = all_bytes(out)
+    monkeypatch.setattr(make, "revision", lambda: "another")
+    assert len(make.run(config=small, out=out, worlds=2, jobs=1)) == len(gathered)
+    depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
+    content = depth.read_bytes()
+    for wrong in (content, content[:-1]):
+        depth.write_bytes(wrong)
+        with pytest.raises(ValueError, match="one corpus is collected by one program; go back"):
+            make.run(config=small, out=out, worlds=2 + (wrong == content), jobs=1)
+    depth.write_bytes(content)
+    assert all_bytes(out) == before
+
+
+def test_a_kind_that_has_changed_is_not_added_to(small, gathered, tmp_path):
+    grove = tmp_path / "grove.yaml"
+    grove.write_text(Path(small.worlds.kinds[0]).read_text())
+    config = replace(small, worlds=replace(small.worlds, kinds=[str(grove)]))
+    make.run(config=config, out=tmp_path / "corpus", worlds=1, jobs=1)
+    grove.write_text("world: !ForestConfig {length: 11, width: 8, height: 4}\n")
+    with pytest.raises(ValueError, match="grove-1000000 is a world of another definition"):
+        make.run(config=config, out=tmp_path / "corpus", worlds=2, jobs=1)
+
+
+def test_what_an_interruption_left_of_a_world_is_not_used(small, gathered, tmp_path):
+    out = shutil.copytree(gathered.folder, tmp_path / "corpus")
+    other, world = (record.path.name for record in gathered.worlds)
+    shutil.rmtree(out / "shards" / gathered.shards[1].path.name)
+    shutil.copy(out / "worlds" / other / "esdf.npz", out / "worlds" / world / "esdf.npz")
+    make.run(config=small, out=out, worlds=2, jobs=1)
+    assert all_bytes(out) == all_bytes(gathered.folder)
+
+
 def test_another_corpus_is_not_added_to(small, gathered):
     """A folder keeps to the configuration that it was begun with."""
     folder = gathered.shards[0].path.parents[1]

@@ -4,13 +4,17 @@ import shutil
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
+from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.shapes import Box, Cylinder, HalfSpace
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.corpus.recovery import (
     StudentFlight,
     add_recovery,
     near_misses,
+    obstacle_clearances,
     rows_before,
     rows_to_recover,
 )
@@ -38,6 +42,21 @@ def clearances(*dips: tuple[float, float]) -> np.ndarray:
 def test_near_misses_are_the_least_clearances(dips, expected):
     """The times at which a flight came nearest, below the limit and a second apart."""
     np.testing.assert_allclose(near_misses(TIMES, clearances(*dips)), expected, atol=1e-9)
+
+
+def test_ground_and_ceiling_are_no_obstacles():
+    ground, ceiling = HalfSpace([0.0, 0.0, 1.0], 0.0), HalfSpace([0.0, 0.0, -1.0], -3.2)
+    wire = Cylinder([-9.0, 20.0, 1.0], [9.0, 20.0, 1.0], 0.02)
+    slit = [Box(RigidTransform([0.0, y, 1.6]), [8.0, 2.0, 3.2]) for y in (-1.6, 1.6)]
+    shapes = [ground, ceiling, wire, *slit]
+    field = AnalyticDistanceField(shapes, np.array([-9.0, -9.0, 0.0]), np.array([9.0, 29.0, 3.2]))
+    level = [[0.0, 10.0, 0.6], [0.0, 10.0, 2.7], [6.0, -8.0, 1.0]]
+    obstacles = [[0.0, 20.0, 1.7], [0.0, 20.6, 1.6], [0.0, 0.0, 1.6], [0.0, 3.3, 1.5]]
+    states = np.stack([hover_state(np.array(p)) for p in level + obstacles])
+    clear = field.distance(states[:, :3]) - VEHICLE_RADIUS
+    flight = StudentFlight("W", np.zeros(3), np.arange(7.0), states, clear)
+    expected = [np.inf, np.inf, np.inf, *clear[3:]]
+    np.testing.assert_array_equal(obstacle_clearances(flight, field), expected)
 
 
 def test_states_are_taken_before_them():
@@ -94,7 +113,8 @@ def test_what_the_expert_would_have_done_is_added(folder, gathered):
     keeps clear; those that were there stay."""
     record = gathered.worlds[1]
     flight = straight_flight(record)
-    events = near_misses(flight.times, flight.clearances)
+    field = record.make().distance_field
+    events = near_misses(flight.times, obstacle_clearances(flight, field))
     assert len(events) > 0
     corpus = add_recovery(folder, [flight], jobs=1)
     samples = corpus.samples(np.arange(len(corpus)))

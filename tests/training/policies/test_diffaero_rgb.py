@@ -31,7 +31,7 @@ from splatpilot.training.policies.train import run
 def training(corpus: Path, *overrides: str) -> DiffAeroRgbTraining:
     settings = [
         f"corpora=[{corpus}]",
-        "held_out=0.34",
+        "held_out=0.2",
         "batch=8",
         "schedule.updates=40",
         "schedule.validate_every=40",

@@ -17,7 +17,9 @@ from splatpilot.systems.sensing.time_of_flight import (
     sensor_of,
     time_of_flight_grid,
 )
+from splatpilot.training.policies.agile_autonomy import AgileAutonomyTraining
 from splatpilot.training.policies.diffaero import DiffAeroTraining
+from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTraining
 from splatpilot.training.policies.observation import (
     blurred,
     disturb_depth,
@@ -25,9 +27,8 @@ from splatpilot.training.policies.observation import (
     proximity_grid,
     tracking_acceleration,
     training_noise,
-    validate_color_noise,
-    validate_training_noise,
 )
+from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
 
 
 @pytest.mark.parametrize("noise", [training_noise(), ObservationNoise(1.0, 2.0, 0.3)])
@@ -92,14 +93,33 @@ def test_training_takes_up_velocities_as_flight_does():
     np.testing.assert_allclose(trained, flown, atol=1e-12)
 
 
-def test_noise_that_training_cannot_have_is_named():
-    """Noise of colours, which training does not see, and noise out of range are refused."""
-    with pytest.raises(ValueError, match=r"noise\.brightness_jitter is 0\.2, but training"):
-        validate_training_noise(ObservationNoise(brightness_jitter=0.2), "noise")
-    with pytest.raises(ValueError, match=r"rollout\.noise\.latency is 2; it must be"):
-        validate_training_noise(ObservationNoise(latency=2), "rollout.noise")
-    with pytest.raises(ValueError, match=r"noise\.latency is 0\.1, but training has images of the"):
-        validate_color_noise(ObservationNoise(latency=0.1), "noise")
+@pytest.mark.parametrize(
+    ("config", "noise", "field"),
+    [
+        (StudentRgbTraining, ObservationNoise(depth_dropout=0.5), "depth_dropout"),
+        (StudentRgbTraining, ObservationNoise(latency=0.1), "latency"),
+        (StudentRgbTraining, ObservationNoise(frame_rate=[5.0, 10.0]), "frame_rate"),
+        (StudentDepthTraining, ObservationNoise(color_noise=0.5), "color_noise"),
+        (StudentDepthTraining, ObservationNoise(blur=3.0), "blur"),
+        (DiffAeroRgbTraining, ObservationNoise(depth_additive=0.1), "depth_additive"),
+        (AgileAutonomyTraining, ObservationNoise(brightness_jitter=0.2), "brightness_jitter"),
+        (AgileAutonomyTraining, ObservationNoise(full_well=8000, read_noise=5), "full_well"),
+    ],
+)
+def test_noise_without_effect_is_refused(config, noise, field):
+    with pytest.raises(ValueError, match=rf"noise\.{field} must be left out, got "):
+        config(noise=noise).validate()
+
+
+def test_noise_out_of_range_is_refused():
+    config = load_config(DiffAeroTraining(), overrides=["rollout.noise.latency=2"])
+    with pytest.raises(ValueError, match=r"rollout\.noise\.latency is 2\.0; it must be"):
+        config.validate()
+
+
+def test_depth_has_no_appearance_to_change():
+    with pytest.raises(ValueError, match="appearance must be left out, got "):
+        load_config(StudentDepthTraining(), overrides=["appearance.hue=10"]).validate()
 
 
 def test_noise_that_does_not_exist_is_named():

@@ -141,7 +141,7 @@ def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
     lost = sorted((tmp_path / "out" / "corpora" / "0" / "shards").glob("expert-*"))[0]
     shutil.rmtree(lost)
     assert both_stages(source, tmp_path / "out") == ledger
-    assert lost.exists() and "flown again" in capsys.readouterr().out
+    assert lost.exists() and "flown again" in capsys.readouterr().err
     assert all(np.array_equal(expected[k], v) for k, v in weights(tmp_path / "out").items())
     about = source / "shards" / lost.name / "shard.json"
     about.write_text(about.read_text().replace('"revision": "', '"revision": "0'))

@@ -6,6 +6,7 @@ import pytest
 from tiny_trainer import TinyTrainer, TinyTraining
 
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.progress import CheckpointClock
 from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.train import run
 
@@ -20,6 +21,46 @@ class OtherReader(Reader):
     """Learns from something else."""
 
     learns_from = "another"
+
+
+class Interrupted(TinyTrainer):
+    """Is ended from outside in its sixth update, and tells with which it begins."""
+
+    first: int | None = None
+
+    def begin_update(self, update: int) -> None:
+        if Interrupted.first is None:
+            Interrupted.first = update
+        if update == 5:
+            raise KeyboardInterrupt
+
+
+def test_an_ended_run_says_what_it_kept_and_resumes_there(tmp_path, monkeypatch, capsys):
+    config = TinyTraining()
+    with pytest.raises(KeyboardInterrupt) as ended:
+        run(config=config, out=tmp_path / "at_updates", make=Interrupted)
+    kept = f"update 4 of 9 is in {tmp_path / 'at_updates'}; the same command resumes there"
+    assert ended.value.__notes__ == [kept]
+    monkeypatch.setattr(CheckpointClock, "is_due", True)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "by_time", make=Interrupted)
+    capsys.readouterr()
+    monkeypatch.setattr(Interrupted, "first", None)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "by_time", make=Interrupted)
+    assert Interrupted.first == 5
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == f"resuming {tmp_path / 'by_time'} at update 5 of 9"
+
+
+def test_a_run_that_kept_nothing_says_so(tmp_path):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as ended:
+        run(config=TinyTraining(), out=tmp_path, make=interrupted)
+    [note] = ended.value.__notes__
+    assert note == f"no update is in {tmp_path} yet; the same command starts again"
 
 
 def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
@@ -51,7 +92,7 @@ def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
 def test_a_mistake_in_what_a_run_names_leaves_its_folder_free(student_corpus, tmp_path):
     """Put right, the same command works in the same folder."""
     trainer = TRAINERS.find("student_depth")
-    tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.34"]
+    tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.2"]
     tiny_student += ["schedule.updates=1", "schedule.checkpoint_every=1", "validation_samples=2"]
     wrong = load_config(trainer.config(), overrides=["corpora=[nowhere]", *tiny_student])
     with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):

@@ -12,7 +12,11 @@ from splatpilot.diagrams.worlds.inserted import InsertedConfig
 from splatpilot.systems.configuration import dump_config
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.corpus import CONFIG, Corpus
-from splatpilot.training.policies.student_data import StudentData
+from splatpilot.training.corpus.library import world_source
+from splatpilot.training.policies.student_data import StudentData, is_held_out
+
+HELD_OUT = 0.2
+"""Share of which one of the three worlds is."""
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +31,7 @@ def two(student_corpus, tmp_path_factory) -> list[Corpus]:
 def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
     """A third of the worlds is held out with all samples of theirs; more samples of the same worlds
     change no world's side, and what both corpora have counts once."""
-    alone, joined = StudentData(two[1:], 0.34), StudentData(two[::-1], 0.34)
+    alone, joined = StudentData(two[1:], HELD_OUT), StudentData(two[::-1], HELD_OUT)
     assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
     for data, count in ((alone, 48), (joined, 72)):
         assert sorted([*data.training, *data.held_out]) == list(range(count))
@@ -39,21 +43,21 @@ def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
 def test_fewer_worlds_are_a_part_of_more(two):
     """One world to train in, beside the one held out: samples of no other are there, the held-out
     ones are the same, and a world more than there are is refused."""
-    whole, one = StudentData(two, 0.34), StudentData(two, 0.34, worlds=1)
+    whole, one = StudentData(two, HELD_OUT), StudentData(two, HELD_OUT, worlds=1)
     assert one.held_out_worlds == whole.held_out_worlds
     assert len(one.worlds) == 2 and set(one.worlds) < set(whole.worlds)
     trained_in = {one.worlds[w] for w in one.labels(one.training).world}
     assert trained_in == set(one.worlds) - set(one.held_out_worlds)
     np.testing.assert_array_equal(one.labels(one.held_out).X_WB, whole.labels(whole.held_out).X_WB)
-    both = StudentData(two, 0.34, worlds=2)
+    both = StudentData(two, HELD_OUT, worlds=2)
     assert both.worlds == whole.worlds and len(both.training) == len(whole.training)
     with pytest.raises(ValueError, match=r"worlds is 3, but .* 2 are left"):
-        StudentData(two, 0.34, worlds=3)
+        StudentData(two, HELD_OUT, worlds=3)
 
 
 def test_samples_keep_their_order_and_world(two):
     """Numbers from both corpora in any order give what each corpus says of them."""
-    data = StudentData(two[::-1], 0.34)
+    data = StudentData(two[::-1], HELD_OUT)
     numbers = np.array([60, 3, 47, 48, 5, 71])
     depth, color = data.pixels(numbers, "depth"), data.pixels(numbers, "color")
     labels = data.labels(numbers)
@@ -71,7 +75,7 @@ def test_samples_keep_their_order_and_world(two):
 def test_distances_along_trajectories_are_those_of_the_world(two):
     """At the waypoints of the experts, brought into the world by the sample's pose, the distance is
     the one of the recorded field, which counts unknown space as occupied."""
-    data = StudentData(two, 0.34)
+    data = StudentData(two, HELD_OUT)
     labels = data.labels(np.arange(0, 72, 5))
     found = data.distance_along(labels.trajectories_B, labels)
     fields = {world.name: world.esdf().conservative() for world in two[0].worlds}
@@ -87,7 +91,7 @@ def test_distances_along_trajectories_are_those_of_the_world(two):
 def test_distances_change_as_waypoints_do(two):
     """A millimetre along the gradient, and back, makes the difference that it says, in all but the
     few that cross from one voxel to the next."""
-    data = StudentData(two, 0.34)
+    data = StudentData(two, HELD_OUT)
     labels = data.labels(np.arange(0, 72, 5))
     waypoints = labels.trajectories_B.nan_to_num().requires_grad_()
     data.distance_along(waypoints, labels).sum().backward()
@@ -115,6 +119,27 @@ def test_corpora_of_test_scenes_are_refused(two, monkeypatch, digest, message):
         StudentData(two, 0.3)
 
 
+def test_a_world_keeps_its_side_when_a_corpus_grows():
+    library = CorpusConfig().worlds
+    names = [world_source(library, seed, k).name for seed in (0, 3) for k in range(400)]
+    sides = {name: is_held_out(name, 0.1) for name in names}
+    assert sides == {name: is_held_out(name, 0.1) for name in reversed(names)}
+    assert 0.07 < sum(sides.values()) / len(sides) < 0.13
+    more = {name for name in names if is_held_out(name, 0.2)}
+    assert {name for name, held_out in sides.items() if held_out} < more
+
+
+def test_different_worlds_of_one_name_are_refused(two, tmp_path):
+    other = tmp_path / "corpus"
+    shutil.copytree(two[0].folder, other)
+    assert StudentData([two[0], Corpus(other)], HELD_OUT).worlds == [w.name for w in two[0].worlds]
+    record = Corpus(other).worlds[1]
+    esdf = record.esdf()
+    replace(esdf, distances=esdf.distances + 0.5).save(record.path / "esdf.npz")
+    with pytest.raises(ValueError, match=r"pillars-1 and .*pillars-1 are different worlds of one"):
+        StudentData([two[0], Corpus(other)], HELD_OUT)
+
+
 def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
     """Another camera is named, and so are shares that leave no world to one side."""
     other = tmp_path / "corpus"
@@ -124,6 +149,8 @@ def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
     assert isinstance(wider, CorpusConfig)
     (other / CONFIG).write_text(dump_config(wider))
     with pytest.raises(ValueError, match="different cameras or numbers of trajectories"):
-        StudentData([two[0], Corpus(other)], 0.34)
+        StudentData([two[0], Corpus(other)], HELD_OUT)
+    with pytest.raises(ValueError, match=r"of 3 worlds 0 are held out, .* from 0\.17 on"):
+        StudentData(two[:1], 0.16)
     with pytest.raises(ValueError, match="of 3 worlds 3 are held out, which leaves 0 samples"):
         StudentData(two[:1], 1.0)

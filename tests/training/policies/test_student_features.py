@@ -19,7 +19,7 @@ FROZEN = 15
 
 @pytest.fixture(scope="module")
 def data(student_corpus) -> StudentData:
-    return StudentData([Corpus(student_corpus)], 0.34)
+    return StudentData([Corpus(student_corpus)], 0.2)
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,12 @@ NUMBERS = 4
 
 @pytest.fixture(scope="module")
 def data(student_corpus) -> StudentData:
-    return StudentData([Corpus(student_corpus)], 0.34)
+    return StudentData([Corpus(student_corpus)], 0.2)
 
 
 def training(corpus, *overrides: str) -> StudentRgbTraining:
-    overrides = (f"corpora=[{corpus}]", "pretrained=false", "noise.brightness_jitter=1", *overrides)
-    return load_config(TRAINERS.find("student_rgb").config(), overrides=list(overrides))
+    always = f"corpora=[{corpus}]", "held_out=0.2", "pretrained=false", "noise.brightness_jitter=1"
+    return load_config(TRAINERS.find("student_rgb").config(), overrides=[*always, *overrides])
 
 
 @pytest.mark.parametrize("frozen", [0, 3])

@@ -24,7 +24,7 @@ PROGRAM = "from splatpilot.analysis.cli import main; import sys; sys.exit(main(s
 def fields(corpus: Path, *overrides: str) -> list[str]:
     schedule = ("updates=3", "validate_every=3", "checkpoint_every=1", "learning_rate=1e-5")
     return [
-        *(f"corpora=[{corpus}]", "pretrained=false", "frozen=0", "held_out=0.34", "batch=6"),
+        *(f"corpora=[{corpus}]", "pretrained=false", "frozen=0", "held_out=0.2", "batch=6"),
         *(f"schedule.{value}" for value in schedule),
         *overrides,
     ]

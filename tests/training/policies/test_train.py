@@ -236,7 +236,7 @@ def test_training_seeds_are_not_the_benchmarks(monkeypatch):
     training, its other seeds and validation share none."""
     asked: list[int] = []
     monkeypatch.setattr(
-        training_worlds, "make_training_world", lambda kind, seed: asked.append(seed)
+        training_worlds, "make_training_world", lambda kind, seed, cache: asked.append(seed)
     )
     monkeypatch.setattr(training_worlds, "WorldBatch", lambda *_: None)
     selection = training_worlds.WorldSelection(count=1000, held_out=1000)

@@ -27,6 +27,7 @@ from splatpilot.training.policies.training_worlds import (
     training_worlds,
     validation_worlds,
 )
+from splatpilot.training.policies.world_cache import WorldCache
 
 UPPER = np.array([12.0, 7.0, 4.0])
 
@@ -69,7 +70,7 @@ def test_kinds_and_places_come_in_turn(yard):
     worlds = training_worlds(selection(yard, voxel_size=0.5), seed=3)
     held_out = validation_worlds(selection(yard))
     for batch, number, seed in ((worlds, 2, 1_003_002), (held_out, 0, 2_000_000)):
-        generated = make_training_world("P02", seed)
+        generated = make_training_world("P02", seed, WorldCache())
         np.testing.assert_allclose(batch.p_WS[number], generated.p_WS, rtol=1e-6)
         np.testing.assert_allclose(batch.p_WG[number], generated.p_WG, rtol=1e-6)
     np.testing.assert_allclose(worlds.upper_W[1::2], [UPPER] * 2, atol=1e-5)

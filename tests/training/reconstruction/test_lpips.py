@@ -100,6 +100,17 @@ def test_distance_is_that_of_the_definition(weights, weights_file):
     assert Lpips(weights_file)(a, b).item() == pytest.approx(expected, rel=1e-4)
 
 
+def test_pixels_without_weight_hardly_count(weights_file):
+    a, b = images(64, 96)
+    lpips = Lpips(weights_file)
+    left = torch.zeros(64, 96)
+    left[:, :48] = 1.0
+    differs_right = torch.cat([a[:, :64], b[:, 64:]], dim=1)
+    everywhere = lpips(a, b, torch.ones(64, 96))
+    assert everywhere.item() == pytest.approx(lpips(a, b).item(), rel=1e-6)
+    assert lpips(a, differs_right, left) < 0.2 * lpips(a, differs_right)
+
+
 def test_batches_are_averaged(weights_file):
     """Of several pairs of images it is the mean."""
     lpips = Lpips(weights_file)

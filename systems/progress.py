@@ -1,0 +1,152 @@
+"""Progress of long commands: bars in a terminal, a line a minute elsewhere."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
+from typing import Any
+
+from tqdm import tqdm
+
+_PERIOD = 60.0  # [s] between two lines that are not for a terminal
+_SHORT = 5.0  # [s] that work must have taken for a line at its end
+_COLUMNS, _ROWS = 80, 24  # of terminals that do not tell theirs
+_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"  # room for figures
+_KEEP_PERIOD = 30.0  # [s] between two checkpoints, unless writing one takes long
+_KEEP_SHARE = 0.02  # of the time, at most, that checkpoints take
+
+
+class Progress(tqdm):
+    """Shows how far work has come, on standard error: `tqdm` in a terminal; elsewhere a line when
+    the work begins, one a minute, and one at the end of what took long.
+
+    Args:
+        iterable: whose items are counted, or None to count by `update`.
+        desc: what is done, such as "rendering frames".
+        total: how many there are; the length of `iterable` if None.
+        initial: how many are done already.
+        unit: what is counted, in the singular.
+        delay: [s] before anything is shown.
+        keywords: of `tqdm`.
+    """
+
+    monitor_interval = 0  # no thread: Drake aborts where another thread frees what is its own
+
+    def __init__(
+        self,
+        iterable: Iterable[Any] | None = None,
+        desc: str = "",
+        total: float | None = None,
+        *,
+        initial: float = 0,
+        unit: str = "",
+        delay: float = 0.0,
+        **keywords: Any,
+    ) -> None:
+        self._lines = not sys.stderr.isatty()
+        self._said_at = -_PERIOD
+        self._begun_at = time.monotonic()
+        if self._lines:
+            keywords |= {"mininterval": 0.0, "leave": False}  # `display` has a clock of its own
+        elif total is not None or isinstance(iterable, Sized):
+            keywords = {"bar_format": _BAR} | keywords
+        columns, rows = _terminal_size()
+        super().__init__(
+            iterable,
+            desc,
+            total,
+            initial=initial,
+            unit=unit,
+            delay=delay,
+            miniters=1,
+            ncols=columns,
+            nrows=rows,
+            file=sys.stderr,
+            **keywords,
+        )
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Shows the bar, or says a line if the last one is a minute old."""
+        if not self._lines:
+            return super().display(msg, pos)
+        now = time.monotonic()
+        if msg is None and now - self._said_at >= _PERIOD:
+            self._said_at = now
+            print(self._line(now - self._begun_at), file=sys.stderr, flush=True)
+
+    def clear(self, nolock: bool = False) -> None:
+        """Removes the bar; lines stay."""
+        if not self._lines:
+            super().clear(nolock)
+
+    def close(self) -> None:
+        """Ends the bar, or says the last line."""
+        if not getattr(self, "disable", True) and self._lines:
+            if time.monotonic() - self._begun_at > max(_SHORT, self.delay):
+                self._said_at = -_PERIOD
+                self.display()
+        super().close()
+
+    def _line(self, elapsed: float) -> str:
+        if self.bar_format:
+            return str(self)
+        done = self.n - self.initial
+        line = f"{self.desc.removesuffix(': ')}: {self.n:.9g}"
+        if self.total:
+            line += f" of {self.total:.9g}"
+        if elapsed >= 1.0:
+            line += f", {self.format_interval(elapsed)} elapsed"
+        if self.total and 0 < done < self.total - self.initial:
+            left = elapsed * (self.total - self.n) / done
+            line += f", {self.format_interval(left)} left"
+        return f"{line}, {self.postfix}" if self.postfix else line
+
+
+def say(text: str) -> None:
+    """Prints a line on standard error, above bars that are there."""
+    if sys.stderr.isatty():
+        tqdm.write(text, file=sys.stderr)
+    else:
+        print(text, file=sys.stderr, flush=True)
+
+
+class CheckpointClock:
+    """Tells when a checkpoint is due by time: 30 s after the last, or later where writing one takes
+    more than 2 % of that."""
+
+    def __init__(self) -> None:
+        self._next = time.monotonic() + _KEEP_PERIOD
+
+    @property
+    def is_due(self) -> bool:
+        """True when another should be written."""
+        return time.monotonic() >= self._next
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Times the block, which writes a checkpoint."""
+        begun = time.monotonic()
+        yield
+        ended = time.monotonic()
+        self._next = ended + max(_KEEP_PERIOD, (ended - begun) / _KEEP_SHARE)
+
+
+@contextmanager
+def resumable(kept: Callable[[], str]) -> Iterator[None]:
+    """Within the block, an interruption (Ctrl-C, SIGTERM) notes what `kept` returns, unless a block
+    inside has: what is kept and how to resume. The command line prints it."""
+    try:
+        yield
+    except KeyboardInterrupt as interruption:
+        if not getattr(interruption, "__notes__", None):
+            interruption.add_note(kept())
+        raise
+
+
+def _terminal_size() -> tuple[int, int]:
+    try:
+        columns, rows = os.get_terminal_size(sys.stderr.fileno())
+    except (OSError, ValueError):
+        columns, rows = 0, 0
+    return columns or _COLUMNS, rows or _ROWS
