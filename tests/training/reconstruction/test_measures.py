@@ -1,7 +1,7 @@
-import numpy as np
-
 # A measure may be None; here a comparison with None is a failure of the test.
 # pyright: reportOptionalOperand=false, reportOperatorIssue=false
+
+import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
