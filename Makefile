@@ -38,7 +38,7 @@ docs: .venv/installed
 
 # Writes the types of the native module, after a change of its bindings.
 stub: .venv/installed
-	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file api/splatpilot/_native.pyi
+	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file splatpilot/_native.pyi
 
 # Writes the Python of the messages, after a change in lcmtypes/.
 messages: .venv/installed

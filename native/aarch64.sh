@@ -49,8 +49,7 @@ if [ ! -e "$work/site/torch" ]; then
 fi
 
 mkdir -p "$work/package/splatpilot"
-for part in "$root"/api/splatpilot/*.py* "$root/systems" "$root/diagrams" "$root/training" \
-  "$root/analysis"; do
+for part in "$root"/splatpilot/*; do
   ln -sfn "$part" "$work/package/splatpilot/$(basename "$part")"
 done
 cat > "$work/python" <<END

@@ -1,4 +1,4 @@
-"""api/splatpilot/_native.pyi."""
+"""splatpilot/_native.pyi."""
 
 from pathlib import Path
 

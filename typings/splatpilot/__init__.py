@@ -1,1 +1,0 @@
-../../api/splatpilot/__init__.py

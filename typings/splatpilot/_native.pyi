@@ -1,1 +1,0 @@
-../../api/splatpilot/_native.pyi
