@@ -86,10 +86,10 @@ def plan(
 
 
 def _check_way_exists(p_WB: np.ndarray, field: Esdf, toa: TimeOfArrival) -> None:
-    if toa.is_reachable(p_WB):
+    # A vehicle that drifts to less than the margin is in a blocked voxel, from which its route is
+    # near; what cuts it off is at least its diameter thick. Contact is for others to judge.
+    if toa.is_reachable(p_WB, within=VEHICLE_RADIUS):
         return
-    # A voxel may be blocked though a point in it is free, and contact is for others to judge; but
-    # a point a whole voxel clear of contact, in a voxel no way leads from, is cut off.
     clearance = float(field.distance(p_WB)) - VEHICLE_RADIUS
     if clearance > field.voxel_size:
         raise InfeasibleFlightError(

@@ -26,6 +26,10 @@ from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near a goal that is not in direct reach
 
+_PACES = 1.0, 0.5, 0.25
+"""Fractions of the nominal speed, tried in turn while nothing beats waiting: in a narrow bend the
+quintics of a fast lattice cut the corner, and those of a slow one follow the route."""
+
 
 @dataclass
 class LatticeConfig:
@@ -125,9 +129,15 @@ class TrajectoryLattice:
             [quintic_basis(self.sample_times, config.horizon, order) for order in (0, 3)]
         )  # (2 S, 6)
         self._final_velocities_L = final_velocities(config)
+        self._stopping_distance = 0.5 * config.horizon * config.speed  # [m]
 
     def trajectories(
-        self, p_WB: np.ndarray, v_WB: np.ndarray, a_WB: np.ndarray, toa: TimeOfArrival
+        self,
+        p_WB: np.ndarray,
+        v_WB: np.ndarray,
+        a_WB: np.ndarray,
+        toa: TimeOfArrival,
+        pace: float = 1.0,
     ) -> Trajectories:
         """The N trajectories from a position, velocity and acceleration, (3,) each.
 
@@ -135,12 +145,11 @@ class TrajectoryLattice:
         the gradient of T, with its velocities v_1 at p_WB + H v_1; one more for each speed on the
         way to the goal, after that length and along it, or at rest in the goal. The speed falls in
         proportion to the time of arrival where the nominal one would take less than half the
-        horizon.
+        horizon. `pace` multiplies every speed.
         """
         config = self.config
-        stopping_distance = 0.5 * config.horizon * config.speed
-        slowing = float(toa.value(p_WB)) / stopping_distance
-        speed = config.speed * min(max(slowing, LEAST_SPEED_FRACTION), 1.0)
+        slowing = float(toa.value(p_WB)) / self._stopping_distance
+        speed = pace * config.speed * min(max(slowing, LEAST_SPEED_FRACTION), 1.0)
         v_L = speed * self._final_velocities_L @ rotation_to(-toa.gradient(p_WB)).T
         speeds = speed * np.array(config.speed_fractions)
         p_way, directions = toa.way(p_WB, config.horizon * speeds)
@@ -190,15 +199,23 @@ class TrajectoryLattice:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The positions (K, S, 3) [m] and costs (K,) of the K best distinct trajectories.
 
-        The first is the cheapest of all; see `trajectories`, `costs` and `select_distinct`.
+        The first is the cheapest of all; see `trajectories`, `costs` and `select_distinct`. While
+        the cheapest leads no nearer to a goal out of reach, slower ones are tried, and taken if
+        cheaper.
         """
         config = self.config
-        trajectories = self.trajectories(p_WB, v_WB, a_WB, toa)
-        costs = self.costs(trajectories, p_WB, field, toa)
-        chosen = select_distinct(
-            trajectories.positions, costs, config.num_hypotheses, config.separation
-        )
-        return trajectories.positions[chosen], costs[chosen]
+        arrival = float(toa.value(p_WB))
+        positions, costs = np.empty(0), np.array([np.inf])
+        for pace in _PACES:
+            trajectories = self.trajectories(p_WB, v_WB, a_WB, toa, pace)
+            found = self.costs(trajectories, p_WB, field, toa)
+            if found.min() < costs.min():
+                positions, costs = trajectories.positions, found
+            nearer = toa.value(positions[np.argmin(costs), -1]) < arrival
+            if nearer or arrival < self._stopping_distance:
+                break
+        chosen = select_distinct(positions, costs, config.num_hypotheses, config.separation)
+        return positions[chosen], costs[chosen]
 
 
 def final_velocities(config: LatticeConfig) -> np.ndarray:
