@@ -133,7 +133,7 @@ def conclude(
         print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
     for row in rows:
         if "reason" in row:
-            print(f"{row['id']} could not be flown: {row['reason']}")
+            print(f"{row['id']}, {row['outcome']}: {row['reason']}")
     print(f"Wrote rollouts.csv, timings.csv, table.csv and report.html in {folder.path}")
     return table
 

@@ -11,6 +11,9 @@ from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.diagrams.flight import Outcome
 from splatpilot.diagrams.scenario_files import benchmark_scenarios
 
+FAILURES = Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, Outcome.ERROR, INFEASIBLE
+"""The outcomes that tables count, next to the successes."""
+
 MEASURES = (
     "min_clearance_m",
     "mean_speed_m_s",
@@ -65,10 +68,7 @@ def success_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "success_rate": successes / len(rows) if rows else math.nan,
         "wilson_lower": interval.lower,
         "wilson_upper": interval.upper,
-    } | {
-        str(outcome): sum(row["outcome"] == outcome for row in rows)
-        for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, INFEASIBLE)
-    }
+    } | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
 
 
 def mean_of(rows: list[dict[str, Any]], name: str) -> float:
