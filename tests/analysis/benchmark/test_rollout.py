@@ -46,6 +46,15 @@ def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys,
         replay.run(study=tmp_path / "far", id="short-straight-2-000")
 
 
+def test_a_scene_without_a_start_and_goal_does_not_stop_the_study(place, tmp_path, short_scenario):
+    hall = place.scene("hall", metric=True)
+    longway = tmp_path / "longway.yaml"
+    longway.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, least_way: 30}}\n")
+    config = StudyConfig([str(longway), str(short_scenario)], ["straight"], seeds=1)
+    [row] = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    assert (row["flights"], row["infeasible"]) == (2, 1)
+
+
 def test_a_flight_that_becomes_infeasible_is_an_error_of_its_row(
     short_scenario, tmp_path, monkeypatch, rows_of
 ):
