@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from splatpilot.analysis.reconstruction.default_flight import unseen_share
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     Scale,
@@ -55,7 +56,8 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
         size = frame.depth.shape
         frames[i] = views.measure(frame, views.seen(frame), lpips)
     height, width = size
-    measures = SceneMeasures(bool(views.metadata.held_out), width, height, frames, missing)
+    held_out = bool(views.metadata.held_out)
+    measures = SceneMeasures(held_out, width, height, frames, missing, unseen_share(scene))
     _write_views(scene / SHEET, views, measures)
     with written_atomically(scene / METRICS) as partial:  # Last: it says that all is there.
         partial.write_text(json.dumps(measures.as_json(), indent=2))
