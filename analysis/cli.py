@@ -17,6 +17,7 @@ from splatpilot.analysis.bug_report import raised_by, write_report
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.verb import FailureWithResultError, as_json
 from splatpilot.systems.extras import missing_extra
+from splatpilot.systems.messages import did_you_mean, unknown
 
 
 class _PrintVersion(argparse.Action):
@@ -41,6 +42,34 @@ class _ImportModule(argparse.Action):
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
+class _Parser(argparse.ArgumentParser):
+    """Asks, for a word that it does not know, which was meant."""
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.option_strings or action.choices is None or value in action.choices:
+            super()._check_value(action, value)
+        else:
+            what = str(action.metavar or action.dest).lower()
+            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
+
+    def error(self, message: str) -> NoReturn:
+        word = message.removeprefix("unrecognized arguments: ").partition(" ")[0]
+        if word in message.split()[2:]:
+            options = {name for parser in self._parsers() for name in parser._option_string_actions}
+            setting = f"did you mean --set {word}?" if word[0] != "-" and "=" in word else ""
+            if hint := setting or did_you_mean(word, options):
+                message = f"{message}; {hint}"
+        super().error(message)
+
+    def _parsers(self) -> Iterator[argparse.ArgumentParser]:
+        """This parser and those of its commands."""
+        yield self
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for parser in set(action.choices.values()):
+                    yield from parser._parsers()
+
+
 _ENDED = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 130)}
 
 
@@ -54,7 +83,7 @@ class _EndedError(KeyboardInterrupt):
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `splatpilot`, with all verbs."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="splatpilot",
         description="Fly drones by camera inside Gaussian-splat worlds.",
         epilog="exit status: 0 done, 1 an error that one message explains, 2 words that make no "
@@ -72,7 +101,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--version", action=_PrintVersion, nargs=0, help="show the version and exit"
     )
-    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb_name")
+    verbs = parser.add_subparsers(required=True, metavar="COMMAND", dest="verb_name")
     for command in COMMANDS:
         command.add_to(verbs)
     return parser
@@ -92,7 +121,7 @@ def run() -> NoReturn:
 
 def main(arguments: list[str] | None = None) -> int:
     """
-    Runs `splatpilot VERB ...`.
+    Runs `splatpilot COMMAND ...`.
 
     Args:
         arguments: the words after `splatpilot`; those of the process when None.

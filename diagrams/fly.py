@@ -66,10 +66,10 @@ def run(
         OSError: if `out` holds anything and is not to be overwritten, or cannot be written; nothing
             is flown then.
     """
+    scenario.validate()
     for path in (out, graphviz):
         if path is not None:
             require_unused(path, overwrite)
-    scenario.validate()
     if graphviz is not None:
         require_writable_folder(graphviz.parent)
     print(f"Building the world, seed {scenario.seed}...", flush=True)

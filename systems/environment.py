@@ -1,4 +1,4 @@
-"""The environment variables that name folders."""
+"""The folders that environment variables name, and what is looked for in them."""
 
 import os
 from pathlib import Path
@@ -20,6 +20,45 @@ def scenes_folder() -> Path:
     return Path(os.environ.get(SCENES, "scenes"))
 
 
+def find_data(path: Path, what: str, hint: str = "") -> Path:
+    """
+    Finds a capture or a mesh: here, in the folder of data, or, by its name alone, in a folder of
+    that. Prints where, if that is not here.
+
+    Args:
+        what: what it is, for the message.
+        hint: what to do if it is nowhere.
+
+    Raises:
+        FileNotFoundError: if it is nowhere.
+    """
+    if path.exists():
+        return path
+    data = data_folder()
+    if data is not None:
+        within = sorted(data.glob(f"*/{path}")) if len(path.parts) == 1 else []
+        for found in (data / path, *within):
+            if found.exists():
+                print(f"{path} is {found}")
+                return found
+    where = f", here or in {data}" if data is not None else f"; {DATA} names no folder of data"
+    raise FileNotFoundError(
+        f"No such file or folder: {path}; expected {what}{where}" + (f"; {hint}" if hint else "")
+    )
+
+
+def require_corpus(folder: Path) -> None:
+    """
+    Raises:
+        FileNotFoundError: unless a folder holds a corpus; the message says how to make one.
+    """
+    if not (folder / "shards").is_dir():
+        raise FileNotFoundError(
+            f"{folder} holds no corpus; collect one with `splatpilot corpus make --out {folder} "
+            "--worlds 18`"
+        )
+
+
 def require_scene(path: str, source: str = "") -> Path:
     """
     Where a scene is: here, or in the folder of scenes.
@@ -36,7 +75,7 @@ def require_scene(path: str, source: str = "") -> Path:
         if place.exists():
             return place
     raise FileNotFoundError(
-        f"{path}: there is no such scene, neither here nor in {folder} (the environment variable "
-        f"{SCENES} names that folder); "
+        f"No such file or folder: {path}; expected a scene, here or in {folder} (the environment "
+        f"variable {SCENES} names that folder); "
         + (source or "reconstruct one with `splatpilot reconstruct`").strip()
     )

@@ -12,6 +12,7 @@ from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.motion_primitives import level_acceleration
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
@@ -33,11 +34,7 @@ class PrivilegedPlannerConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.0 < self.rate <= 1000.0:
-            raise ValueError(
-                f"PrivilegedPlannerConfig.rate is {self.rate} Hz but must be positive and at most "
-                f"1000; the default is {PrivilegedPlannerConfig.rate}."
-            )
+        require_field(self, "rate", 0.0 < self.rate <= 1000.0, "in (0, 1000] Hz")
         self.lattice.validate()
 
 

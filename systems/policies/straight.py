@@ -1,11 +1,11 @@
 """The policy that looks at nothing: what a world asks of a policy is what this one lacks."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.policies.velocity_tracking import (
     approach_velocity,
     tracking_acceleration,
@@ -26,11 +26,8 @@ class StraightConfig:
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name, largest in (("speed", 20.0), ("rate", 1000.0)):
-            value = getattr(self, name)
-            if not 0.0 < value <= largest or math.isnan(value):
-                raise ValueError(
-                    f"StraightConfig.{name} is {value}; it must be positive and at most {largest:g}"
-                )
+            valid = 0.0 < getattr(self, name) <= largest
+            require_field(self, name, valid, f"positive and at most {largest:g}")
 
 
 class Straight(LeafSystem):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splatpilot.systems.collision.distance_field import Distances
+from splatpilot.systems.messages import require, require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.policies.motion_primitives import (
     lengths,
@@ -77,29 +78,28 @@ class LatticeConfig:
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("num_yaws", "num_pitches", "num_hypotheses"):
-            _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
+            require_field(self, name, getattr(self, name) >= 1, "at least 1")
         for name, most in (("speed", 20.0), ("horizon", 30.0)):
             value = getattr(self, name)
-            _check(name, value, 0.0 < value <= most, f"positive and at most {most:g}")
+            require_field(self, name, 0.0 < value <= most, f"positive and at most {most:g}")
         samples = self.horizon / WAYPOINT_PERIOD
         whole = samples > NUM_WAYPOINTS - 0.5 and abs(samples - round(samples)) < 1e-6
         least = NUM_WAYPOINTS * WAYPOINT_PERIOD
-        _check("horizon", self.horizon, whole, f"a multiple of 0.1 s and at least {least} s")
+        require_field(self, "horizon", whole, f"a multiple of 0.1 s and at least {least} s")
         weights = "penetration_weight", "speed_weight", "jerk_weight"
         for name in (*weights, "separation", "margin", "max_yaw", "max_pitch"):
-            _check(name, getattr(self, name), 0.0 <= getattr(self, name) <= 1e6, "0 to 1e6")
-        _check("max_yaw", self.max_yaw, self.max_yaw <= math.pi, "at most pi")
-        _check("max_pitch", self.max_pitch, self.max_pitch < math.pi / 2, "less than pi/2")
+            require_field(self, name, 0.0 <= getattr(self, name) <= 1e6, "0 to 1e6")
+        require_field(self, "max_yaw", self.max_yaw <= math.pi, "at most pi")
+        require_field(self, "max_pitch", self.max_pitch < math.pi / 2, "less than pi/2")
         in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
-        _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
+        require_field(self, "speed_fractions", in_range, "one or more values in (0, 1]")
         trajectories = self.num_yaws * self.num_pitches * len(self.speed_fractions)
-        _check(
-            "num_yaws and num_pitches", trajectories, trajectories <= 10**5, "at most 1e5 in all"
-        )
+        what = "LatticeConfig.num_yaws and num_pitches"
+        require(trajectories <= 10**5, what, "at most 1e5 in all", trajectories)
         few = self.num_hypotheses <= trajectories
-        _check(
+        require_field(
+            self,
             "num_hypotheses",
-            self.num_hypotheses,
             few,
             f"at most {trajectories}, the size of the lattice",
         )
@@ -226,10 +226,3 @@ def final_velocities(config: LatticeConfig) -> np.ndarray:
         config.speed_fractions,
     )
     return np.vstack([fan, np.zeros(3)])
-
-
-def _check(name: str, value: object, valid: bool, limit: str) -> None:
-    if not valid:
-        raise ValueError(
-            f"LatticeConfig.{name} is {value} but must be {limit}; see the comment at the field."
-        )

@@ -128,4 +128,4 @@ def test_table_says_what_was_not_run(tmp_path, monkeypatch, capsys):
 def test_no_seeds_are_refused(seeds, capsys):
     """There is nothing to measure in no world."""
     assert main(["difficulty", "P10", "--seeds", seeds]) == 1
-    assert f"--seeds is {seeds}; it must be at least 1" in capsys.readouterr().err
+    assert f"--seeds must be at least 1, got {seeds}" in capsys.readouterr().err

@@ -43,7 +43,10 @@ def test_chunks_are_flights_through_one_place(short_scenario):
         ({"policies": ["planner", "planner"]}, "the policy planner is given twice"),
         ({"policies": ["a=straight", "a=planner"]}, "the policy a is given twice"),
         ({"policies": ["reactive:margn=0.2"]}, "policy reactive-margn-0.2: .*did you mean margin"),
-        ({"policies": ["straight:rate=-1"]}, "policy straight-rate--1: StraightConfig.rate is -1"),
+        (
+            {"policies": ["straight:rate=-1"]},
+            "straight-rate--1: StraightConfig.rate .* got -1",
+        ),
         ({"policies": ["scenario"]}, "short.yaml has no `policy`, which --policies scenario would"),
         ({"speeds": [2.0, 2.0000001]}, "the speed 2 is given twice"),
         ({"speeds": [-1.0]}, "the speed -1 m/s cannot be flown"),
