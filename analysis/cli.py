@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -17,7 +18,7 @@ from splatpilot.analysis.bug_report import raised_by, write_report
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.verb import FailureWithResultError, as_json
 from splatpilot.systems.extras import missing_extra
-from splatpilot.systems.messages import did_you_mean, unknown
+from splatpilot.systems.messages import TYPES, did_you_mean, unknown
 
 
 class _PrintVersion(argparse.Action):
@@ -52,22 +53,28 @@ class _Parser(argparse.ArgumentParser):
             what = str(action.metavar or action.dest).lower()
             raise argparse.ArgumentError(None, unknown(what, value, action.choices))
 
-    def error(self, message: str) -> NoReturn:
-        word = message.removeprefix("unrecognized arguments: ").partition(" ")[0]
-        if word in message.split()[2:]:
-            options = {name for parser in self._parsers() for name in parser._option_string_actions}
-            setting = f"did you mean --set {word}?" if word[0] != "-" and "=" in word else ""
-            if hint := setting or did_you_mean(word, options):
-                message = f"{message}; {hint}"
-        super().error(message)
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        try:
+            return super()._get_value(action, arg_string)
+        except argparse.ArgumentError:
+            if (expected := TYPES.get(action.type)) is None:
+                raise
+            what = "/".join(action.option_strings) or action.dest
+            problem = f"{what} must be {expected}, got {arg_string!r}"
+            raise argparse.ArgumentError(None, problem) from None
 
-    def _parsers(self) -> Iterator[argparse.ArgumentParser]:
-        """This parser and those of its commands."""
-        yield self
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for parser in set(action.choices.values()):
-                    yield from parser._parsers()
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        # Of a command, here and not in the parser of all commands: this one knows its options.
+        options, words = super().parse_known_args(args, namespace)
+        if words:
+            setting = f"did you mean --set {words[0]}?" if re.match(r"[\w.]+=", words[0]) else ""
+            hint = setting or did_you_mean(words[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(words)}" + (f"; {hint}" if hint else ""))
+        return options, words
+
+    def error(self, message: str) -> NoReturn:
+        remedy = "" if message.endswith("?") else f"; see `{self.prog} --help`"
+        self.exit(2, f"{self.prog}: {message}{remedy}\n")
 
 
 _ENDED = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 130)}

@@ -13,7 +13,7 @@ from splatpilot.diagrams.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import WORLDS, WorldConfig
 from splatpilot.systems.configuration import open_field
-from splatpilot.systems.messages import require
+from splatpilot.systems.messages import FieldError, require
 from splatpilot.systems.policies.privileged_planner import PrivilegedPlannerConfig
 from splatpilot.systems.seeds import check_seed
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
@@ -111,7 +111,10 @@ class Scenario:
         parts = [(WORLDS, self.world), (POLICIES, self.policy)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
             registry.kind_of(part)
-            part.validate()
+            try:
+                part.validate()
+            except FieldError as error:
+                raise error.within(self) from None
         self.observation.validate()
         _check_camera(self.camera)
         _check_simulator(self.simulator)

@@ -41,9 +41,10 @@ def find_data(path: Path, what: str, hint: str = "") -> Path:
             if found.exists():
                 print(f"{path} is {found}")
                 return found
-    where = f", here or in {data}" if data is not None else f"; {DATA} names no folder of data"
+    where = f"in {data}" if data is not None else f"in the folder that {DATA} names (it is not set)"
     raise FileNotFoundError(
-        f"No such file or folder: {path}; expected {what}{where}" + (f"; {hint}" if hint else "")
+        f"No such file or folder: {path}; expected {what}, here or {where}"
+        + (f"; {hint}" if hint else "")
     )
 
 

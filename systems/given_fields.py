@@ -6,10 +6,7 @@ from typing import Any, get_args, get_origin
 
 import yaml
 
-from splatpilot.systems.messages import did_you_mean, require
-
-_TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
-"""What plain values of these types are called. Texts are left to Drake's reader."""
+from splatpilot.systems.messages import TYPES, did_you_mean, require
 
 _TAGGED = object()
 
@@ -77,8 +74,8 @@ def _check_type(name: str, expected: Any, value: Any) -> None:
             _check_type(f"{name}[{number}]", options[0], each)
     elif get_origin(expected) is UnionType and len(options) == 1:
         _check_type(name, options[0], value)
-    elif expected in _TYPES and value is not _TAGGED:
-        require(_converts(value, expected), name, _TYPES[expected], _shown(value))
+    elif expected in TYPES and value is not _TAGGED:
+        require(_converts(value, expected), name, TYPES[expected], _shown(value))
 
 
 def _converts(value: Any, expected: type) -> bool:

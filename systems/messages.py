@@ -1,7 +1,11 @@
 """Messages about what a user gave, in one form each."""
 
+import dataclasses
 import difflib
 from collections.abc import Iterable
+
+TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
+"""What plain values of these types are called."""
 
 _MIN_LIKENESS, _NO_LESS, _MAX_NAMES = 0.6, 0.1, 3
 """[-] Of names that are suggested: at least, less than the most alike at most, and how many."""
@@ -26,9 +30,42 @@ def require(valid: object, what: str, condition: str, value: object, remedy: str
         )
 
 
+class FieldError(ValueError):
+    """A field of a configuration is out of range; the message names the configuration's type."""
+
+    def __init__(self, config: object, name: str, problem: str) -> None:
+        super().__init__(config, name, problem)
+        self.config, self.name, self.problem = config, name, problem
+
+    def __str__(self) -> str:
+        return f"{type(self.config).__name__}.{self.name} {self.problem}"
+
+    def within(self, whole: object) -> ValueError:
+        """The same error, naming the field as it is written in a file of the configuration `whole`,
+        for example `policy.lattice.speed`."""
+        path = _path(whole, self.config)
+        return ValueError(f"{path}.{self.name} {self.problem}") if path else self
+
+
+def _path(whole: object, part: object) -> str:
+    """The names of the fields that lead from one configuration to another, empty if none do."""
+    fields = whole if isinstance(whole, dict) else {}
+    for name, value in (vars(whole) if dataclasses.is_dataclass(whole) else fields).items():
+        if value is part:
+            return str(name)
+        if inner := _path(value, part):
+            return f"{name}.{inner}"
+    return ""
+
+
 def require_field(config: object, name: str, valid: object, condition: str) -> None:
-    """Checks a field of a configuration, named with its type, see `require`."""
-    require(valid, f"{type(config).__name__}.{name}", condition, getattr(config, name))
+    """Checks a field of a configuration, see `require`.
+
+    Raises:
+        FieldError: unless it is valid.
+    """
+    if not valid:
+        raise FieldError(config, name, f"must be {condition}, got {getattr(config, name)}")
 
 
 def unknown(what: str, name: str, known: Iterable[str], others: str = "") -> str:

@@ -1,7 +1,6 @@
 """What a study is: the same flights for every policy, each with a name by which it can be flown
 again."""
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,10 +8,11 @@ from typing import Any, NamedTuple
 import yaml
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES, speed_of
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES, MAX_SPEED, speed_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.messages import require
 from splatpilot.systems.seeds import TRAINING_SEEDS
 
 
@@ -109,16 +109,13 @@ class StudyConfig:
         Raises:
             ValueError: for numbers out of range, anything given twice or not at all.
         """
-        if not 1 <= self.seeds <= TRAINING_SEEDS:
-            raise ValueError(f"seeds is {self.seeds}; it must be 1 to {TRAINING_SEEDS}")
-        if not 0 <= self.first_seed <= TRAINING_SEEDS - self.seeds:
-            raise ValueError(
-                f"first_seed is {self.first_seed}; it must be 0 to {TRAINING_SEEDS - self.seeds}, "
-                f"so that none of {self.seeds} seeds is one of training"
-            )
+        require(1 <= self.seeds <= TRAINING_SEEDS, "seeds", f"in [1, {TRAINING_SEEDS}]", self.seeds)
+        last = TRAINING_SEEDS - self.seeds
+        trained = f"later ones are of training, with {self.seeds} seeds"
+        valid = 0 <= self.first_seed <= last
+        require(valid, "first_seed", f"in [0, {last}]", self.first_seed, trained)
         for speed in self.speeds:
-            if not 0.0 < speed < math.inf:
-                raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
+            require(0.0 < speed <= MAX_SPEED, "speeds", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
         self._check_names()
 
     def _check_names(self) -> None:

@@ -78,8 +78,8 @@ class ReactiveConfig:
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         self.camera.validate()
-        require_field(self, "speed", 0.0 < self.speed <= 20.0, "positive and at most 20 m/s")
-        require_field(self, "rate", 0.0 < self.rate <= 1000.0, "positive and at most 1000 Hz")
+        require_field(self, "speed", 0.0 < self.speed <= 20.0, "in (0, 20] m/s")
+        require_field(self, "rate", 0.0 < self.rate <= 1000.0, "in (0, 1000] Hz")
         for name, size in (("columns", self.camera.width), ("rows", self.camera.height)):
             value = getattr(self, name)
             divides = 1 <= value <= size and size % value == 0

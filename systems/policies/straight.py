@@ -25,9 +25,9 @@ class StraightConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name, largest in (("speed", 20.0), ("rate", 1000.0)):
+        for name, largest, unit in (("speed", 20.0, "m/s"), ("rate", 1000.0, "Hz")):
             valid = 0.0 < getattr(self, name) <= largest
-            require_field(self, name, valid, f"positive and at most {largest:g}")
+            require_field(self, name, valid, f"in (0, {largest:g}] {unit}")
 
 
 class Straight(LeafSystem):

@@ -79,9 +79,9 @@ class LatticeConfig:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("num_yaws", "num_pitches", "num_hypotheses"):
             require_field(self, name, getattr(self, name) >= 1, "at least 1")
-        for name, most in (("speed", 20.0), ("horizon", 30.0)):
-            value = getattr(self, name)
-            require_field(self, name, 0.0 < value <= most, f"positive and at most {most:g}")
+        for name, most, unit in (("speed", 20.0, "m/s"), ("horizon", 30.0, "s")):
+            valid = 0.0 < getattr(self, name) <= most
+            require_field(self, name, valid, f"in (0, {most:g}] {unit}")
         samples = self.horizon / WAYPOINT_PERIOD
         whole = samples > NUM_WAYPOINTS - 0.5 and abs(samples - round(samples)) < 1e-6
         least = NUM_WAYPOINTS * WAYPOINT_PERIOD

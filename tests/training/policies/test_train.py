@@ -209,6 +209,8 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
         run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"schedule\.updates is 0"):
         run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
+    with pytest.raises(ValueError, match=r"seed must be in \[0, 999\], got 1000"):
+        run(config=tiny("seed=1000"), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"there is no scenario 'P99'; did you mean P09"):
         run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
