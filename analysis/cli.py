@@ -63,7 +63,9 @@ class _Parser(argparse.ArgumentParser):
             problem = f"{what} must be {expected}, got {arg_string!r}"
             raise argparse.ArgumentError(None, problem) from None
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, args: Any = None, namespace: Any = None
+    ) -> Any:
         # Of a command, here and not in the parser of all commands: this one knows its options.
         options, words = super().parse_known_args(args, namespace)
         if words:
