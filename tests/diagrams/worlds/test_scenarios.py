@@ -202,7 +202,7 @@ def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     assert find_scene(SceneConfig(path="hall")) == hall / "hall"
     monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match=r"hall: .*SPLATPILOT_SCENES.*; ask Ann"):
+    with pytest.raises(FileNotFoundError, match=r": hall; .*SPLATPILOT_SCENES.*; ask Ann"):
         make_world(SceneConfig(path="hall", source="ask Ann"), 0)
 
 
