@@ -159,7 +159,7 @@ def test_values_out_of_range_are_named(small, tmp_path, override, message):
 @pytest.mark.parametrize("number", ["worlds", "jobs"])
 def test_numbers_below_one_are_refused(small, tmp_path, number):
     """No worlds and no workers gather nothing."""
-    with pytest.raises(ValueError, match=f"--{number} is 0"):
+    with pytest.raises(ValueError, match=f"--{number} must be at least 1, got 0"):
         make.run(config=small, out=tmp_path, **{"worlds": 1, "jobs": 1} | {number: 0})
 
 
