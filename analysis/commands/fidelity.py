@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
@@ -40,6 +41,7 @@ def _defaults(options: argparse.Namespace) -> Any:
 def _fidelity(options: argparse.Namespace) -> None:
     for scene in options.scenes:
         require_existing(scene, "a scene folder")
+        check_kind(scene, "scene")
     from splatpilot.systems.progress import say
 
     say(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
 
@@ -23,6 +24,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _measure(options: argparse.Namespace) -> None:
     require_existing(options.scene, "a scene folder")
+    check_kind(options.scene, "scene")
     from splatpilot.systems.progress import say
 
     say(f"measuring {options.scene}")
