@@ -41,10 +41,11 @@ def _defaults(options: argparse.Namespace) -> Any:
 def _fidelity(options: argparse.Namespace) -> None:
     for scene in options.scenes:
         require_existing(scene, "a scene folder")
-        check_kind(scene, "scene")
     from splatpilot.systems.progress import say
 
     say(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
+    for scene in options.scenes:
+        check_kind(scene, "scene")
     from splatpilot.analysis.fidelity import run as fidelity
     from splatpilot.systems.configuration import load_config
 

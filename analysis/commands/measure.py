@@ -24,10 +24,10 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _measure(options: argparse.Namespace) -> None:
     require_existing(options.scene, "a scene folder")
-    check_kind(options.scene, "scene")
     from splatpilot.systems.progress import say
 
     say(f"measuring {options.scene}")
+    check_kind(options.scene, "scene")
     from splatpilot.analysis.reconstruction import measure_scene
 
     measure_scene.run(options.scene, options.overwrite)

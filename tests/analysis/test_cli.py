@@ -138,6 +138,7 @@ def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path
     ],
 )
 def test_long_commands_say_what_they_do_before_anything_slow_is_imported(words, tmp_path):
+    (tmp_path / "out" / "corpus" / "shards").mkdir(parents=True)
     script = (
         "import sys; from splatpilot.analysis.cli import main\n"
         # Importing these fails.
