@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -17,6 +18,7 @@ from splatpilot.analysis.bug_report import raised_by, write_report
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.verb import FailureWithResultError, as_json
 from splatpilot.systems.extras import missing_extra
+from splatpilot.systems.messages import TYPES, did_you_mean, unknown
 
 
 class _PrintVersion(argparse.Action):
@@ -41,6 +43,42 @@ class _ImportModule(argparse.Action):
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
+class _Parser(argparse.ArgumentParser):
+    """Asks, for a word that it does not know, which was meant."""
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.option_strings or action.choices is None or value in action.choices:
+            super()._check_value(action, value)
+        else:
+            what = str(action.metavar or action.dest).lower()
+            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
+
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        try:
+            return super()._get_value(action, arg_string)
+        except argparse.ArgumentError:
+            if (expected := TYPES.get(action.type)) is None:
+                raise
+            what = "/".join(action.option_strings) or action.dest
+            problem = f"{what} must be {expected}, got {arg_string!r}"
+            raise argparse.ArgumentError(None, problem) from None
+
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, args: Any = None, namespace: Any = None
+    ) -> Any:
+        # Of a command, here and not in the parser of all commands: this one knows its options.
+        options, words = super().parse_known_args(args, namespace)
+        if words:
+            setting = f"did you mean --set {words[0]}?" if re.match(r"[\w.]+=", words[0]) else ""
+            hint = setting or did_you_mean(words[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(words)}" + (f"; {hint}" if hint else ""))
+        return options, words
+
+    def error(self, message: str) -> NoReturn:
+        remedy = "" if message.endswith("?") else f"; see `{self.prog} --help`"
+        self.exit(2, f"{self.prog}: {message}{remedy}\n")
+
+
 _ENDED = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 130)}
 
 
@@ -54,7 +92,7 @@ class _EndedError(KeyboardInterrupt):
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `splatpilot`, with all verbs."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="splatpilot",
         description="Fly drones by camera inside Gaussian-splat worlds.",
         epilog="exit status: 0 done, 1 an error that one message explains, 2 words that make no "
@@ -72,7 +110,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--version", action=_PrintVersion, nargs=0, help="show the version and exit"
     )
-    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb_name")
+    verbs = parser.add_subparsers(required=True, metavar="COMMAND", dest="verb_name")
     for command in COMMANDS:
         command.add_to(verbs)
     return parser
@@ -92,7 +130,7 @@ def run() -> NoReturn:
 
 def main(arguments: list[str] | None = None) -> int:
     """
-    Runs `splatpilot VERB ...`.
+    Runs `splatpilot COMMAND ...`.
 
     Args:
         arguments: the words after `splatpilot`; those of the process when None.

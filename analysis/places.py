@@ -7,6 +7,7 @@ from pathlib import Path
 from splatpilot.analysis.tour import TourConfig, make_scene
 from splatpilot.systems.configuration import load_config
 from splatpilot.systems.environment import DATA
+from splatpilot.systems.messages import unknown
 from splatpilot.training.captures import render_capture
 from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -90,7 +91,7 @@ def run(
     names = list(names) or list(BENCHMARK_PLACES)
     for name in names:
         if name not in PLACES:
-            raise ValueError(f"there is no place {name!r}; there are {', '.join(PLACES)}")
+            raise ValueError(unknown("place", name, PLACES))
     sources = [_source(PLACES[name], data) for name in names]
     configs = [
         load_config(PlaceConfig(), overrides=[*PLACES[name].settings, *overrides]) for name in names

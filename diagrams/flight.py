@@ -3,7 +3,7 @@
 import enum
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +18,7 @@ from splatpilot.diagrams.pilot import goal_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.vehicle.flight_limits import LEVEL
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
@@ -34,6 +35,7 @@ class Outcome(enum.StrEnum):
     LEFT_VOLUME = "left_volume"
     TIMEOUT = "timeout"
     LANDED = "landed"
+    ERROR = "error"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,7 @@ class Flight:
     # of policies that return none.
     hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialisation
+    reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
 
     def summary(self) -> dict[str, float | str]:
         """The flight in numbers; distances along the samples, speed as path length over time."""
@@ -63,7 +66,7 @@ class Flight:
             "mean_speed_m_s": path_length / duration if duration > 0 else 0.0,
             "min_clearance_m": float(np.nanmin(self.clearances)),
             "real_time_factor": duration / self.wall_time,
-        }
+        } | ({"reason": self.reason} if self.reason else {})
 
     def save(self, path: Path) -> None:
         """Writes the arrays of this flight as a compressed .npz file, the same bytes every time."""
@@ -75,6 +78,14 @@ class Flight:
             clearances=self.clearances,
             hypotheses=self.hypotheses,
         )
+
+
+class FlightError(ValueError):
+    """A system of the flight raised; `flight` is what was flown until then."""
+
+    def __init__(self, flight: Flight) -> None:
+        super().__init__(f"the flight ended {flight.reason}")
+        self.flight = flight
 
 
 def fly(
@@ -91,6 +102,12 @@ def fly(
         diagram, scenario, world: as built.
         progress: called with the simulated time [s] now and then.
         realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
+
+    Returns:
+        The flight. Its outcome is `ERROR` if a system raised `InfeasibleFlightError` after time 0.
+
+    Raises:
+        FlightError: from any other exception after time 0.
     """
     simulator = flight_simulator(diagram, scenario, world, progress)
     simulator.set_target_realtime_rate(realtime_rate)
@@ -100,7 +117,17 @@ def fly(
     plant_context.SetContinuousState(sample_initial_state(scenario, world))
     simulator.Initialize()
     started = time.perf_counter()
-    simulator.AdvanceTo(scenario.timeout)
+    try:
+        simulator.AdvanceTo(scenario.timeout)
+    except Exception as error:
+        if root.get_time() == 0.0 or isinstance(error, MemoryError):
+            raise
+        wall_time = time.perf_counter() - started
+        flight = record_flight(diagram, root, world, Outcome.ERROR, wall_time)
+        flight = replace(flight, reason=_reason(error, root.get_time(), flight.states[-1]))
+        if isinstance(error, InfeasibleFlightError):
+            return flight
+        raise FlightError(flight) from error
     wall_time = time.perf_counter() - started
 
     p_WG = goal_of(scenario, world)
@@ -197,7 +224,8 @@ def has_landed(diagram: Diagram, context: Context) -> bool:
 def record_flight(
     diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
 ) -> Flight:
-    """What a flight left in the loggers of its diagram, which took `wall_time` [s]."""
+    """What a flight left in the loggers of its diagram, which took `wall_time` [s]. After an error
+    no port is evaluated: that could raise it again."""
     logs = {
         name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
         for name in ("state", "command")
@@ -205,7 +233,7 @@ def record_flight(
     times = logs["state"].sample_times().copy()
     # Copies: what a log returns is a view of memory that the diagram owns.
     states, commands = (log.data().T.copy() for log in logs.values())
-    if root.get_time() > times[-1]:
+    if root.get_time() > times[-1] and outcome is not Outcome.ERROR:
         times = np.append(times, root.get_time())
         states = np.vstack([states, _evaluated(diagram, "state", root)])
         commands = np.vstack([commands, _evaluated(diagram, "command", root)])
@@ -215,22 +243,30 @@ def record_flight(
         states=states,
         commands=commands,
         clearances=world.distances(times, QuadrotorState.of(states).p_WB) - VEHICLE_RADIUS,
-        hypotheses=_recorded_plans(diagram, root),
+        hypotheses=_recorded_plans(diagram, root, outcome is not Outcome.ERROR),
         wall_time=wall_time,
     )
 
 
-def _recorded_plans(diagram: Diagram, root: Context) -> np.ndarray:
+def _recorded_plans(diagram: Diagram, root: Context, with_last: bool) -> np.ndarray:
     """All plans that were made (M, size), or (0, 0) of a policy that makes none."""
     if not diagram.HasOutputPort("hypotheses"):
         return np.empty((0, 0))
     sink = cast(VectorLogSink, diagram.GetSubsystemByName("hypotheses_log"))
     plans = sink.FindLog(root).data().T.copy()
     # A log samples before the policy updates at the same instant: it lacks the last plan.
-    last = _evaluated(diagram, "hypotheses", root)
-    if last[0] != plans[-1, 0]:
-        plans = np.vstack([plans, last])
+    if with_last:
+        last = _evaluated(diagram, "hypotheses", root)
+        if last[0] != plans[-1, 0]:
+            plans = np.vstack([plans, last])
     return plans[np.isfinite(plans[:, 0])]
+
+
+def _reason(error: Exception, time: float, state: np.ndarray) -> str:
+    """When and in which state (13,) which exception was raised."""
+    p_WB, v_WB, _, _ = (part.round(2).tolist() for part in QuadrotorState.of(state))
+    kind = "" if isinstance(error, InfeasibleFlightError) else f"{type(error).__name__}: "
+    return f"at t = {time:.2f} s, p_WB = {p_WB} m, v_WB = {v_WB} m/s: {kind}{error}"
 
 
 def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:

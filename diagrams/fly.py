@@ -2,13 +2,14 @@
 
 import contextlib
 import time
+import traceback
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 from pydrake.systems.framework import Diagram
 
-from splatpilot.diagrams.flight import Flight, fly
+from splatpilot.diagrams.flight import Flight, FlightError, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight_files import FLIGHT_FILES, write_flight, write_summary
 from splatpilot.diagrams.flight_page import (
@@ -29,6 +30,8 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.state_to_pose import pose_from_state
 from splatpilot.systems.visualization.video_recorder import VideoRecorder
 
+_TRACEBACK = "traceback.txt"
+
 
 @holds_folder("out")
 def run(
@@ -45,6 +48,7 @@ def run(
 
     - `flight.html`: a page to watch it in, see `replay_page`;
     - `flight.mp4`: what the onboard camera saw, colour beside depth;
+    - `traceback.txt`, if an exception other than `InfeasibleFlightError` ended the flight;
     - what `write_flight` and `write_summary` write, the former before any picture is made.
 
     Args:
@@ -62,10 +66,10 @@ def run(
         OSError: if `out` holds anything and is not to be overwritten, or cannot be written; nothing
             is flown then.
     """
+    scenario.validate()
     for path in (out, graphviz):
         if path is not None:
             require_unused(path, overwrite)
-    scenario.validate()
     if graphviz is not None:
         require_writable_folder(graphviz.parent)
     print(f"Building the world, seed {scenario.seed}...", flush=True)
@@ -83,10 +87,17 @@ def run(
     if graphviz is not None:
         with written_atomically(graphviz) as path:
             path.write_text(diagram.GetGraphvizString())
-    flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
-    for name in ("flight.html", "flight.mp4", *FLIGHT_FILES):
+    failure = None
+    try:
+        flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
+    except FlightError as error:
+        flight, failure = error.flight, error
+    for name in ("flight.html", "flight.mp4", _TRACEBACK, *FLIGHT_FILES):
         (out / name).unlink(missing_ok=True)
     write_flight(out, scenario, flight)
+    if failure is not None:
+        with written_atomically(out / _TRACEBACK) as path:
+            path.write_text("".join(traceback.format_exception(failure)))
     camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
     summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
     write_summary(out, summary)
@@ -95,7 +106,7 @@ def run(
     name = f"{world.name}, seed {scenario.seed}"
     shown = replayed_flight(name, flight, frames)
     write_flight_page(out / "flight.html", scenario, world, [shown])
-    written = ["flight.html", *FLIGHT_FILES]
+    written = ["flight.html", *FLIGHT_FILES, *([_TRACEBACK] if failure is not None else [])]
     if video:
         recorder.save(out / "flight.mp4", scenario.camera.z_far)
         written.insert(1, "flight.mp4")

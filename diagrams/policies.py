@@ -10,6 +10,7 @@ from pydrake.systems.framework import System
 
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.configuration import require_configuration
+from splatpilot.systems.messages import require
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
@@ -117,8 +118,8 @@ register_policy(
     name="agile_autonomy",
 )
 
-DEFAULT_SPEED = 2.0
-"""[m/s], nominal, where nobody says another."""
+DEFAULT_SPEED, MAX_SPEED = 2.0, 20.0
+"""[m/s], the nominal speed if none is given, and the largest that a policy can be given."""
 
 BENCHMARK_POLICIES = tuple(POLICIES.registered())
 """Those that a study flies when nobody says which: our own, whatever else is installed, but for
@@ -176,9 +177,10 @@ def at_speed(config: Any, speed: float) -> Any:
     field = POLICIES.kind_of(config).speed_field
     if not field:
         raise ValueError(
-            f"the policy {name_of(config)} flies as fast as it has learned and cannot be asked for "
-            f"{speed:g} m/s; leave the speed out"
+            f"the policy {name_of(config)} flies as fast as it has learned, not at {speed:g} m/s; "
+            "leave the speed out"
         )
+    require(0.0 < speed <= MAX_SPEED, "the speed", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
     return _with_field(config, field, speed)
 
 

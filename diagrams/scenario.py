@@ -13,7 +13,9 @@ from splatpilot.diagrams.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.make_world import WORLDS, WorldConfig
 from splatpilot.systems.configuration import open_field
+from splatpilot.systems.messages import FieldError, require
 from splatpilot.systems.policies.privileged_planner import PrivilegedPlannerConfig
+from splatpilot.systems.seeds import check_seed
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
@@ -58,7 +60,8 @@ def _default_simulator() -> SimulatorConfig:
 class Scenario:
     """One flight. The same scenario gives the same flight, bit for bit."""
 
-    # Seed of everything random: the world where it is generated, and the start's offset.
+    # Seed of everything random, in [0, 2147483647]: the environment if it is generated, and the
+    # start's offset.
     seed: int = 0
     # What is flown in: a generated world, or (!SceneConfig) a reconstructed scene, or another of
     # `make_world.py` and of other packages.
@@ -96,58 +99,55 @@ class Scenario:
         Raises:
             ValueError: naming the field, its value and its limit.
         """
-        _check("seed", self.seed, self.seed >= 0, "at least 0")
-        _check("appearance", self.appearance, 0 <= self.appearance <= 1, "0 to 1")
-        _check("start_radius", self.start_radius, 0 <= self.start_radius <= 1, "0 to 1 m")
-        _check("goal_radius", self.goal_radius, 0 < self.goal_radius < inf, "positive")
-        _check("timeout", self.timeout, 0 < self.timeout <= 3600, "more than 0, at most 3600 s")
+        check_seed(self.seed)
+        require(0 <= self.appearance <= 1, "appearance", "in [0, 1]", self.appearance)
+        require(0 <= self.start_radius <= 1, "start_radius", "in [0, 1] m", self.start_radius)
+        require(0 < self.goal_radius < inf, "goal_radius", "positive and finite", self.goal_radius)
+        require(0 < self.timeout <= 3600, "timeout", "in (0, 3600] s", self.timeout)
         for name in ("start", "goal"):
             point = getattr(self, name)
             valid = point is None or (len(point) == 3 and np.isfinite(point).all())
-            _check(name, point, valid, "three finite numbers x, y, z in metres")
+            require(valid, name, "three finite numbers x, y, z [m]", point)
         parts = [(WORLDS, self.world), (POLICIES, self.policy)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
             registry.kind_of(part)
-            part.validate()
+            try:
+                part.validate()
+            except FieldError as error:
+                raise error.within(self) from None
         self.observation.validate()
         _check_camera(self.camera)
         _check_simulator(self.simulator)
-
-
-def _check(name: str, value: object, valid: bool | np.bool_, limit: str) -> None:
-    if not valid:
-        raise ValueError(f"{name} is {value}; it must be {limit}")
 
 
 def _check_camera(camera: CameraConfig) -> None:
     pixels = camera.width * camera.height
     valid = camera.width > 1 and camera.height > 1 and pixels <= _MAX_PIXELS
     size = f"{camera.width}x{camera.height} pixels"
-    _check("camera", size, valid, f"at least 2x2 and at most {_MAX_PIXELS} pixels")
+    require(valid, "camera", f"at least 2x2 and at most {_MAX_PIXELS} pixels", size)
     try:
         focal = (camera.focal_x(), camera.focal_y())
     except RuntimeError:  # Drake's way to say that there is neither
-        raise ValueError(
-            "camera.focal is without x and y; it must have one of them at least"
-        ) from None
-    _check("camera.focal", focal, all(0 < f < inf for f in focal), "positive and finite [pixels]")
+        raise ValueError("camera.focal must have x or y or both, got neither") from None
+    require(all(0 < f < inf for f in focal), "camera.focal", "positive and finite [pixels]", focal)
     center = camera.principal_point()
     valid = np.all((center > 0) & (center < [camera.width, camera.height]))
-    _check("camera's principal point", center.tolist(), valid, "inside the image [pixels]")
-    _check("camera.fps", camera.fps, 0.01 <= camera.fps <= 1000, "0.01 to 1000 Hz")
+    require(valid, "camera's principal point", "inside the image [pixels]", center.tolist())
+    require(0.01 <= camera.fps <= 1000, "camera.fps", "in [0.01, 1000] Hz", camera.fps)
     for name in WITHOUT_EFFECT:
         value, default = (repr(getattr(c, name)) for c in (camera, CameraConfig()))
-        _check(f"camera.{name}", value, value == default, "left out: a splat camera ignores it")
+        ignored = "a splat camera ignores it"
+        require(value == default, f"camera.{name}", "left out", value, ignored)
 
 
 def _check_simulator(simulator: SimulatorConfig) -> None:
     known = GetIntegrationSchemes()
     scheme = simulator.integration_scheme
-    _check("simulator.integration_scheme", scheme, scheme in known, f"one of {', '.join(known)}")
+    require(scheme in known, "simulator.integration_scheme", f"one of {', '.join(known)}", scheme)
     step = simulator.max_step_size
-    _check("simulator.max_step_size", step, 1e-5 <= step <= 1, "1e-5 to 1 s")
+    require(1e-5 <= step <= 1, "simulator.max_step_size", "in [1e-5, 1] s", step)
     accuracy = simulator.accuracy
-    _check("simulator.accuracy", accuracy, 0 < accuracy < 1, "between 0 and 1")
+    require(0 < accuracy < 1, "simulator.accuracy", "in (0, 1)", accuracy)
     for name in ("start_time", "target_realtime_rate"):
         value = getattr(simulator, name)
-        _check(f"simulator.{name}", value, value == 0, "0: flights start then, as fast as they can")
+        require(value == 0, f"simulator.{name}", "0", value, "flights start then and do not wait")

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from splatpilot.systems.messages import unknown
+
 _FOLDER = Path(__file__).parent / "scenarios"
 
 
@@ -32,7 +34,4 @@ def scenario_file(scenario: str) -> Path:
         return known[scenario]
     if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
         return Path(scenario)
-    raise ValueError(
-        f"there is no scenario {scenario!r}; there are {', '.join(known)}, and others are given as "
-        "YAML files"
-    )
+    raise ValueError(unknown("scenario", scenario, known, "and others as YAML files"))

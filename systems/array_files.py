@@ -72,8 +72,9 @@ def array_layout(path: Path) -> tuple[tuple[int, ...], np.dtype]:
 
 def reason_of(error: object) -> str:
     """What an exception of a library says, in one line that does not repeat whole files."""
-    words = (word if len(word) <= 80 else f"{word[:40]}..." for word in str(error).split())
-    return " ".join(words)[:300] or type(error).__name__
+    words = str(error).split()
+    short = (word if len(word) <= 80 else f"{word[:20]}...{word[-40:]}" for word in words)
+    return " ".join(short)[:300] or type(error).__name__
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:

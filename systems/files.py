@@ -97,10 +97,10 @@ def remove_leftovers(folder: Path) -> None:
 def require_existing(path: Path, what: str) -> None:
     """
     Raises:
-        FileNotFoundError: if nothing is there; the message says that `what` is needed.
+        FileNotFoundError: if nothing is there; the message says that `what` is expected.
     """
     if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file or folder; {what} is needed")
+        raise FileNotFoundError(f"No such file or folder: {path}; expected {what}")
 
 
 def require_unused(path: Path, overwrite: bool) -> None:

@@ -9,7 +9,10 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+from splatpilot.systems.messages import unknown
+
 _OURS = "splatpilot."
+_OTHER = "and module:attribute of your own"
 _others: set[str] = set()
 _ATTRIBUTE = re.compile(r"[\w.]+:[\w.]+")
 
@@ -82,7 +85,7 @@ class Registry[Kind]:
         if _ATTRIBUTE.fullmatch(name):
             _look_here_too()
             return self._load(EntryPoint(name=name, value=name, group=self.group))
-        raise ValueError(_unknown(self.what, name, self.names()))
+        raise ValueError(unknown(self.what, name, self.names(), _OTHER))
 
     def kind_of(self, config: Any) -> Kind:
         """
@@ -137,7 +140,9 @@ class Registry[Kind]:
         _others.add(point.module.partition(".")[0])
         try:
             value = point.load()
-        except (ImportError, AttributeError) as error:
+        except ImportError as error:
+            raise ValueError(_not_imported(point.module, error)) from error
+        except AttributeError as error:
             raise ValueError(
                 f"the {self.what} {point.name!r} is not at {point.value}: {error}"
             ) from error
@@ -167,7 +172,7 @@ def check_name(what: str, group: str, name: str, ours: Sequence[str]) -> None:
     """
     announced = [point.name for point in _installed(group, tuple(sys.path))]
     if name not in (*ours, *announced) and not _ATTRIBUTE.fullmatch(name):
-        raise ValueError(_unknown(what, name, [*ours, *announced]))
+        raise ValueError(unknown(what, name, [*ours, *announced], _OTHER))
 
 
 @functools.cache
@@ -175,13 +180,6 @@ def _installed(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """The entry points of a group that packages on the `path` announce, whose files take 50 ms to
     read."""
     return tuple(entry_points(group=group))
-
-
-def _unknown(what: str, name: str, known: Sequence[str]) -> str:
-    return (
-        f"there is no {what} {name!r}; there are {', '.join(dict.fromkeys(known))}, and "
-        "module:attribute of your own"
-    )
 
 
 def import_modules(names: Sequence[str]) -> None:
@@ -199,10 +197,14 @@ def import_modules(names: Sequence[str]) -> None:
         except SyntaxError as error:
             raise ValueError(f"the module {name} cannot be imported: {error}") from error
         except ImportError as error:
-            raise ValueError(
-                f"the module {name} cannot be imported: {error}; install it, or put its folder "
-                "into PYTHONPATH"
-            ) from error
+            raise ValueError(_not_imported(name, error)) from error
+
+
+def _not_imported(module: str, error: ImportError) -> str:
+    return (
+        f"the module {module} cannot be imported: {error}; install it, run in its folder, or put "
+        "that into PYTHONPATH"
+    )
 
 
 def packages_of_others() -> set[str]:

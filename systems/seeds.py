@@ -9,6 +9,9 @@
 | from 3,000,000 | Monte Carlo simulations |
 """
 
+from splatpilot.systems.messages import require
+
+MAX_SEED = 2**31 - 1
 TRAINING_SEEDS = 1_000_000
 VALIDATION_SEEDS = 2_000_000
 SEEDS_PER_RUN = 1000
@@ -42,6 +45,11 @@ def describe_seeds(split: str, count: int) -> str:
     return f"{SPLIT_NAMES[split]} seeds {seeds[0]} to {seeds[-1]}"
 
 
+def check_seed(seed: int) -> None:
+    """Raises ValueError unless a seed is in [0, `MAX_SEED`]."""
+    require(0 <= seed <= MAX_SEED, "seed", f"in [0, {MAX_SEED}]", seed)
+
+
 def first_training_seed(run: int) -> int:
     """Returns the first of the `SEEDS_PER_RUN` seeds of a training run, named by its own seed.
 
@@ -49,6 +57,5 @@ def first_training_seed(run: int) -> int:
         ValueError: for a run whose seeds would reach into those of validation.
     """
     runs = (VALIDATION_SEEDS - TRAINING_SEEDS) // SEEDS_PER_RUN
-    if not 0 <= run < runs:
-        raise ValueError(f"seed is {run}; it must be 0 to {runs - 1}")
+    require(0 <= run < runs, "seed", f"in [0, {runs - 1}]", run)
     return TRAINING_SEEDS + run * SEEDS_PER_RUN

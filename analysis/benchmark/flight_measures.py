@@ -19,7 +19,7 @@ def flight_measures(flight: Flight, shortest: float) -> dict[str, float | str | 
     The measures of a flight, by the names of their columns.
 
     - `success`: the goal was reached, and the clearance at the vehicle's radius never negative;
-    - `outcome`: `goal`, `collision`, `left_volume` or `timeout`;
+    - `outcome`: `goal`, `collision`, `left_volume`, `timeout` or `error`;
     - `flight_time_s`, `path_length_m`, `mean_speed_m_s`, `min_clearance_m`;
     - `shortest_path_m`, `path_excess`: the way flown over the shortest way, less one; NaN of
       flights that did not arrive;

@@ -14,6 +14,7 @@ from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.study_inputs import kept_scenario
 from splatpilot.analysis.benchmark.tables import (
+    FAILURES,
     IN_DISTRIBUTION,
     PAPER_FLIGHTS,
     PaperRow,
@@ -111,7 +112,7 @@ def _warnings(
     ]
     lines += [f"{escape(problem)}; the flight was flown again" for problem in damaged]
     lines += [
-        f"{escape(row['id'])} could not be flown and counts as a failure: {escape(row['reason'])}"
+        f"{escape(row['id'])}, {row['outcome']}, counts as a failure: {escape(row['reason'])}"
         for row in rows
         if "reason" in row
     ]
@@ -120,8 +121,8 @@ def _warnings(
 
 def _policies(table: list[dict[str, Any]]) -> str:
     header = ["policy", "speed [m/s]", "flights", "success", "new scenarios"]
-    header += ["collision", "timeout", "left volume"]
-    header += ["infeasible", "not run", "scenarios passed", "min. clearance [m]"]
+    header += [outcome.replace("_", " ") for outcome in FAILURES]
+    header += ["not run", "scenarios passed", "min. clearance [m]"]
     header += ["velocity [m/s]", "path excess"]
     header += ["jerk [m/s³]", "smoothness"]
     rows = [
@@ -131,7 +132,7 @@ def _policies(table: list[dict[str, Any]]) -> str:
             str(row["flights"]),
             _rate(row),
             _clusters(row),
-            *(str(row[name]) for name in ("collision", "timeout", "left_volume", "infeasible")),
+            *(str(row[outcome]) for outcome in FAILURES),
             str(row["not_run"]),
             _passed(row),
             html_page.number(row["min_clearance_m"], "+.2f"),

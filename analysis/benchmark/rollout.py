@@ -34,8 +34,8 @@ ARRAYS = "times", "states", "commands", "clearances"
 """The arrays of `Flight` that a study keeps."""
 
 INFEASIBLE = "infeasible"
-"""The outcome of a flight that cannot be flown (`InfeasibleFlightError`); it counts as a failure,
-and its row says why."""
+"""The outcome of a flight that cannot be begun (`InfeasibleFlightError`); it counts as a failure,
+and its row says why. One that becomes infeasible in flight has the outcome `Outcome.ERROR`."""
 
 
 class Rollout(NamedTuple):
@@ -89,9 +89,9 @@ def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
     """
     Flies one flight of a study.
 
-    Flights fail by their outcome, or because they are infeasible. Nothing else is a failure of a
-    flight: a policy that raises, a scene that has gone or a want of memory says nothing about how
-    the policy flies, and a study that counted them would be wrong without anyone's noticing.
+    Flights fail by their outcome, or because they are or become infeasible. Nothing else is a
+    failure of a flight: a policy with a bug, a missing scene or lack of memory says nothing about
+    how the policy flies, and a study that counted them would be wrong unnoticed.
 
     Args:
         spec: the flight.
@@ -110,7 +110,10 @@ def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
             scenario.goal_radius,
         )
         measures = flight_measures(flight, shortest) | {"digest": digest(flight)}
-        timing |= _flight_timing(diagram, scenario, flight)
+        if flight.reason:  # deciding again could raise again
+            measures["reason"] = flight.reason
+        else:
+            timing |= _flight_timing(diagram, scenario, flight)
     except InfeasibleFlightError as error:
         flight = None
         measures = {"success": False, "outcome": INFEASIBLE, "reason": str(error)}

@@ -25,6 +25,7 @@ from splatpilot.analysis.benchmark.workers import fly_all
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
 from splatpilot.systems.cores import available_cores
+from splatpilot.systems.messages import require
 from splatpilot.systems.output_folders import holds_folder
 from splatpilot.systems.progress import Progress, resumable
 from splatpilot.systems.provenance import program
@@ -66,8 +67,7 @@ def run(
         OSError: if `out` cannot be written, the workers fail, or nothing can be flown because all
             scenes are absent.
     """
-    if jobs is not None and jobs < 1:
-        raise ValueError(f"--jobs is {jobs}; it must be at least 1")
+    require(jobs is None or jobs >= 1, "--jobs", "at least 1", jobs)
     scenarios = config.load_scenarios()
     share = config.rollouts() if shard is None else shard.of(config.rollouts())
     names = {spec.scenario for spec in share}
@@ -140,7 +140,7 @@ def conclude(
         print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
     for row in rows:
         if "reason" in row:
-            print(f"{row['id']} could not be flown: {row['reason']}")
+            print(f"{row['id']}, {row['outcome']}: {row['reason']}")
     print(f"Wrote rollouts.csv, timings.csv, table.csv and report.html in {folder.path}")
     return table
 

@@ -1,7 +1,6 @@
 """What a study is: the same flights for every policy, each with a name by which it can be flown
 again."""
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,10 +8,11 @@ from typing import Any, NamedTuple
 import yaml
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES, speed_of
+from splatpilot.diagrams.policies import BENCHMARK_POLICIES, MAX_SPEED, speed_of
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.messages import require
 from splatpilot.systems.seeds import study_seeds
 
 
@@ -111,8 +111,7 @@ class StudyConfig:
         """
         study_seeds(self.split, self.seeds)
         for speed in self.speeds:
-            if not 0.0 < speed < math.inf:
-                raise ValueError(f"the speed {speed:g} m/s cannot be flown; it must be positive")
+            require(0.0 < speed <= MAX_SPEED, "speeds", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
         self._check_names()
 
     def _check_names(self) -> None:

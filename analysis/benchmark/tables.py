@@ -22,6 +22,9 @@ from splatpilot.diagrams.scenario_files import benchmark_scenarios
 from splatpilot.systems.seeds import describe_seeds
 from splatpilot.training.world_kinds import PROCEDURAL
 
+FAILURES = Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, Outcome.ERROR, INFEASIBLE
+"""The outcomes that tables count, next to the successes."""
+
 MEASURES = (
     "min_clearance_m",
     "mean_speed_m_s",
@@ -85,10 +88,7 @@ def success_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "wilson_upper": interval.upper,
         "cluster_lower": clusters.lower,
         "cluster_upper": clusters.upper,
-    } | {
-        str(outcome): sum(row["outcome"] == outcome for row in rows)
-        for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, INFEASIBLE)
-    }
+    } | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
 
 
 def mean_of(rows: list[dict[str, Any]], name: str) -> float:

@@ -7,6 +7,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from splatpilot.systems.messages import require
+
 SCENARIO = "scenario"
 """The policy that is the scenario's own: what stands in its `policy` block."""
 
@@ -76,11 +78,19 @@ def parse_variant(text: str) -> Variant:
     for override in overrides:
         field = override.partition("=")[0].rpartition(".")[2]
         remedy = {
-            "speed": "--speeds, and of `fly` --speed, say how fast all policies fly",
+            "speed": "give the speed of all policies by --speed (fly) or --speeds (benchmark)",
             "weights": "give the file of weights as the policy, LABEL=FILE.npz",
         }.get(field)
         if remedy:
-            raise ValueError(f"the policy {text!r} sets {override}; leave it out: {remedy}")
+            raise ValueError(f"the policy {text!r} must not set {field}; {remedy}")
+    file = Path(policy[:100])
+    require(
+        policy.endswith(".npz") or not (policy.endswith(".py") or "/" in policy),
+        "a policy",
+        "a name, a file of weights (.npz) or module:Class",
+        str(file),
+        f"of a class in {file.name}, write {file.stem}:CLASS in the folder of that file",
+    )
     if not label:
         name = Path(policy).stem if policy.endswith(".npz") else policy.rpartition(":")[2]
         label = "-".join([name, *(override.replace("=", "-", 1) for override in overrides)])

@@ -3,10 +3,10 @@
 import argparse
 from pathlib import Path
 
+from splatpilot.analysis.commands.checks import find_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.reconstruct import reconstruction_defaults
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -34,8 +34,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _ablate(options: argparse.Namespace) -> None:
-    for capture in options.captures:
-        require_existing(capture, "the folder of a capture, or a scene,")
+    options.captures = [find_place(path, "capture", "scene") for path in options.captures]
     from splatpilot.systems.progress import say
 
     say(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")

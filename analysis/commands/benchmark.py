@@ -149,4 +149,4 @@ def _speed(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"the speed {text!r} is no number; give metres per second") from None
+        raise ValueError(f"--speeds must be numbers in m/s, got {text!r}") from None

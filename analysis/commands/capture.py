@@ -4,10 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_place
+from splatpilot.analysis.commands.checks import find_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import FailureWithResultError, add_json, add_verb
-from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -53,7 +52,7 @@ def _check_defaults(options: argparse.Namespace) -> Any:
 
 
 def _check(options: argparse.Namespace) -> Any:
-    require_existing(options.capture, "the folder of a capture")
+    options.capture = find_place(options.capture, "capture")
     from splatpilot.systems.progress import say
 
     say(f"checking {options.capture}")
@@ -101,7 +100,7 @@ def _render_defaults(options: argparse.Namespace) -> Any:
 
 
 def _render(options: argparse.Namespace) -> None:
-    check_place(options.world, "a .glb, .gltf, .obj or a scenario")
+    options.world = find_place(options.world, "mesh", "scenario")
     from splatpilot.systems.progress import say
 
     say(f"rendering {options.world} to {options.out}")

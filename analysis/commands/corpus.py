@@ -8,6 +8,7 @@ from splatpilot.analysis.commands.checks import check_config
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing, require_unused
+from splatpilot.systems.messages import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -91,10 +92,8 @@ def _add_inspect(actions: argparse._SubParsersAction) -> None:
 def _inspect(options: argparse.Namespace) -> None:
     require_existing(options.corpus, "the folder of a corpus")
     require_unused(options.out, options.overwrite)
-    if options.out.suffix.lower() != ".png":
-        raise ValueError(f"--out is {options.out}; the sheet is a PNG file")
-    if options.samples < 1:
-        raise ValueError(f"--samples is {options.samples}; it must be at least 1")
+    require(options.out.suffix.lower() == ".png", "--out", "a PNG file", options.out)
+    require(options.samples >= 1, "--samples", "at least 1", options.samples)
     from splatpilot.analysis.corpus_sheet import draw_sheet
     from splatpilot.training.corpus.corpus import Corpus
 

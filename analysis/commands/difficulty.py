@@ -4,6 +4,7 @@ import argparse
 
 from splatpilot.analysis.commands.checks import SCENARIOS, check_scenario
 from splatpilot.analysis.commands.verb import add_named, add_verb
+from splatpilot.systems.messages import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -30,8 +31,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _difficulty(options: argparse.Namespace) -> None:
     for scenario in options.scenarios:
         check_scenario(scenario)
-    if options.seeds < 1:
-        raise ValueError(f"--seeds is {options.seeds}; it must be at least 1")
+    require(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
     from splatpilot.analysis import difficulty
 
     difficulty.run(scenarios=options.scenarios, seeds=options.seeds)

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
@@ -43,6 +44,8 @@ def _fidelity(options: argparse.Namespace) -> None:
     from splatpilot.systems.progress import say
 
     say(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
+    for scene in options.scenes:
+        check_kind(scene, "scene")
     from splatpilot.analysis.fidelity import run as fidelity
     from splatpilot.systems.configuration import load_config
 

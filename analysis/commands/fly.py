@@ -9,7 +9,12 @@ from splatpilot.analysis.commands.scenario_options import (
     name_of_flight,
     read_scenario,
 )
-from splatpilot.analysis.commands.verb import add_json, add_overwrite, add_verb
+from splatpilot.analysis.commands.verb import (
+    FailureWithResultError,
+    add_json,
+    add_overwrite,
+    add_verb,
+)
 from splatpilot.systems.files import require_unused
 
 
@@ -48,7 +53,7 @@ def _fly(options: argparse.Namespace) -> Any:
 
     from splatpilot.diagrams import fly
 
-    return fly.run(
+    summary = fly.run(
         scenario=scenario,
         out=options.out or Path("out") / name_of_flight(options, scenario),
         live=options.live,
@@ -56,3 +61,6 @@ def _fly(options: argparse.Namespace) -> Any:
         graphviz=options.graphviz,
         overwrite=options.overwrite,
     )
+    if "reason" in summary:
+        raise FailureWithResultError(f"the flight ended {summary['reason']}", summary)
+    return summary

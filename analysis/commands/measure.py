@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.systems.files import require_existing
 
@@ -26,6 +27,7 @@ def _measure(options: argparse.Namespace) -> None:
     from splatpilot.systems.progress import say
 
     say(f"measuring {options.scene}")
+    check_kind(options.scene, "scene")
     from splatpilot.analysis.reconstruction import measure_scene
 
     measure_scene.run(options.scene, options.overwrite)

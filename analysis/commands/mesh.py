@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import check_place
+from splatpilot.analysis.commands.checks import find_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.analysis.commands.view import scenario_defaults
@@ -38,7 +38,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _mesh(options: argparse.Namespace) -> None:
-    check_place(Path(options.what), "a scene, an OctoMap or a scenario")
+    options.what = str(find_place(Path(options.what), "scene", "map", "scenario"))
     require_unused(options.out, options.overwrite)
     import_extra("manifold3d", "mesh")
     from splatpilot.analysis import mesh

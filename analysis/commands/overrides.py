@@ -26,6 +26,8 @@ class SetField(argparse.Action):
 
             print(format_settings(self.configuration(namespace)))
             parser.exit()
+        if "=" not in values:
+            raise argparse.ArgumentError(None, f"--set must be FIELD=VALUE, got {values!r}")
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), values])
 
 

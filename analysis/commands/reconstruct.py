@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from splatpilot.analysis.commands.checks import find_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -39,7 +39,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
-    require_existing(options.capture, "the folder of a capture")
+    options.capture = find_place(options.capture, "capture")
     from splatpilot.systems.progress import say
 
     say(f"reconstructing {options.capture} as {options.out}")

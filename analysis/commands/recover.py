@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import check_config
+from splatpilot.analysis.commands.checks import LEARN_FROM_CORPORA, check_config, check_corpora
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.train import trainer_defaults
 from splatpilot.analysis.commands.verb import add_verb
@@ -25,7 +25,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
             "--flown-by out/rgb/stage_2/student_rgb.npz",
         ),
     )
-    recover.add_argument("policy", choices=["student_rgb", "student_depth", "diffaero_rgb"])
+    recover.add_argument("policy", choices=LEARN_FROM_CORPORA)
     recover.add_argument(
         "--out",
         type=Path,
@@ -48,6 +48,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _recover(options: argparse.Namespace) -> None:
     check_config(options.config)
+    check_corpora([options.policy], options.overrides, options.config)
     from splatpilot.systems.progress import resumable, say
 
     say(f"training {options.policy} with recovery in {options.out}")

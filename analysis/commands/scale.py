@@ -4,6 +4,7 @@ import argparse
 import re
 from pathlib import Path
 
+from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.verb import add_verb
 from splatpilot.systems.files import require_existing
 
@@ -60,6 +61,7 @@ def _scale(options: argparse.Namespace) -> None:
     points = [_point("--between", text) for text in options.between or ()]
     floor = [_point("--floor", text) for text in options.floor or ()]
     require_existing(options.scene, "a scene folder or a file of Gaussians")
+    check_kind(options.scene, "scene", "gaussians")
     from splatpilot.analysis.reconstruction import rescale
 
     rescale.run(

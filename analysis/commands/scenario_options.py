@@ -5,7 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatpilot.analysis.benchmark.variants import parse_variant
-from splatpilot.analysis.commands.checks import POLICIES, SCENARIOS, check_policy, check_scenario
+from splatpilot.analysis.commands.checks import (
+    POLICIES,
+    SCENARIOS,
+    check_kind,
+    check_policy,
+    check_scenario,
+)
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_named
 from splatpilot.systems.environment import require_scene
@@ -59,7 +65,7 @@ def check_scenario_options(options: argparse.Namespace) -> None:
     if options.policy is not None:
         check_policy(parse_variant(options.policy))
     if options.scene is not None:
-        require_scene(str(options.scene))
+        check_kind(require_scene(str(options.scene)), "scene", "gaussians", "map")
 
 
 def read_scenario(options: argparse.Namespace) -> "Scenario":

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_place
+from splatpilot.analysis.commands.checks import find_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_verb
 
@@ -44,7 +44,7 @@ def _defaults(options: argparse.Namespace) -> Any:
 
 
 def _tour(options: argparse.Namespace) -> None:
-    check_place(options.world, "a .glb, .gltf, .obj or a scenario")
+    options.world = find_place(options.world, "mesh", "scenario")
     from splatpilot.analysis import tour
     from splatpilot.systems.configuration import load_config
 

@@ -7,11 +7,13 @@ from typing import Any
 from splatpilot.analysis.commands.checks import (
     TRAINERS,
     check_config,
+    check_corpora,
     check_scenario,
     check_trainer,
 )
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_named, add_verb
+from splatpilot.systems.messages import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -71,8 +73,7 @@ def trainer_defaults(options: argparse.Namespace) -> Any:
 
 
 def _train(options: argparse.Namespace) -> None:
-    if options.jobs is not None and options.jobs < 1:
-        raise ValueError(f"--jobs is {options.jobs}; it must be at least 1")
+    require(options.jobs is None or options.jobs >= 1, "--jobs", "at least 1", options.jobs)
     scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
     for name in scenarios:
         check_scenario(name)  # before the training, not after it
@@ -82,6 +83,7 @@ def _train(options: argparse.Namespace) -> None:
         if twice := [one for k, one in enumerate(given) if one in given[:k]]:
             raise ValueError(f"the {what} {twice[0]} is given twice; leave one out")
     check_config(options.config)
+    check_corpora(options.policies, options.overrides, options.config)
     from splatpilot.systems.progress import resumable, say
 
     say(f"training {', '.join(options.policies)} in {options.out}")

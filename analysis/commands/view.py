@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import SCENARIOS, check_place
+from splatpilot.analysis.commands.checks import SCENARIOS, find_place
 from splatpilot.analysis.commands.overrides import add_overrides
 from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 from splatpilot.diagrams.scenario_files import scenario_file
@@ -50,7 +50,8 @@ def scenario_defaults(options: argparse.Namespace) -> Any:
 
 
 def _view(options: argparse.Namespace) -> None:
-    check_place(Path(options.what), "a scene, an OctoMap, a capture or a scenario")
+    kinds = "scene", "gaussians", "map", "capture", "scenario"
+    options.what = str(find_place(Path(options.what), *kinds))
     if options.viser and options.out is not None:
         raise ValueError(f"--out {options.out} and --viser: viser writes no page; keep one of them")
     if options.viser:

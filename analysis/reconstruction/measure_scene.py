@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from splatpilot.analysis.reconstruction.default_flight import unseen_share
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     Scale,
@@ -60,7 +61,8 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
         frames[i] = views.measure(frame, views.seen(frame), lpips)
         strict[i] = views.measure(frame, lpips=lpips, fit_gain=False)
     height, width = size
-    measures = SceneMeasures(bool(views.metadata.held_out), width, height, frames, strict, missing)
+    held_out, unseen = bool(views.metadata.held_out), unseen_share(scene)
+    measures = SceneMeasures(held_out, width, height, frames, strict, missing, unseen)
     _write_views(scene / SHEET, views, measures)
     with written_atomically(scene / METRICS) as partial:  # Last: it says that all is there.
         partial.write_text(json.dumps(measures.as_json(), indent=2))

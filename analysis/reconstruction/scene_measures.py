@@ -19,6 +19,8 @@ NAMES = {
     "unseen_fraction": ("left out as unseen", "{:.2%}"),
 }
 """How measures are called and written in tables."""
+_MOSTLY_UNSEEN = 0.5
+"""Share of the pixels of the default flight from which on a warning is given."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class SceneMeasures:
     """In all pixels, with a gain of 1."""
     lpips_missing: str
     """Why there is no LPIPS; empty if there is."""
+    flight_unseen_fraction: float | None
+    """See `unseen_share`; None of a scene that cannot be flown in."""
 
     def mean(self, name: str) -> float | None:
         """Returns the mean of a measure over the frames that have it; None if none has."""
@@ -62,6 +66,7 @@ class SceneMeasures:
             "width": self.width,
             "height": self.height,
             "lpips_missing": self.lpips_missing,
+            "flight_unseen_fraction": self.flight_unseen_fraction,
             "frames": {str(i): asdict(frame) for i, frame in self.frames.items()},
             "strict_frames": {str(i): asdict(f) for i, f in self.strict_frames.items()},
         }
@@ -81,6 +86,13 @@ class SceneMeasures:
             lines.append(f"{title:<22} {told:<26} {strict}")
         worst = format_measure(self.worst_hole_fraction, NAMES["hole_fraction"][1])
         lines.append(f"{'holes, worst frame':<22} {worst}")
+        unseen = self.flight_unseen_fraction
+        lines.append(f"{'unseen in flight':<22} {format_measure(unseen, '{:.1%}')}")
+        if unseen is not None and unseen > _MOSTLY_UNSEEN:
+            lines.append(
+                "warning: a flight from the default start to the default goal looks mostly into "
+                "space that no camera saw; capture it looking ahead along such routes"
+            )
         if self.lpips_missing:
             lines.append(f"no LPIPS: {self.lpips_missing}")
         return "\n".join(lines)

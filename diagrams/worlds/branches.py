@@ -16,6 +16,7 @@ from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.systems.collision.shapes import Capsule
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
@@ -45,7 +46,8 @@ def branches_blueprint(config: BranchesConfig, seed: int) -> Blueprint:
     """Grows the forest of `config` and puts limbs and wires into it.
 
     Raises:
-        ValueError: see `forest_blueprint`; or if limbs and wires leave no way.
+        ValueError: see `forest_blueprint`.
+        InfeasibleFlightError: if limbs and wires leave no route.
     """
     forest = Forest(config, seed)
     bare = forest.blueprint()
@@ -54,8 +56,8 @@ def branches_blueprint(config: BranchesConfig, seed: int) -> Blueprint:
         blueprint = replace(bare, name="branches", solids=[*bare.solids, *thin])
         if is_feasible(blueprint):
             return replace(blueprint, gaussians=partial(_gaussians, forest, blueprint, thin))
-    raise ValueError(
-        f"branches: limbs = {config.limbs} and wires = {config.wires} leave no way in {TRIES} "
+    raise InfeasibleFlightError(
+        f"branches: limbs = {config.limbs} and wires = {config.wires} leave no route in {TRIES} "
         f"draws from seed {seed}; use fewer of them or a wider spacing"
     )
 

@@ -10,6 +10,7 @@ from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf_from_distance_field import cubes_of_points
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.seeds import check_seed
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
@@ -23,11 +24,10 @@ def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -
     """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
 
     Raises:
-        ValueError: for a negative seed.
+        ValueError: for a seed out of range.
         InfeasibleFlightError: if none of `TRIES` instances is feasible.
     """
-    if seed < 0:
-        raise ValueError(f"seed = {seed} must be 0 or more")
+    check_seed(seed)
     name = "world"
     for attempt in range(TRIES):
         blueprint = draw(np.random.default_rng([seed, attempt]))

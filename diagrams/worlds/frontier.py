@@ -1,5 +1,6 @@
 """The surface that closes a captured place where nobody looked any further."""
 
+import functools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -8,12 +9,14 @@ from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.frontier import (
     frontier_faces,
     hidden_frontier,
     reachable_space,
     with_obstacles,
 )
+from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -27,6 +30,13 @@ _COVERAGE = 0.55
 """Standard deviation of a surfel over the edge of its square. Less than in generated worlds, whose
 patches may hang over edges a little more: here that would hide what was captured."""
 
+_WIDTH = 160
+"""[px], about as wide depth images are thinned to."""
+
+_FAR_VOXEL, _FAR_VOXELS = 2, 2e6
+"""[-] Edge of the voxels in which the frontier beyond the field's range is found, in voxels of the
+field, and how many there may be."""
+
 _STRIPE = 0.4
 """[m], period of the hatching along each axis."""
 
@@ -37,24 +47,50 @@ _SHADES = np.array([0.62, 0.42])
 def close_frontier(
     esdf: Esdf, depths: Iterable[np.ndarray], K: np.ndarray, X_WCs: Sequence[RigidTransform]
 ) -> tuple[Esdf, GaussianScene | None]:
-    """Closes a captured place where space that the vehicle can look into ends in unknown space.
+    """Closes a captured scene where space that the vehicle can look into ends in unknown space.
 
     Without it nothing would be seen there, and flights would end all the same. What nobody looked
-    into begins with obstacles, and hatched surfels stand on them. Space before the sky stays open.
+    into begins with obstacles, and hatched surfels are drawn on them. Space before the sky, and
+    before what was captured beyond the field's range, stays open. There the surfels begin where
+    the images saw no farther, on a coarse grid of its own: none hides what was captured.
 
     Args:
-        esdf: the place.
+        esdf: the distance field of the scene.
         depths, K, X_WCs: what it was made of, see `esdf_from_depth_images`.
 
     Returns:
         The distance field with these obstacles, and the surfels; `esdf` and None where there is
         nothing to close.
     """
-    reachable = reachable_space(esdf, VEHICLE_RADIUS)
-    hidden, before = hidden_frontier(esdf, reachable, depths, K, X_WCs)
-    if not hidden.any():
+    images = []
+    for depth in depths:
+        step = max(depth.shape[1] // _WIDTH, 1)
+        images.append(depth[step // 2 :: step, step // 2 :: step])
+        if len(images) == 1:
+            K = np.diag([1 / step, 1 / step, 1.0]) @ K
+    views = images, K, X_WCs
+    hidden, before, beyond = hidden_frontier(esdf, reachable_space(esdf, VEHICLE_RADIUS), *views)
+    parts = []
+    if hidden.any():
+        parts.append(_draw(esdf, *frontier_faces(before, hidden)))
+    if beyond:
+        parts.append(_far_frontier(_FAR_VOXEL * esdf.voxel_size, *views))
+    if not parts:
         return esdf, None
-    return with_obstacles(esdf, hidden), _draw(esdf, *frontier_faces(before, hidden))
+    return with_obstacles(esdf, hidden), functools.reduce(GaussianScene.merged_with, parts)
+
+
+def _far_frontier(
+    voxel_size: float, images: Sequence[np.ndarray], K: np.ndarray, X_WCs: Sequence[RigidTransform]
+) -> GaussianScene:
+    """Draws the frontier of all that images show, on a grid of at least `voxel_size` [m]."""
+    reach = 2.0 * max(float(image[image < FAR].max(initial=0.0)) for image in images)  # [m]
+    lower_W, upper_W = bounds_of_depth_images(images, K, X_WCs, reach)
+    voxel_size = max(voxel_size, float(np.cbrt(np.prod(upper_W - lower_W) / _FAR_VOXELS)))
+    far = esdf_from_depth_images(images, K, X_WCs, lower_W, upper_W, voxel_size, reach)
+    reachable = reachable_space(far, VEHICLE_RADIUS)
+    hidden, before, _ = hidden_frontier(far, reachable, images, K, X_WCs)
+    return _draw(far, *frontier_faces(before, hidden))
 
 
 def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> GaussianScene:

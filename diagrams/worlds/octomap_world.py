@@ -17,11 +17,16 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
     to_gaussians,
 )
 from splatpilot.diagrams.worlds.solids.textures import fbm, hash_unit, ramp
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import (
+    choose_start_and_goal,
+    draw_start_and_goal,
+    short_route_warning,
+)
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.octomap import Octomap, read_octomap
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -59,7 +64,8 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
     """Reads the map of `config`; its colours, which it has not, are those of heights.
 
     Raises:
-        FileNotFoundError, ValueError: for a map that is not there, damaged or without free space.
+        FileNotFoundError, ValueError: for a map that is not there or damaged.
+        InfeasibleFlightError: if no start and goal can be chosen or drawn in it.
     """
     config.validate()
     path = find_scene(config)
@@ -70,14 +76,16 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     if not (esdf.states == FieldState.FREE).any():
-        raise ValueError(
+        raise InfeasibleFlightError(
             f"{path}: no space from {lower_W} to {upper_W} m is known to be free; there is nowhere "
             "to fly: choose another map, or another part of it by world.lower and world.upper"
         )
     if config.draw_ends:
-        p_WS, p_WG, _ = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed)
+        p_WS, p_WG, _ = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed, least=config.least_way)
     else:
-        p_WS, p_WG, _ = choose_start_and_goal(esdf, VEHICLE_RADIUS)
+        p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
+        if warning := short_route_warning(length):
+            _log.warning("%s: %s", config.path, warning)
     hour = Daylight.sample(np.random.default_rng([seed, 1]))
     return World(
         name=Path(config.path).stem,

@@ -58,8 +58,8 @@ def read_scene_world(config: SceneSource, seed: int) -> World:
     """Reads the scene of `config`.
 
     Raises:
-        FileNotFoundError, ValueError: see `find_scene` and `read_scene`; or if no free space is
-            large enough.
+        FileNotFoundError, ValueError: see `find_scene` and `read_scene`.
+        InfeasibleFlightError: see `draw_start_and_goal`.
     """
     world = read_scene(find_scene(config))
     if not config.draw_ends:

@@ -6,6 +6,7 @@ of what lies infinitely far (`EnvironmentMap`). `frontier.ply`, if there is one,
 where nobody looked any further: cameras of flights see it too, measures of the scene do not.
 """
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from splatpilot.diagrams.worlds.scene_metadata import (
     read_scene_metadata,
     write_scene_metadata,
 )
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, short_route_warning
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
@@ -31,6 +32,7 @@ from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_splats
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
+_log = logging.getLogger(__name__)
 _MAX_VOXELS = 2e7
 _COARSEST = 0.25  # [m], voxels at which a vehicle of 0.354 m radius still finds its way
 
@@ -200,7 +202,9 @@ def _read_bare_gaussians(path: Path) -> World:
             "far Gaussians away, or give it its size with `splatpilot scale`"
         )
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
-    p_WS, p_WG, _ = choose_start_and_goal(esdf, VEHICLE_RADIUS)
+    p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
+    if warning := short_route_warning(length):
+        _log.warning("%s: %s", path, warning)
     return World(
         name=path.stem,
         gaussians=gaussians,

@@ -1,6 +1,7 @@
 """Where to fly from and to in a world of which only the free space is known."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,12 +9,34 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.infeasible import InfeasibleFlightError
 
 SHORTEST = 1.0
-"""[m], length of the shortest way that is worth a flight."""
+"""[m], length of the shortest route that is worth a flight."""
+
+LONG_ENOUGH = 8.0
+"""[m], length from which on a route shows how a policy flies; the benchmark's own minimum."""
+
+_GAIN = 1.5
+"""[-] How many times as long a path with half of the margin must be to be preferred."""
 
 _MAX_NODES = 250_000
 _DRAWS = 20
+
+
+class _Part(NamedTuple):
+    """A connected part of the free space."""
+
+    graph: csr_array
+    """Of all free space; the other parts are not reached from this one."""
+    p_WN: NDArray[np.float64]
+    """(N, 3) [m], the nodes of the graph."""
+    nodes: NDArray[np.intp]
+    """Of the part."""
+    end: int
+    """The node that begins (nearly) the longest of all shortest paths in the part."""
+    length: float
+    """[m], of that path."""
 
 
 def choose_start_and_goal(
@@ -21,26 +44,17 @@ def choose_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    The ends of (nearly) the longest of all shortest paths that a sphere of `radius` with `margin`
-    [m] to spare can fly through space known to be free, at least `SHORTEST`: in the largest
-    connected part of a grid, the node farthest from any node, and the node farthest from that (the
-    double sweep, exact on trees). If no space has that much margin, half of it is tried: through
-    less, vehicles hover before gaps that planners do not trust. Paths longer than `longest` [m] are
-    not considered: a flight should end in good time.
+    The ends of (nearly) the longest of all shortest paths that a sphere of `radius` can fly through
+    space known to be free, at least `SHORTEST`, with `margin` [m] to spare or half of that, see
+    `_longest_part`: through less, vehicles hover before gaps that planners do not trust. Paths
+    longer than `longest` [m] are not considered: a flight should end in good time.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
+        InfeasibleFlightError: if no free space holds a sphere of `radius` and lets it fly so far.
     """
-    reach = 0.0
-    for graph, p_WN in _free_graphs(esdf, radius, margin):
-        _, label = connected_components(graph, directed=False)
-        inner = int(np.argmax(label == np.bincount(label).argmax()))
-        start, _ = _farthest(graph, inner)
-        goal, length = _farthest(graph, start, longest)
-        if length >= SHORTEST:
-            return p_WN[start], p_WN[goal], length
-        reach = max(reach, length)
-    raise _no_room(esdf, radius, margin, reach, SHORTEST)
+    part = _longest_part(esdf, radius, margin, longest, SHORTEST)
+    goal, length = _farthest(part.graph, part.end, longest)
+    return part.p_WN[part.end], part.p_WN[goal], length
 
 
 def draw_start_and_goal(
@@ -53,38 +67,73 @@ def draw_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    As `choose_start_and_goal`, but anywhere: the start is drawn from the largest connected part of
-    free space, the goal from those nodes whose shortest path from it is at least 60 % of the
-    longest there is, up to `longest` [m], and at least `least` [m]. The same seed gives the same
-    bits; where no start in so many draws has such a goal, it is an end of the longest path.
+    As `choose_start_and_goal`, but anywhere: the start is drawn from the part of free space with
+    the longest path, the goal from those nodes whose shortest path from it is at least 60 % of
+    that, up to `longest` [m], and at least `least` [m]. The same seed gives the same bits; if no
+    start in so many draws has such a goal, it is an end of the longest path.
 
     Raises:
-        ValueError: if no free space holds a sphere of `radius` and lets it fly so far.
+        InfeasibleFlightError: if no free space holds a sphere of `radius` and lets it fly so far.
     """
     rng = np.random.default_rng(seed)
-    reach = 0.0
-    for graph, p_WN in _free_graphs(esdf, radius, margin):
+    part = _longest_part(esdf, radius, margin, longest, least)
+    for attempt in range(_DRAWS + 1):
+        start = int(rng.choice(part.nodes)) if attempt < _DRAWS else part.end
+        lengths = dijkstra(part.graph, directed=False, indices=start, limit=longest)
+        desired = max(0.6 * min(part.length, longest), least)
+        far = np.flatnonzero(np.isfinite(lengths) & (lengths >= desired))
+        if len(far):
+            goal = int(rng.choice(far))
+            return part.p_WN[start], part.p_WN[goal], float(lengths[goal])
+    raise _no_room(esdf, radius, margin, part.length, least)
+
+
+def short_route_warning(length: float) -> str:
+    """Says that a route of this length [m] is too short to show much; empty if it is not."""
+    if length >= LONG_ENOUGH:
+        return ""
+    return (
+        f"the longest route from a start to a goal is {length:.1f} m, and flights shorter than "
+        f"{LONG_ENOUGH:g} m show little; free space is narrow or cut up, and unknown space counts "
+        "as occupied"
+    )
+
+
+def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
+    """Returns the connected part of the free space with the longest path, up to `longest` [m].
+
+    It has all of `margin` [m] if that path is `LONG_ENOUGH`, and else half of it where that makes
+    the path `_GAIN` times as long.
+
+    Raises:
+        InfeasibleFlightError: if no path is at least `least` [m] long.
+    """
+    best, reach = None, 0.0
+    for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
+        if best is not None and best.length >= max(LONG_ENOUGH, least):
+            break
         _, label = connected_components(graph, directed=False)
-        part = np.flatnonzero(label == np.bincount(label).argmax())
-        end, _ = _farthest(graph, int(part[0]))
-        _, length = _farthest(graph, end)
-        reach = max(reach, length)
-        for attempt in range(_DRAWS + 1):
-            start = int(rng.choice(part)) if attempt < _DRAWS else end
-            lengths = dijkstra(graph, directed=False, indices=start, limit=longest)
-            wanted = max(0.6 * min(length, longest), least)
-            far = np.flatnonzero(np.isfinite(lengths) & (lengths >= wanted))
-            if len(far):
-                goal = int(rng.choice(far))
-                return p_WN[start], p_WN[goal], float(lengths[goal])
-    raise _no_room(esdf, radius, margin, reach, least)
+        sizes = np.bincount(label)
+        for number in np.argsort(-sizes, kind="stable"):
+            # No path is longer than one along the diagonals through all nodes of a part.
+            if min(np.sqrt(3.0) * spacing * (sizes[number] - 1), longest) <= reach:
+                break
+            nodes = np.flatnonzero(label == number)
+            end, _ = _farthest(graph, int(nodes[0]))
+            _, length = _farthest(graph, end)
+            if length > reach:
+                best, reach = _Part(graph, p_WN, nodes, end, length), length
+        reach *= _GAIN
+    if best is None or best.length < least:
+        raise _no_room(esdf, radius, margin, 0.0 if best is None else best.length, least)
+    return best
 
 
 def _free_graphs(
     esdf: Esdf, radius: float, margin: float
-) -> Iterator[tuple[csr_array, NDArray[np.float64]]]:
-    """Graphs of the space free for a sphere of `radius` [m], and their nodes (N, 3) [m], with ever
-    less margin: all of `margin` [m] and half of it."""
+) -> Iterator[tuple[csr_array, NDArray[np.float64], float]]:
+    """Graphs of the space free for a sphere of `radius` [m], their nodes (N, 3) [m] and the spacing
+    of these [m], with ever less margin: all of `margin` [m] and half of it."""
     field = esdf.conservative()
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
@@ -97,20 +146,22 @@ def _free_graphs(
     for need in (margin, margin / 2):
         if np.count_nonzero(clearance > need) >= 2:
             graph, nodes = grid_graph(clearance > need, spacing)
-            yield graph, p_WN.reshape(-1, 3)[nodes]
+            yield graph, p_WN.reshape(-1, 3)[nodes], spacing
 
 
-def _no_room(esdf: Esdf, radius: float, margin: float, reach: float, least: float) -> ValueError:
+def _no_room(
+    esdf: Esdf, radius: float, margin: float, reach: float, least: float
+) -> InfeasibleFlightError:
     room = f"a vehicle of radius {radius} m with {margin / 2:g} m to spare"
     if reach > 0:
-        return ValueError(
-            f"the longest way of {room} through free space is {reach:.2f} m, at least {least:g} m "
-            "is needed, and unknown space counts as occupied; capture more of the place"
+        return InfeasibleFlightError(
+            f"the longest route of {room} through free space must be at least {least:g} m, got "
+            f"{reach:.2f} m; unknown space counts as occupied: capture more of the scene"
         )
     largest = float(esdf.conservative().distances.max())
-    return ValueError(
+    return InfeasibleFlightError(
         f"no free space for {room}: the largest clearance is {largest:.2f} m, and unknown space "
-        "counts as occupied; capture more of the place"
+        "counts as occupied; capture more of the scene"
     )
 
 

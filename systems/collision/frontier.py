@@ -50,42 +50,48 @@ def hidden_frontier(
     depths: Iterable[np.ndarray],
     K: np.ndarray,
     X_WCs: Sequence[RigidTransform],
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The unknown space at the edge of the voxels `reachable` (nx, ny, nz), but for the sky.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
+    """Finds the unknown space at the edge of the voxels `reachable` (nx, ny, nz), but for space
+    that an image saw through.
 
-    It begins two voxels behind the last one that was seen to be free: what stands there hides
-    nothing of what the images saw. Before the sky space is unknown only because it is far away.
+    It begins two voxels behind the last one that was seen to be free: an obstacle there hides
+    nothing of what the images saw. Before the sky, and before surfaces beyond the field's range,
+    space is unknown only because it is far away: an obstacle there would hide them.
 
     Args:
         depths, K, X_WCs: what the field was made of, see `esdf_from_depth_images`.
 
     Returns:
-        The first of its voxels (nx, ny, nz), and the voxels (nx, ny, nz) before them.
+        The first of its voxels (nx, ny, nz), the voxels (nx, ny, nz) before them, and whether it
+        was left open before a surface.
     """
     unknown = esdf.states == FieldState.UNKNOWN
     before = _grown(reachable) & (esdf.states != FieldState.OCCUPIED)
     first = binary_dilation(before) & unknown & ~_grown(esdf.states == FieldState.FREE)
     index = np.argwhere(_grown(first) & unknown)
     p_WV = esdf.lower_W + esdf.voxel_size * (index + 0.5)
-    sky = np.zeros(len(index), dtype=bool)
+    deepest = np.zeros(len(index))  # [m] of what is seen through each voxel
     for depth, X_WC in zip(depths, X_WCs, strict=True):
-        if (depth >= FAR).any():
-            sky |= _values_at(p_WV, depth, K, X_WC) >= FAR
-    of_sky = np.zeros_like(first)
-    of_sky[tuple(index[sky].T)] = True
-    return first & ~_grown(of_sky), before
+        z = (p_WV - X_WC.translation()) @ X_WC.rotation().matrix()[:, 2]
+        seen = _values_at(p_WV, depth, K, X_WC)
+        deepest = np.fmax(deepest, np.where(seen > z + esdf.voxel_size, seen, 0.0))
+    open_ = np.zeros_like(first)
+    open_[tuple(index[deepest > 0.0].T)] = True
+    before_surface = bool(((deepest > 0.0) & (deepest < FAR)).any())
+    return first & ~_grown(open_), before, before_surface
 
 
 def _values_at(
     p_WQ: np.ndarray, image: np.ndarray, K: np.ndarray, X_WC: RigidTransform
 ) -> NDArray[np.float64]:
-    """The pixels (N,) of an image (H, W) that see the points (N, 3) [m]; NaN beside it."""
+    """Returns the pixels (N,) of an image (H, W) that see the points (N, 3) [m]; NaN beside it and
+    at its border, where rounding decides."""
     p_CQ = (p_WQ - X_WC.translation()) @ X_WC.rotation().matrix()
     ahead = np.flatnonzero(p_CQ[:, 2] > 0.0)
     x, y, _ = (p_CQ[ahead] / p_CQ[ahead, 2:]).T
     column, row = K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
     height, width = image.shape
-    inside = (column >= 0.0) & (column < width) & (row >= 0.0) & (row < height)
+    inside = (column >= 1.0) & (column < width - 1) & (row >= 1.0) & (row < height - 1)
     values = np.full(len(p_WQ), np.nan)
     values[ahead[inside]] = image[row[inside].astype(int), column[inside].astype(int)]
     return values

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.policies.agile_autonomy_inference import TrajectoryNetworkSpec
 from splatpilot.systems.policies.observation import require_poolable
 from splatpilot.systems.policies.recurrent_network import NetworkSpec
@@ -43,8 +44,4 @@ class _HasSpeed(Protocol):
 
 def require_speed(config: _HasSpeed) -> None:
     """Raises ValueError unless the speed that a policy is asked for can be."""
-    if not 0.1 <= config.speed <= 10.0:
-        raise ValueError(
-            f"{type(config).__name__}.speed is {config.speed} m/s but must be 0.1 to 10; the "
-            f"default is {type(config).speed}"
-        )
+    require_field(config, "speed", 0.1 <= config.speed <= 10.0, "in [0.1, 10] m/s")

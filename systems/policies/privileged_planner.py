@@ -12,6 +12,7 @@ from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.moving_balls import MovingBalls
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.motion_primitives import level_acceleration
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
@@ -33,11 +34,7 @@ class PrivilegedPlannerConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0.0 < self.rate <= 1000.0:
-            raise ValueError(
-                f"PrivilegedPlannerConfig.rate is {self.rate} Hz but must be positive and at most "
-                f"1000; the default is {PrivilegedPlannerConfig.rate}."
-            )
+        require_field(self, "rate", 0.0 < self.rate <= 1000.0, "in (0, 1000] Hz")
         self.lattice.validate()
 
 
@@ -86,10 +83,10 @@ def plan(
 
 
 def _check_way_exists(p_WB: np.ndarray, field: Esdf, toa: TimeOfArrival) -> None:
-    if toa.is_reachable(p_WB):
+    # A vehicle that drifts to less than the margin is in a blocked voxel, from which its route is
+    # near; what cuts it off is at least its diameter thick. Contact is for others to judge.
+    if toa.is_reachable(p_WB, within=VEHICLE_RADIUS):
         return
-    # A voxel may be blocked though a point in it is free, and contact is for others to judge; but
-    # a point a whole voxel clear of contact, in a voxel no way leads from, is cut off.
     clearance = float(field.distance(p_WB)) - VEHICLE_RADIUS
     if clearance > field.voxel_size:
         raise InfeasibleFlightError(

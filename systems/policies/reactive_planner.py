@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.soft_barrier import soft_barrier
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.policies.motion_primitives import rotation_to, velocity_fan
 from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -77,25 +78,23 @@ class ReactiveConfig:
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         self.camera.validate()
-        _check("speed", self.speed, 0.0 < self.speed <= 20.0, "positive and at most 20 m/s")
-        _check("rate", self.rate, 0.0 < self.rate <= 1000.0, "positive and at most 1000 Hz")
+        require_field(self, "speed", 0.0 < self.speed <= 20.0, "in (0, 20] m/s")
+        require_field(self, "rate", 0.0 < self.rate <= 1000.0, "in (0, 1000] Hz")
         for name, size in (("columns", self.camera.width), ("rows", self.camera.height)):
             value = getattr(self, name)
             divides = 1 <= value <= size and size % value == 0
-            _check(name, value, divides, f"a divisor of the camera's {size} pixels")
+            require_field(self, name, divides, f"a divisor of the camera's {size} pixels")
         for name, largest in (("memory", 300), ("num_yaws", 100), ("num_pitches", 100)):
-            _check(
-                name, getattr(self, name), 1 <= getattr(self, name) <= largest, f"1 to {largest}"
-            )
-        _check("horizon", self.horizon, 0.3 <= self.horizon <= 10.0, "0.3 to 10 s")
+            require_field(self, name, 1 <= getattr(self, name) <= largest, f"1 to {largest}")
+        require_field(self, "horizon", 0.3 <= self.horizon <= 10.0, "0.3 to 10 s")
         yaw, pitch = self.max_yaw, self.max_pitch
-        _check("max_yaw", yaw, 0.0 <= yaw <= math.pi, "0 to pi rad")
-        _check("max_pitch", pitch, 0.0 <= pitch < math.pi / 2, "0 to less than pi/2 rad")
+        require_field(self, "max_yaw", 0.0 <= yaw <= math.pi, "0 to pi rad")
+        require_field(self, "max_pitch", 0.0 <= pitch < math.pi / 2, "0 to less than pi/2 rad")
         in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
-        _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
+        require_field(self, "speed_fractions", in_range, "one or more values in (0, 1]")
         weights = [f"{name}_weight" for name in ("height", "barrier", "contact", "unseen")]
         for name in (*weights, "acceleration_weight", "margin", "barrier_margin"):
-            _check(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, "at least 0")
+            require_field(self, name, 0.0 <= getattr(self, name) < math.inf, "at least 0")
 
 
 def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
@@ -201,10 +200,3 @@ def candidate_costs(
         + (along * steps).sum(axis=1)
         + config.acceleration_weight * np.square(velocities - v_WB).sum(axis=1)
     )
-
-
-def _check(name: str, value: object, valid: bool, limit: str) -> None:
-    if not valid:
-        raise ValueError(
-            f"ReactiveConfig.{name} is {value} but must be {limit}; see the comment at the field."
-        )

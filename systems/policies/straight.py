@@ -1,11 +1,11 @@
 """The policy that looks at nothing: what a world asks of a policy is what this one lacks."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.policies.velocity_tracking import (
     approach_velocity,
     tracking_acceleration,
@@ -25,12 +25,9 @@ class StraightConfig:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name, largest in (("speed", 20.0), ("rate", 1000.0)):
-            value = getattr(self, name)
-            if not 0.0 < value <= largest or math.isnan(value):
-                raise ValueError(
-                    f"StraightConfig.{name} is {value}; it must be positive and at most {largest:g}"
-                )
+        for name, largest, unit in (("speed", 20.0, "m/s"), ("rate", 1000.0, "Hz")):
+            valid = 0.0 < getattr(self, name) <= largest
+            require_field(self, name, valid, f"in (0, {largest:g}] {unit}")
 
 
 class Straight(LeafSystem):

@@ -85,12 +85,17 @@ class TimeOfArrival:
         slopes = trilinear_with_gradient(corners, *fractions)[1:]
         return np.stack(slopes, axis=-1).reshape(np.shape(p_WQ)) / self.voxel_size
 
-    def is_reachable(self, p_WQ: np.ndarray) -> bool:
-        """Whether a way leads to the goal from the voxel that p_WQ (3,) [m] lies in."""
-        index = np.floor((np.asarray(p_WQ) - self.lower_W) / self.voxel_size)
-        if np.any(index < 0) or np.any(index >= self.reachable.shape):
+    def is_reachable(self, p_WQ: np.ndarray, within: float = 0.0) -> bool:
+        """Checks that a route leads to the goal from the voxel of p_WQ (3,) [m], or from one that
+        the cube of half edge `within` [m] about it touches."""
+        from_corner = np.asarray(p_WQ) - self.lower_W
+        first = np.floor((from_corner - within) / self.voxel_size)
+        last = np.floor((from_corner + within) / self.voxel_size)
+        if np.any(last < 0) or np.any(first >= self.reachable.shape):
             return False
-        return bool(self.reachable[tuple(index.astype(int))])
+        first, last = np.maximum(first, 0).astype(int), last.astype(int)
+        cube = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+        return bool(self.reachable[cube].any())
 
     def way(self, p_WQ: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (n, 3) [m] and directions (n, 3) of the way to the goal from p_WQ (3,) [m].

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splatpilot.systems.collision.distance_field import Distances
+from splatpilot.systems.messages import require, require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.policies.motion_primitives import (
     lengths,
@@ -25,6 +26,10 @@ from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, slowness
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
 LEAST_SPEED_FRACTION = 0.25  # of the nominal speed, near a goal that is not in direct reach
+
+_PACES = 1.0, 0.5, 0.25
+"""Fractions of the nominal speed, tried in turn while nothing beats waiting: in a narrow bend the
+quintics of a fast lattice cut the corner, and those of a slow one follow the route."""
 
 
 @dataclass
@@ -73,29 +78,28 @@ class LatticeConfig:
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("num_yaws", "num_pitches", "num_hypotheses"):
-            _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
-        for name, most in (("speed", 20.0), ("horizon", 30.0)):
-            value = getattr(self, name)
-            _check(name, value, 0.0 < value <= most, f"positive and at most {most:g}")
+            require_field(self, name, getattr(self, name) >= 1, "at least 1")
+        for name, most, unit in (("speed", 20.0, "m/s"), ("horizon", 30.0, "s")):
+            valid = 0.0 < getattr(self, name) <= most
+            require_field(self, name, valid, f"in (0, {most:g}] {unit}")
         samples = self.horizon / WAYPOINT_PERIOD
         whole = samples > NUM_WAYPOINTS - 0.5 and abs(samples - round(samples)) < 1e-6
         least = NUM_WAYPOINTS * WAYPOINT_PERIOD
-        _check("horizon", self.horizon, whole, f"a multiple of 0.1 s and at least {least} s")
+        require_field(self, "horizon", whole, f"a multiple of 0.1 s and at least {least} s")
         weights = "penetration_weight", "speed_weight", "jerk_weight"
         for name in (*weights, "separation", "margin", "max_yaw", "max_pitch"):
-            _check(name, getattr(self, name), 0.0 <= getattr(self, name) <= 1e6, "0 to 1e6")
-        _check("max_yaw", self.max_yaw, self.max_yaw <= math.pi, "at most pi")
-        _check("max_pitch", self.max_pitch, self.max_pitch < math.pi / 2, "less than pi/2")
+            require_field(self, name, 0.0 <= getattr(self, name) <= 1e6, "0 to 1e6")
+        require_field(self, "max_yaw", self.max_yaw <= math.pi, "at most pi")
+        require_field(self, "max_pitch", self.max_pitch < math.pi / 2, "less than pi/2")
         in_range = bool(self.speed_fractions) and all(0.0 < f <= 1.0 for f in self.speed_fractions)
-        _check("speed_fractions", self.speed_fractions, in_range, "one or more values in (0, 1]")
+        require_field(self, "speed_fractions", in_range, "one or more values in (0, 1]")
         trajectories = self.num_yaws * self.num_pitches * len(self.speed_fractions)
-        _check(
-            "num_yaws and num_pitches", trajectories, trajectories <= 10**5, "at most 1e5 in all"
-        )
+        what = "LatticeConfig.num_yaws and num_pitches"
+        require(trajectories <= 10**5, what, "at most 1e5 in all", trajectories)
         few = self.num_hypotheses <= trajectories
-        _check(
+        require_field(
+            self,
             "num_hypotheses",
-            self.num_hypotheses,
             few,
             f"at most {trajectories}, the size of the lattice",
         )
@@ -125,9 +129,15 @@ class TrajectoryLattice:
             [quintic_basis(self.sample_times, config.horizon, order) for order in (0, 3)]
         )  # (2 S, 6)
         self._final_velocities_L = final_velocities(config)
+        self._stopping_distance = 0.5 * config.horizon * config.speed  # [m]
 
     def trajectories(
-        self, p_WB: np.ndarray, v_WB: np.ndarray, a_WB: np.ndarray, toa: TimeOfArrival
+        self,
+        p_WB: np.ndarray,
+        v_WB: np.ndarray,
+        a_WB: np.ndarray,
+        toa: TimeOfArrival,
+        pace: float = 1.0,
     ) -> Trajectories:
         """The N trajectories from a position, velocity and acceleration, (3,) each.
 
@@ -135,12 +145,11 @@ class TrajectoryLattice:
         the gradient of T, with its velocities v_1 at p_WB + H v_1; one more for each speed on the
         way to the goal, after that length and along it, or at rest in the goal. The speed falls in
         proportion to the time of arrival where the nominal one would take less than half the
-        horizon.
+        horizon. `pace` multiplies every speed.
         """
         config = self.config
-        stopping_distance = 0.5 * config.horizon * config.speed
-        slowing = float(toa.value(p_WB)) / stopping_distance
-        speed = config.speed * min(max(slowing, LEAST_SPEED_FRACTION), 1.0)
+        slowing = float(toa.value(p_WB)) / self._stopping_distance
+        speed = pace * config.speed * min(max(slowing, LEAST_SPEED_FRACTION), 1.0)
         v_L = speed * self._final_velocities_L @ rotation_to(-toa.gradient(p_WB)).T
         speeds = speed * np.array(config.speed_fractions)
         p_way, directions = toa.way(p_WB, config.horizon * speeds)
@@ -190,15 +199,23 @@ class TrajectoryLattice:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The positions (K, S, 3) [m] and costs (K,) of the K best distinct trajectories.
 
-        The first is the cheapest of all; see `trajectories`, `costs` and `select_distinct`.
+        The first is the cheapest of all; see `trajectories`, `costs` and `select_distinct`. While
+        the cheapest leads no nearer to a goal out of reach, slower ones are tried, and taken if
+        cheaper.
         """
         config = self.config
-        trajectories = self.trajectories(p_WB, v_WB, a_WB, toa)
-        costs = self.costs(trajectories, p_WB, field, toa)
-        chosen = select_distinct(
-            trajectories.positions, costs, config.num_hypotheses, config.separation
-        )
-        return trajectories.positions[chosen], costs[chosen]
+        arrival = float(toa.value(p_WB))
+        positions, costs = np.empty(0), np.array([np.inf])
+        for pace in _PACES:
+            trajectories = self.trajectories(p_WB, v_WB, a_WB, toa, pace)
+            found = self.costs(trajectories, p_WB, field, toa)
+            if found.min() < costs.min():
+                positions, costs = trajectories.positions, found
+            nearer = toa.value(positions[np.argmin(costs), -1]) < arrival
+            if nearer or arrival < self._stopping_distance:
+                break
+        chosen = select_distinct(positions, costs, config.num_hypotheses, config.separation)
+        return positions[chosen], costs[chosen]
 
 
 def final_velocities(config: LatticeConfig) -> np.ndarray:
@@ -209,10 +226,3 @@ def final_velocities(config: LatticeConfig) -> np.ndarray:
         config.speed_fractions,
     )
     return np.vstack([fan, np.zeros(3)])
-
-
-def _check(name: str, value: object, valid: bool, limit: str) -> None:
-    if not valid:
-        raise ValueError(
-            f"LatticeConfig.{name} is {value} but must be {limit}; see the comment at the field."
-        )

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.splats.distortion import Distortion
 
 _LARGEST = 4096  # [px]
@@ -44,24 +45,26 @@ class OnboardCamera:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("width", "height"):
             value = getattr(self, name)
-            _check(name, value, 1 <= value <= _LARGEST, f"1 to {_LARGEST} pixels")
+            require_field(self, name, 1 <= value <= _LARGEST, f"1 to {_LARGEST} pixels")
         for name in ("fov_x", "fov_y"):
             value = getattr(self, name)
-            _check(name, value, value is None or 1.0 <= value <= 170.0, "1 to 170 deg")
+            require_field(self, name, value is None or 1.0 <= value <= 170.0, "1 to 170 deg")
         if self.distortion is not None:
             self.distortion.validate()
             widest = 2.0 * math.degrees(math.atan(self.distortion.limit))
             for name in ("fov_x", "fov_y"):
                 value = getattr(self, name)
                 shown = value is None or value < widest
-                _check(name, value, shown, f"less than the {widest:.1f} deg that the lens shows")
-        _check("min_depth", self.min_depth, self.min_depth >= 0.0, "at least 0 m")
+                require_field(
+                    self, name, shown, f"less than the {widest:.1f} deg that the lens shows"
+                )
+        require_field(self, "min_depth", self.min_depth >= 0.0, "at least 0 m")
         farther = self.min_depth < self.max_depth < math.inf
-        _check("max_depth", self.max_depth, farther, "more than min_depth, and finite")
+        require_field(self, "max_depth", farther, "more than min_depth, and finite")
         mounted = len(self.p_BC) == 3 and bool(np.isfinite(self.p_BC).all())
-        _check("p_BC", self.p_BC, mounted, "three finite numbers x, y, z in metres")
-        _check("readout", self.readout, 0.0 <= self.readout <= 0.2, "0 to 0.2 s")
-        _check("pitch", self.pitch, -90.0 <= self.pitch <= 90.0, "-90 to 90 deg")
+        require_field(self, "p_BC", mounted, "three finite numbers x, y, z in metres")
+        require_field(self, "readout", 0.0 <= self.readout <= 0.2, "0 to 0.2 s")
+        require_field(self, "pitch", -90.0 <= self.pitch <= 90.0, "-90 to 90 deg")
 
     @property
     def focal_x(self) -> float:
@@ -107,8 +110,3 @@ class OnboardCamera:
 def focal_length(size: int, fov: float) -> float:
     """[px], of an axis with `size` pixels and a field of view [deg]."""
     return 0.5 * size / math.tan(math.radians(0.5 * fov))
-
-
-def _check(name: str, value: object, valid: bool, limit: str) -> None:
-    if not valid:
-        raise ValueError(f"OnboardCamera.{name} is {value}; it must be {limit}")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatpilot.systems.messages import require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
 
 LEAST_DEPTH = 1e-3
@@ -45,18 +46,20 @@ class TimeOfFlight:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
         for name in ("fov_x", "fov_y", "fov"):
             value = getattr(self, name)
-            _check(name, value, 1.0 <= value < 180.0, "at least 1 and below 180 deg")
-        _check("anchor", self.anchor, self.anchor in _ANCHORS, f"one of {', '.join(_ANCHORS)}")
-        _check("max_range", self.max_range, 0.0 < self.max_range < math.inf, "positive and finite")
+            require_field(self, name, 1.0 <= value < 180.0, "at least 1 and below 180 deg")
+        require_field(self, "anchor", self.anchor in _ANCHORS, f"one of {', '.join(_ANCHORS)}")
+        require_field(self, "max_range", 0.0 < self.max_range < math.inf, "positive and finite")
         for name in ("width", "height", "columns", "rows"):
             value = getattr(self, name)
-            _check(name, value, value >= 1, "at least 1")
+            require_field(self, name, value >= 1, "at least 1")
         crop = self.crop(self.height, self.width, self.fov_x, self.fov_y)
         for count, part, name in zip(
             (self.rows, self.columns), crop, ("rows", "columns"), strict=True
         ):
             left = part.stop - part.start
-            _check(name, count, count <= left, f"at most {left}, the pixels that the crop leaves")
+            require_field(
+                self, name, count <= left, f"at most {left}, the pixels that the crop leaves"
+            )
 
     def crop(self, height: int, width: int, fov_x: float, fov_y: float) -> tuple[slice, slice]:
         """The rows and columns that are left of an upright frame with these fields of view."""
@@ -143,8 +146,3 @@ def range_of_depth(height: int, width: int, fov_x: float, fov_y: float) -> np.nd
     x = (np.arange(width) - 0.5 * width) / focal_length(width, fov_x)
     y = (np.arange(height) - 0.5 * height) / focal_length(height, fov_y)
     return np.sqrt(1.0 + x**2 + y[:, None] ** 2)
-
-
-def _check(name: str, value: object, valid: bool, limit: str) -> None:
-    if not valid:
-        raise ValueError(f"TimeOfFlight.{name} is {value}; it must be {limit}")

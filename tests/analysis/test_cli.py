@@ -138,6 +138,7 @@ def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path
     ],
 )
 def test_long_commands_say_what_they_do_before_anything_slow_is_imported(words, tmp_path):
+    (tmp_path / "out" / "corpus" / "shards").mkdir(parents=True)
     script = (
         "import sys; from splatpilot.analysis.cli import main\n"
         # Importing these fails.
@@ -179,15 +180,17 @@ def fails(arguments: list[str], capsys) -> str:
         (["--set", "goal=[100, 0, 2]"], "goal [100.0, 0.0, 2.0] is outside the world"),
         (["--set", "start=[1.5, 0, -1]"], "start [1.5, 0.0, -1.0] is"),
         (["--set", "start=[1.5, 0, 0.2]"], "0.200 m from the nearest surface"),
-        (["--set", "camera.focal=!FocalLength {x: 0}"], "it must be positive"),
+        (["--set", "camera.focal=!FocalLength {x: 0}"], "camera.focal must be positive"),
         (["--set", "worl.length=3"], "did you mean world"),
         (["--set", "world.spacing=0.5"], "spacing"),
-        (["--scenario", "nowhere.yaml"], "nowhere.yaml: there is no such"),
+        (["--scenario", "nowhere.yaml"], "No such file or folder: nowhere.yaml"),
         (["--scene", "nowhere"], "nowhere"),
         (["--policy", "nobody"], "there is no policy 'nobody'"),
         (["--policy", "reactive:margin"], "without a value; write reactive:margin=VALUE"),
         (["--scenario", "P99"], "there is no scenario 'P99'"),
         (["--seed", "-1"], "seed"),
+        (["--speed", "-2"], "the speed must be in (0, 20] m/s, got -2"),
+        (["--policy", "diffaero", "--speed", "15"], "policy.speed must be in [0.1, 10] m/s"),
     ],
 )
 def test_bad_input_is_one_message_and_nothing_written(arguments, message, tmp_path, capsys):
@@ -195,6 +198,26 @@ def test_bad_input_is_one_message_and_nothing_written(arguments, message, tmp_pa
     out = tmp_path / "out"
     assert message in fails(["fly", "--out", str(out), *arguments], capsys)
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("fli", "splatpilot: there is no command 'fli'; did you mean fly?"),
+        ("capture chek room", "splatpilot capture: there is no action 'chek'; did you mean check?"),
+        ("view P02 --sede 3", "view: unrecognized arguments: --sede 3; did you mean --seed?"),
+        ("fly timeout=3", "unrecognized arguments: timeout=3; did you mean --set timeout=3?"),
+        ("fly --set timeout", "--set must be FIELD=VALUE, got 'timeout'; see `splatpilot fly --he"),
+        ("fly --seed 1.5", "splatpilot fly: --seed must be a whole number, got '1.5'"),
+        ("fly --speed fast", "splatpilot fly: --speed must be a number, got 'fast'"),
+    ],
+)
+def test_an_invalid_command_line_is_one_sentence(words, message, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    error = capsys.readouterr().err
+    assert (ended.value.code, error.count("\n")) == (2, 1)
+    assert message in error
 
 
 def make_scene(xs) -> GaussianScene:
@@ -417,4 +440,4 @@ def test_drake_says_nothing_but_warnings(tmp_path):
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert ended.returncode == 0
-    assert ended.stderr.startswith("splatpilot: nowhere") and "Meshcat" not in ended.stderr
+    assert "folder: nowhere" in ended.stderr and "Meshcat" not in ended.stderr

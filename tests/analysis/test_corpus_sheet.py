@@ -63,8 +63,8 @@ def test_a_damaged_corpus_is_named(folder, tmp_path, capsys):
     assert "color.npy is damaged" in capsys.readouterr().err
     color.write_bytes(whole)
     for wrong, message in (
-        ([*words, "--samples", "0"], "--samples is 0"),
-        ([*words[:-1], str(tmp_path / "a.jpg")], "is a PNG file"),
+        ([*words, "--samples", "0"], "--samples must be at least 1, got 0"),
+        ([*words[:-1], str(tmp_path / "a.jpg")], "--out must be a PNG file"),
         (["corpus", "inspect", str(tmp_path), "--out", "a.png"], "holds no corpus"),
     ):
         assert main(wrong) == 1

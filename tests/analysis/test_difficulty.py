@@ -146,4 +146,4 @@ def test_infeasible_seeds_are_counted(tmp_path, monkeypatch):
 def test_no_seeds_are_refused(seeds, capsys):
     """There is nothing to measure in no world."""
     assert main(["difficulty", "P10", "--seeds", seeds]) == 1
-    assert f"--seeds is {seeds}; it must be at least 1" in capsys.readouterr().err
+    assert f"--seeds must be at least 1, got {seeds}" in capsys.readouterr().err

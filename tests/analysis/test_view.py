@@ -166,9 +166,12 @@ def test_looking_needs_no_extras():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nowhere"], "nowhere: there is no such file or folder"),
+        (["nowhere"], "No such file or folder: nowhere"),
         (["room.ksplat"], "room.ksplat: a KSPLAT; convert it to PLY"),
-        (["room.glb"], "room.glb: a binary glTF"),
+        (
+            ["room.glb"],
+            "got a mesh; render a capture of it with `splatpilot capture render",
+        ),
         (["scene", "--seed", "1"], "no generated world"),
         (["scene", "--set", "world.length=3"], "a finished scene has no settings"),
     ],

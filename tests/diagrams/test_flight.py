@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight import Outcome, flight_outcome, fly
+from splatpilot.diagrams.flight import FlightError, Outcome, flight_outcome, fly
 from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight_start import sample_initial_state
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
@@ -63,6 +65,43 @@ def test_plans_are_recorded_as_flown(post_world):
         nearest = np.argmin(np.abs(flight.times - plan.plan_time))
         offset = plan.X_WB.translation() - flight.states[nearest, :3]
         assert np.linalg.norm(offset) <= 0.01 * 2.5  # Half a log period at top speed.
+
+
+class Failing(LeafSystem):
+    """Flies along x; raises `error` from 0.5 s on."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self._error = error
+        self.DeclareVectorOutputPort("velocity", 3, self._calc, {self.time_ticket()})
+
+    def _calc(self, context, output) -> None:
+        if context.get_time() >= 0.5:
+            raise self._error
+        output.SetFromVector([1.0, 0.0, 0.0])
+
+
+def test_an_exception_in_flight_keeps_what_was_flown(post_world):
+    scenario = Scenario(timeout=5.0)
+    diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(KeyError("depth")))
+    message = r"at t = 0.5\d* s, p_WB = \[.*KeyError: 'depth'"
+    with pytest.raises(FlightError, match=message) as raised:
+        fly(diagram, scenario, post_world)
+    flight = raised.value.flight
+    assert flight.outcome == Outcome.ERROR
+    assert isinstance(raised.value.__cause__, KeyError)
+    assert 0.45 < flight.times[-1] <= 0.55
+    assert len(flight.times) == len(flight.states) == len(flight.commands)
+    assert flight.summary()["reason"] == flight.reason
+
+
+def test_a_flight_that_becomes_infeasible_ends_with_an_error(post_world):
+    scenario = Scenario(timeout=5.0)
+    error = InfeasibleFlightError("no route leads to the goal")
+    diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(error))
+    flight = fly(diagram, scenario, post_world)
+    assert flight.outcome == Outcome.ERROR
+    assert flight.reason.endswith("m/s: no route leads to the goal")
 
 
 @pytest.mark.parametrize(

@@ -134,15 +134,15 @@ def test_ports_of_another_size_are_named(post_world):
 def test_scenarios_out_of_range_are_refused(post_world):
     """By who builds the diagram, and by who flies it: Drake would end the process."""
     for wrong, message in (
-        ({"timeout": -1.0}, "timeout is -1.0"),
-        ({"timeout": np.nan}, "timeout is nan"),
-        ({"goal_radius": -1.0}, "goal_radius is -1.0"),
-        ({"goal": [1.0, 2.0]}, r"goal is \[1.0, 2.0\]; it must be three"),
+        ({"timeout": -1.0}, "timeout .* got -1.0"),
+        ({"timeout": np.nan}, "timeout .* got nan"),
+        ({"goal_radius": -1.0}, "goal_radius .* got -1.0"),
+        ({"goal": [1.0, 2.0]}, r"goal must be three .* got \[1.0, 2.0\]"),
     ):
         with pytest.raises(ValueError, match=message):
             BuildFlightDiagram(Scenario(**wrong), post_world, camera=False)
     diagram = BuildFlightDiagram(Scenario(), post_world, camera=False)
-    with pytest.raises(ValueError, match=r"timeout is -1\.0"):
+    with pytest.raises(ValueError, match=r"timeout .* got -1"):
         fly(diagram, Scenario(timeout=-1.0), post_world)
 
 

@@ -74,9 +74,9 @@ def test_name_gives_a_policy_of_that_speed(name, post_world):
 
 def test_unknown_policy_and_speed_are_refused():
     """An unknown name lists the known ones; a speed that cannot be flown is named."""
-    with pytest.raises(ValueError, match=r"no policy 'Planner'; .* planner, straight, reactive"):
+    with pytest.raises(ValueError, match=r"no policy 'Planner'; did you mean planner\?"):
         policy_named("Planner")
-    with pytest.raises(ValueError, match=r"speed is -1"):
+    with pytest.raises(ValueError, match=r"speed .* got -1"):
         policy_named("planner", -1.0)
 
 

@@ -58,7 +58,9 @@ def test_dumped_scenario_loads_as_itself(tmp_path):
         ("sensors={a: null}", "null}': sensors.a is null where fields belong"),
         ("start=5", "'start=5': "),
         ("camera.X_PB.translation=[1, 2]", "'camera.X_PB.translation=.1, 2.': "),
-        ("timeout=soon", "'timeout=soon': .*soon"),
+        ("timeout=soon", "'timeout=soon': timeout must be a number, got soon"),
+        ("seed=1.5", "seed must be a whole number, got 1.5"),
+        ("goal=[1, x, 2]", r"goal\[1\] must be a number, got x"),
         ("timeout", "'timeout' has no value; write FIELD=VALUE"),
         ("goal=[1, 2", "'goal=.1, 2' is not YAML"),
     ],
@@ -144,34 +146,35 @@ def test_fields_that_may_be_empty_may_be_null(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("timeout=0", "timeout is 0.0; it must be more than 0"),
-        ("seed=-1", "seed is -1; it must be at least 0"),
-        ("goal_radius=-1", "goal_radius is -1.0; it must be positive"),
-        ("start_radius=.inf", "start_radius is inf; it must be 0 to 1 m"),
-        ("start=[1, 2]", r"start is \[1.0, 2.0\]; it must be three finite numbers"),
-        ("goal=[1, .nan, 2]", r"goal is \[1.0, nan, 2.0\]; it must be three finite numbers"),
+        ("timeout=0", "timeout .* got 0.0"),
+        ("seed=-1", "seed .*2147483647.* got -1"),
+        ("seed=9999999999999999999999", "seed .*2147483647.* got 9999999999999999999999"),
+        ("goal_radius=-1", "goal_radius .* got -1.0"),
+        ("start_radius=.inf", "start_radius .* got inf"),
+        ("start=[1, 2]", r"start must be three finite numbers .* got \[1.0, 2.0\]"),
+        ("goal=[1, .nan, 2]", r"goal must be three finite numbers .* got \[1.0, nan, 2.0\]"),
         ("world.rocks=1000000000", "rocks = 1000000000 must be 0 to 1000"),
         ("world=!SceneConfig {}", "world.path is empty"),
-        ("camera.width=0", "camera is 0x240 pixels"),
-        ("camera.width=1000000", "camera is 1000000x240 pixels"),
-        ("camera.center_x=-1", "principal point is .*inside the image"),
-        ("camera.fps=1e-9", "camera.fps is 1e-09; it must be 0.01"),
-        ("camera.width=1", "camera is 1x240 pixels; it must be at least 2x2"),
-        ("camera={width: 4096, height: 4096}", "camera is 4096x4096 pixels; it must be .* at most"),
-        ("policy.lattice.speed=1e300", "speed is 1e[+]300 but must be positive and at most 20"),
+        ("camera.width=0", "camera .* got 0x240 pixels"),
+        ("camera.width=1000000", "camera .* got 1000000x240 pixels"),
+        ("camera.center_x=-1", "principal point must be inside the image"),
+        ("camera.fps=1e-9", "camera.fps .* got 1e-09"),
+        ("camera.width=1", "camera .* at least 2x2 .* got 1x240"),
+        ("camera={width: 4096, height: 4096}", "camera .* at most .* got 4096x4096"),
+        ("policy.lattice.speed=1e300", r"^policy\.lattice\.speed .* 20\] m/s, got 1e[+]300"),
         ("world.length=1000000", "is 1.6e[+]07 m² of ground; it must be at most"),
         ("world.width=1e9", "m² of ground; it must be at most"),
         ("world.voxel_size=1e-9", "voxel_size = 1e-09 m does not fit: .* the limit is"),
         ("world.width=1e-320", r"voxel_size = 0.15 m does not fit: .* fewer than 2 voxels"),
-        ("camera.focal=!FovDegrees {x: null}", "camera.focal is without x and y"),
-        ("camera.fps=.inf", "camera.fps is inf; it must be 0.01 to 1000 Hz"),
-        ("camera.focal=!FocalLength {x: 0}", "camera.focal is .*; it must be positive"),
-        ("camera.lcm_bus=other", "camera.lcm_bus is 'other'; it must be left out"),
-        ("simulator.integration_scheme=foo", "integration_scheme is foo; .*runge_kutta3"),
-        ("simulator.max_step_size=0", "max_step_size is 0.0; it must be 1e-5 to 1 s"),
-        ("simulator.max_step_size=.nan", "max_step_size is nan"),
-        ("simulator.accuracy=0", "accuracy is 0.0"),
-        ("simulator.start_time=5", "start_time is 5.0; it must be 0"),
+        ("camera.focal=!FovDegrees {x: null}", "camera.focal .* got neither"),
+        ("camera.fps=.inf", "camera.fps .* got inf"),
+        ("camera.focal=!FocalLength {x: 0}", "camera.focal must be positive"),
+        ("camera.lcm_bus=other", "camera.lcm_bus must be left out, got 'other'"),
+        ("simulator.integration_scheme=foo", "integration_scheme .*runge_kutta3.* got foo"),
+        ("simulator.max_step_size=0", "max_step_size .* got 0.0"),
+        ("simulator.max_step_size=.nan", "max_step_size .* got nan"),
+        ("simulator.accuracy=0", "accuracy .* got 0.0"),
+        ("simulator.start_time=5", "start_time must be 0, got 5.0"),
     ],
 )
 def test_scenario_refuses_what_cannot_be_flown(override, message):
@@ -189,7 +192,7 @@ def test_nothing_named_gives_the_defaults_and_they_are_valid(tmp_path):
     assert dump_config(scenario) == dump_config(Scenario())
     scenario.validate()
     scenario.timeout = 0.0
-    with pytest.raises(ValueError, match="timeout is 0"):
+    with pytest.raises(ValueError, match=r"timeout .* got 0"):
         scenario.validate()
 
 

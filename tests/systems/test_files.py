@@ -94,7 +94,7 @@ def test_what_is_there_is_used_only_if_it_may_be_overwritten(tmp_path):
 def test_what_must_be_there_is_named(tmp_path):
     """A path that leads nowhere is said with what is needed."""
     require_existing(tmp_path, "a folder")
-    with pytest.raises(FileNotFoundError, match=r"nowhere: there is no .*; a scene is needed"):
+    with pytest.raises(FileNotFoundError, match=r"No such file.*nowhere; expected a scene"):
         require_existing(tmp_path / "nowhere", "a scene")
 
 

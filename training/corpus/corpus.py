@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.environment import require_corpus
 from splatpilot.training.corpus.config import CorpusConfig
 from splatpilot.training.corpus.sample import OFF_PATH, Samples
 from splatpilot.training.corpus.shard import Shard
@@ -35,10 +36,7 @@ class Corpus:
     """
 
     def __init__(self, folder: Path) -> None:
-        if not (folder / "shards").is_dir():
-            raise FileNotFoundError(
-                f"{folder} holds no corpus; gather one with `splatpilot corpus make --out {folder}`"
-            )
+        require_corpus(folder)
         self.folder = folder
         self.config = load_config(CorpusConfig(), folder / CONFIG)
         self.shards = [Shard(path) for path in entries(folder / "shards")]

@@ -7,6 +7,7 @@ from pathlib import Path
 from splatpilot.systems.cores import available_cores
 from splatpilot.systems.files import require_writable_folder
 from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.messages import require
 from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.processes import map_processes
 from splatpilot.systems.progress import Progress, resumable, say
@@ -45,10 +46,8 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     """
     config.validate()
     jobs = available_cores() if jobs is None else jobs
-    if jobs < 1:
-        raise ValueError(f"--jobs is {jobs}; it must be at least 1")
-    if worlds < 1:
-        raise ValueError(f"--worlds is {worlds}; it must be at least 1")
+    require(jobs >= 1, "--jobs", "at least 1", jobs)
+    require(worlds >= 1, "--worlds", "at least 1", worlds)
     sources = [world_source(config.worlds, config.seed, k) for k in range(worlds)]
     claim_folder(out / CONFIG, config)
     for part in ("worlds", "shards"):

@@ -33,6 +33,7 @@ from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.privileged_planner import plan
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.progress import Progress
+from splatpilot.systems.seeds import first_training_seed
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -110,6 +111,7 @@ class AgileAutonomyTraining:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        first_training_seed(self.seed)
         self.schedule.validate()
         self.worlds.validate()
         for name in ("rounds", "round_updates", "environments", "steps", "ask_every", "batch"):

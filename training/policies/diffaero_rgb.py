@@ -19,6 +19,7 @@ from splatpilot.systems.policies.diffaero_inference import FARTHEST, NEAREST
 from splatpilot.systems.policies.diffaero_rgb_inference import DIFFAERO_RGB_NETWORK
 from splatpilot.systems.policies.monocular_depth import HEIGHT, WIDTH, rays_B, require_view
 from splatpilot.systems.progress import Progress
+from splatpilot.systems.seeds import check_seed
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
@@ -45,7 +46,7 @@ _CLOSE = 0.25
 class DiffAeroRgbTraining:
     """A training run."""
 
-    # Seed of everything random.
+    # Seed of everything random, 0 to 2147483647.
     seed: int = 0
     # Where the tensors live: cpu, or cuda.
     device: str = "cpu"
@@ -78,6 +79,7 @@ class DiffAeroRgbTraining:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        check_seed(self.seed)
         self.schedule.validate()
         if not self.corpora:
             raise ValueError("corpora is empty; name one or more folders of corpora")

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.policies import policy_named
 from splatpilot.systems.files import written_atomically
+from splatpilot.systems.messages import require
 from splatpilot.systems.output_folders import claim_folder, holds_folder
 from splatpilot.systems.progress import say
 from splatpilot.systems.provenance import revision
@@ -95,8 +96,7 @@ def run[Config: CorpusTraining](
         OSError: if `out` cannot be written, or a process was killed.
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
-        if value < 1:
-            raise ValueError(f"--{name} is {value}; it must be at least 1")
+        require(value >= 1, f"--{name}", "at least 1", value)
     # What is not there is refused before anything is written.
     if flown_by:
         policy_named(flown_by)

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from splatpilot.systems.seeds import first_training_seed
 from splatpilot.training.policies.differentiable_rollout import (
     DifferentiableRollout,
     Learner,
@@ -39,6 +40,7 @@ class RolloutTraining:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        first_training_seed(self.seed)
         self.schedule.validate()
         self.worlds.validate()
         self.rollout.validate()

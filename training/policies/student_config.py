@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from splatpilot.systems.seeds import check_seed
 from splatpilot.systems.sensing.observation_noise import ObservationNoise
 from splatpilot.training.policies.observation import validate_training_noise
 from splatpilot.training.policies.student_images import Appearance
@@ -17,7 +18,7 @@ class StudentTraining:
     observation: ClassVar[str]
     """What the student sees: rgb or depth."""
 
-    # Seed of everything random.
+    # Seed of everything random, 0 to 2147483647.
     seed: int = 0
     # Where the tensors live: cpu, or cuda.
     device: str = "cpu"
@@ -96,6 +97,7 @@ class StudentTraining:
 
     def validate(self) -> None:
         """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        check_seed(self.seed)
         self.schedule.validate()
         if not self.corpora:
             raise ValueError("corpora is empty; name one or more folders of corpora")

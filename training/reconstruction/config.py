@@ -7,6 +7,7 @@ import numpy as np
 from splatpilot.diagrams.worlds.scene_metadata import REPRESENTATIONS
 from splatpilot.diagrams.worlds.splits import SPLITS
 from splatpilot.systems.cores import available_cores
+from splatpilot.systems.seeds import check_seed
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 INITIALIZATIONS = ("auto", "depth", "points", "random")
@@ -150,6 +151,7 @@ class ReconstructConfig:
 
     def validate(self) -> None:
         """Raises ValueError for values that make no sense."""
+        check_seed(self.seed)
         choices = {
             "representation": REPRESENTATIONS,
             "initialization": INITIALIZATIONS,

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from splatpilot.diagrams.worlds.frontier import close_frontier
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
 from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source_digest
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, short_route_warning
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.progress import Progress
 from splatpilot.systems.torch_threads import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
@@ -270,8 +271,10 @@ def start_and_goal(
     """
     try:
         if metric:
-            return *choose_start_and_goal(field, VEHICLE_RADIUS), ()
+            p_WS, p_WG, length = choose_start_and_goal(field, VEHICLE_RADIUS)
+            warning = short_route_warning(length)
+            return p_WS, p_WG, length, ((warning,) if warning else ())
         reason = "its scale is unknown"
-    except ValueError as error:
+    except InfeasibleFlightError as error:
         reason = str(error)
     return *otherwise, float("nan"), (f"this scene cannot be flown in: {reason}",)

@@ -12,6 +12,7 @@ from splatpilot.diagrams.worlds.forest.light import ForestLight
 from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
 from splatpilot.diagrams.worlds.solids.light import Daylight
 from splatpilot.diagrams.worlds.solids.surfaces import merge
+from splatpilot.systems.seeds import check_seed
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 
 
@@ -44,8 +45,7 @@ class Forest:
 
     def __init__(self, config: TrunksConfig, seed: int) -> None:
         config.validate()
-        if seed < 0:
-            raise ValueError(f"seed = {seed} must be 0 or more")
+        check_seed(seed)
         self.config, self.seed = config, seed
         # One stream of random numbers a part: a change to one part leaves the others as they are.
         layout_rng, light_rng = (np.random.default_rng([seed, k]) for k in range(2))

@@ -15,8 +15,10 @@ from splatpilot.analysis.benchmark.workers import fly_all
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.config import ForestConfig
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
 from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.straight import Straight
 
 
 def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys, rows_of):
@@ -33,7 +35,7 @@ def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys,
     config = replace(config, overrides=["goal=[50, 0, 1.8]"])
     table = benchmark.run(config=config, out=tmp_path / "far", jobs=1)
     assert [row["infeasible"] for row in table] == [1, 1]
-    assert "short-straight-2-000 could not be flown: goal" in capsys.readouterr().out
+    assert "short-straight-2-000, infeasible: goal" in capsys.readouterr().out
     words = ["--scenarios", str(short_scenario), "--policies", "straight,planner", "--seeds", "1"]
     words += ["--out", str(tmp_path / "far"), "--set", *config.overrides, "--json"]
     assert main(["benchmark", *words]) == 1  # No flight is no success,
@@ -42,6 +44,53 @@ def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys,
     assert [row["infeasible"] for row in json.loads(printed.out)] == [1, 1]  # but a result.
     with pytest.raises(ValueError, match=r"could not be flown .* is outside the world"):
         replay.run(study=tmp_path / "far", id="short-straight-2-000")
+
+
+def test_a_scene_without_a_start_and_goal_does_not_stop_the_study(place, tmp_path, short_scenario):
+    hall = place.scene("hall", metric=True)
+    longway = tmp_path / "longway.yaml"
+    longway.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, least_way: 30}}\n")
+    config = StudyConfig([str(longway), str(short_scenario)], ["straight"], seeds=1)
+    [row] = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    assert (row["flights"], row["infeasible"]) == (2, 1)
+
+
+def test_a_flight_that_becomes_infeasible_is_an_error_of_its_row(
+    short_scenario, tmp_path, monkeypatch, rows_of
+):
+    update = Straight._update
+
+    def fail_later(policy, context, discrete_state):
+        if context.get_time() > 0.5:
+            raise InfeasibleFlightError("no route leads to the goal")
+        update(policy, context, discrete_state)
+
+    monkeypatch.setattr(Straight, "_update", fail_later)
+    config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1)
+    straight, planner = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
+    assert (straight["error"], straight["infeasible"], planner["error"]) == (1, 0, 0)
+    row = rows_of(tmp_path / "out" / "rollouts.csv")[0]
+    assert row["outcome"] == "error" and 0.5 < float(row["flight_time_s"]) < 0.6
+    assert row["reason"].startswith("at t = 0.53 s, p_WB = [")
+    assert "no route leads to the goal" in (tmp_path / "out" / "report.html").read_text()
+    assert replay.run(study=tmp_path / "out", id="short-straight-2-000").exact
+
+
+def test_a_policy_that_raises_stops_the_study(short_scenario, tmp_path, monkeypatch, capsys):
+    update = Straight._update
+
+    def fail_later(policy, context, discrete_state):
+        update(policy, context, discrete_state)
+        if context.get_time() > 0.5:
+            raise KeyError("depth")
+
+    monkeypatch.setattr(Straight, "_update", fail_later)
+    words = ["--scenarios", str(short_scenario), "--policies", "straight", "--jobs", "1"]
+    assert main(["benchmark", "--out", str(tmp_path / "out"), *words]) == 1
+    error = capsys.readouterr().err
+    assert "at t = 0.53 s, p_WB = [" in error and "KeyError: 'depth'" in error
+    traceback = (tmp_path / "out" / "errors" / "short-straight-2-000.txt").read_text()
+    assert "in fail_later" in traceback
 
 
 def test_exception_stops_the_study(short_scenario, tmp_path, capsys, rows_of):

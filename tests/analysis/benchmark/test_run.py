@@ -130,7 +130,7 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
     table = benchmark.run(config=config, out=tmp_path / "out", jobs=1)
     assert (table[0]["flights"], table[0]["not_run"]) == (2, 2)
     printed = capsys.readouterr().out
-    assert f"R99 is not flown: {tmp_path / 'nowhere'}: there is no such scene" in printed
+    assert f"R99 is not flown: No such file or folder: {tmp_path / 'nowhere'}" in printed
     assert "R99 was not run" in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -191,14 +191,14 @@ def test_study_interrupted_while_it_begins_is_finished(study, tmp_path, monkeypa
         (["replay", "{out}", "short-planner-2-999"], "has no flight 'short-planner-2-999'"),
         (["replay", "{out}/rollouts", "a"], "study.yaml: there is no such file"),
         (["benchmark", "--out", "{out}", "--scenarios", "P99"], "there is no scenario 'P99'"),
-        (["benchmark", "--out", "{out}", "--speeds", "fast"], "the speed 'fast' is no number"),
+        (["benchmark", "--out", "{out}", "--speeds", "fast"], "numbers in m/s, got 'fast'"),
         (
             ["benchmark", "--out", "{out}", "--scenarios", "{scenario}", "--policies", "nobody"],
             "there is no policy 'nobody'",
         ),
         (
             ["benchmark", "--out", "{out}", "--scenarios", "{scenario}", "--jobs", "0"],
-            "--jobs is 0",
+            "--jobs must be at least 1, got 0",
         ),
     ],
 )

@@ -44,9 +44,13 @@ def test_variants_are_read(text, variant):
         ("=reactive", "'=reactive' has no label before its ="),
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),
-        ("a=reactive:speed=3", "say how fast all policies fly"),
-        ("a=planner:lattice.speed=3", "say how fast all policies fly"),
+        ("a=reactive:speed=3", "must not set speed; give the speed of all policies"),
+        (
+            "a=planner:lattice.speed=3",
+            "must not set speed; give the speed of all policies",
+        ),
         ("a=diffaero:weights=x.npz", "LABEL=FILE.npz"),
+        ("../mine.py", r"a policy must be .*, got \.\./mine\.py; .* write mine:CLASS"),
     ],
 )
 def test_bad_variants_are_refused(text, message):

@@ -2,12 +2,15 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from splatpilot.analysis.cli import main
 from splatpilot.diagrams import fly
 from splatpilot.diagrams.scenario import Scenario
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.policies.straight import Straight
 
 SHORT = ["--set", "world.length=10", "--set", "world.width=6", "--set", "timeout=0.5"]
 
@@ -89,3 +92,27 @@ def test_policies_are_given_as_in_the_benchmark(tmp_path):
     words = ["--no-video", "--policy", "reactive:margin=0.3", "--out", str(out), *SHORT]
     assert main(["fly", *words]) == 0
     assert load_config(Scenario(), out / "scenario.yaml").policy.margin == 0.3
+
+
+@pytest.mark.parametrize(
+    ("error", "written"), [(InfeasibleFlightError("no route"), False), (KeyError("depth"), True)]
+)
+def test_an_exception_in_flight_leaves_the_page_and_the_flight(
+    error, written, tmp_path, monkeypatch, capsys
+):
+    def fail_later(policy, context, discrete_state):
+        if context.get_time() > 0.3:
+            raise error
+
+    monkeypatch.setattr(Straight, "_update", fail_later)
+    out = tmp_path / "flight"
+    words = ["--policy", "straight", "--json", "--no-video", "--out", str(out), *SHORT]
+    assert main(["fly", *words]) == 1
+    printed = capsys.readouterr()
+    assert "the flight ended at t = 0.33 s, p_WB = [" in printed.err.splitlines()[-1]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["outcome"] == "error" and str(error) in summary["reason"]
+    assert json.loads(printed.out) == summary
+    assert (out / "flight.html").stat().st_size > 1e4
+    assert np.load(out / "trajectory.npz")["times"][-1] == pytest.approx(0.32, abs=0.02)
+    assert (out / "traceback.txt").exists() is written

@@ -10,7 +10,7 @@ SHORT = ["--set", "world.length=10", "--set", "world.width=6"]
 @pytest.mark.parametrize(
     ("words", "there"),
     [
-        (["reconstruct", "scene", "--out", "scene"], "scene/views.png"),
+        (["reconstruct", "capture", "--out", "scene"], "scene/views.png"),
         (["measure", "scene"], "scene/metrics.json"),
         (["view", "scene", "--out", "mine"], "mine"),
         (["view", "P02", "--seed", "3"], "out/view/P02-003.html"),
@@ -24,6 +24,7 @@ def test_what_is_there_stays(words, there, place, monkeypatch, capsys):
     """A file or folder that a verb would write is refused, with the remedy, and stays as it is."""
     monkeypatch.chdir(place.folder)
     place.scene("scene")
+    (place.folder / "capture").mkdir()
     file = place.folder / there
     file.parent.mkdir(parents=True, exist_ok=True)
     if not file.exists():

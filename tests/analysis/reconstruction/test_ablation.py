@@ -121,7 +121,7 @@ def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
         unseen_fraction=0.0,
         gain=1.0,
     )
-    return SceneMeasures(True, 8, 8, {0: view}, {0: view}, "none")
+    return SceneMeasures(True, 8, 8, {0: view}, {0: view}, "none", None)
 
 
 def test_means_and_spreads():

@@ -54,11 +54,11 @@ def photographs(seen_room, tmp_path):
 
 @pytest.fixture
 def unscaled(seen_room, photographs, tmp_path):
-    """The room as a scene of photographs alone: its far end was seen by nobody."""
+    """The room as a scene of photographs alone: what lies behind the cameras is unknown."""
     gaussians, _ = seen_room
     occupied, unknown = np.zeros((2, 60, 30, 25), bool)
-    occupied[:50, :, 0] = True
-    unknown[50:] = True
+    occupied[5:, :, 0] = True
+    unknown[:5] = True
     field = esdf_from_occupancy(occupied, unknown, np.zeros(3), 0.1 * SHRUNK)
     world = World(
         name="room",
@@ -114,7 +114,7 @@ def test_scene_of_photographs_can_be_flown_in_once_it_has_its_size(
         unit = BakedScene(old.gaussians).render(again.K, 64, 48, X_OC)
         np.testing.assert_allclose(scaled.color, unit.color, atol=1e-4)
         np.testing.assert_allclose(scaled.depth, unit.depth / SHRUNK, rtol=1e-4)
-    known = new.esdf.states == old.esdf.states  # All but what closes the far end.
+    known = new.esdf.states == old.esdf.states  # All but what closes the near end.
     assert known.mean() > 0.9
     free = old.esdf.states == FieldState.FREE
     assert (new.esdf.distances <= old.esdf.distances / SHRUNK + 1e-5)[free].all()

@@ -70,6 +70,18 @@ def test_frontier_hides_nothing_that_was_captured(captured, closed):
         assert np.mean(seen_depth(closed[1], X_WC) < depth - 0.1) < 0.005
 
 
+def test_what_was_captured_beyond_the_range_of_the_field_is_not_hidden(captured):
+    _, depths, X_WCs = captured
+    box = np.full(3, -0.4), SIZE + 0.4
+    field = esdf_from_depth_images(depths, K, X_WCs, *box, VOXEL, max_range=3.0)
+    _, frontier = close_frontier(field, depths, K, X_WCs)
+    assert frontier is not None
+    for depth, X_WC in zip(depths, X_WCs, strict=True):
+        assert np.mean(seen_depth(frontier, X_WC) < depth - 0.1) < 0.005
+    aside = looking(np.pi, [2.8, 2.0, 1.5])  # back into the corners beside the cameras
+    assert np.mean(np.isfinite(seen_depth(frontier, aside))) > 0.5
+
+
 def test_frontier_is_seen_where_it_is_hit(captured, closed):
     """From inside, looking about, rays that end at the frontier's obstacles see it there, hardly
     any farther than two voxels behind, and its surfels are few."""

@@ -8,6 +8,7 @@ from splatpilot.diagrams.worlds.make_world import place_config
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.scene import SceneConfig
 from splatpilot.systems.collision.octomap import Octomap
+from splatpilot.systems.infeasible import InfeasibleFlightError
 
 
 def hall(length: int, width: int) -> Octomap:
@@ -47,11 +48,24 @@ def test_large_maps_are_cropped_about_free_space(in_map, monkeypatch, caplog):
     np.testing.assert_allclose(named.esdf.upper_W, [10, 10, 4])
 
 
+def test_short_routes_are_warned_of(in_map, caplog):
+    in_map(hall(24, 12))
+    assert "map.bt: the longest route from a start to a goal is" in caplog.text
+
+
+def test_drawn_ends_are_as_far_apart_as_the_scenario_says(in_map):
+    in_map(hall(40, 20), draw_ends=True, least_way=6.0)
+    with pytest.raises(InfeasibleFlightError, match="at least 30 m, got"):
+        in_map(hall(40, 20), draw_ends=True, least_way=30.0)
+
+
 def test_maps_without_free_space_are_refused(in_map):
     """Where nothing is known to be free there is nowhere to fly."""
     octomap = hall(20, 20)
     octomap.occupied[:] = True
-    with pytest.raises(ValueError, match=r"map\.bt: no space from .* is known to be free"):
+    with pytest.raises(
+        InfeasibleFlightError, match=r"map\.bt: no space from .* is known to be free"
+    ):
         in_map(octomap)
 
 

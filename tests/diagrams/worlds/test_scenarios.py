@@ -7,7 +7,8 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds import feasibility
+from splatpilot.diagrams.worlds import branches, feasibility
+from splatpilot.diagrams.worlds.branches import BranchesConfig
 from splatpilot.diagrams.worlds.clutter import ClutterConfig
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
 from splatpilot.diagrams.worlds.inserted import GAP, InsertedConfig
@@ -26,6 +27,7 @@ from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanc
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import Box, Capsule, HalfSpace
 from splatpilot.systems.configuration import load_config
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.splats.gaussian_scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
 
@@ -169,9 +171,12 @@ def test_infeasible_draws_are_redrawn_and_given_up(monkeypatch):
     full = ClutterConfig(
         length=8, width=4, height=3, spheres=0, boxes=200, half_min=0.5, half_max=0.7, floating=True
     )
-    with pytest.raises(ValueError, match=r"none of 2 instances .* seed 0 leaves a vehicle"):
+    with pytest.raises(InfeasibleFlightError, match=r"none of 2 instances .* seed 0 leaves a"):
         make_blueprint(full, 0)
-    with pytest.raises(ValueError, match="seed = -1"):
+    monkeypatch.setattr(branches, "is_feasible", lambda blueprint: False)
+    with pytest.raises(InfeasibleFlightError, match=r"leave no route in \d+ draws from seed 0"):
+        make_blueprint(BranchesConfig(length=8, width=5, height=3), 0)
+    with pytest.raises(ValueError, match="seed must be"):
         make_blueprint(RoomConfig(), -1)
 
 
@@ -197,7 +202,7 @@ def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     assert find_scene(SceneConfig(path="hall")) == hall / "hall"
     monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match=r"hall: .*SPLATPILOT_SCENES.*; ask Ann"):
+    with pytest.raises(FileNotFoundError, match=r": hall; .*SPLATPILOT_SCENES.*; ask Ann"):
         make_world(SceneConfig(path="hall", source="ask Ann"), 0)
 
 

@@ -1,8 +1,13 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, draw_start_and_goal
+from splatpilot.diagrams.worlds.start_and_goal import (
+    choose_start_and_goal,
+    draw_start_and_goal,
+    short_route_warning,
+)
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.infeasible import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
 
@@ -71,10 +76,32 @@ def test_narrow_places_get_less_margin():
         choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.95, 0.95))), RADIUS)
 
 
+def test_the_longer_route_is_chosen_not_the_larger_part():
+    hall = ((0.2, 0.2, 0.2), (3.2, 3.2, 3.2))
+    corridor = ((4.0, 0.2, 0.2), (5.3, 9.8, 1.5))
+    esdf = corridors(hall, corridor, size=(60, 100, 40))
+    for p_WS, p_WG, length in (
+        choose_start_and_goal(esdf, RADIUS, margin=0.2),
+        draw_start_and_goal(esdf, RADIUS, seed=0, margin=0.2),
+    ):
+        assert min(p_WS[0], p_WG[0]) > 4.0
+        assert length > 4.0
+
+
+def test_half_of_the_margin_is_taken_for_a_much_longer_route():
+    rooms = [((x, 0.2, 0.2), (x + 1.8, 2.0, 2.0)) for x in (0.2, 4.0, 7.8)]
+    doors = [((x, 0.6, 0.6), (x + 2.0, 1.7, 1.7)) for x in (2.0, 5.8)]
+    esdf = corridors(*rooms, *doors, size=(100, 22, 22))
+    _, _, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
+    assert length > 8.0
+    assert not short_route_warning(length)
+    assert "5.0 m" in short_route_warning(5.0)
+
+
 def test_no_room_at_all():
     """A place too narrow for the vehicle is an error that names radius and largest clearance."""
     with pytest.raises(
-        ValueError,
+        InfeasibleFlightError,
         match=r"radius 0\.354 m with 0\.1 m to spare: the largest clearance is 0\.\d\d m",
     ):
         choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.7, 0.7))), RADIUS)
@@ -85,7 +112,7 @@ def test_no_way_worth_a_flight():
     cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.4, 1.4)))
     for choose in (choose_start_and_goal, lambda *given: draw_start_and_goal(*given, seed=0)):
         with pytest.raises(
-            ValueError, match=r"longest way .* is 0\.\d\d m, at least 1 m is needed"
+            InfeasibleFlightError, match=r"longest route .* at least 1 m, got 0\.\d\d m"
         ):
             choose(cell, RADIUS)
 
@@ -106,5 +133,6 @@ def test_drawn_ends_are_as_far_apart_as_asked(seed):
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
     _, _, length = draw_start_and_goal(esdf, RADIUS, seed, least=0.8 * longest)
     assert 0.8 * longest <= length <= longest + 1e-9
-    with pytest.raises(ValueError, match=r"longest way .* is \d\.\d+ m, at least 50 m is needed"):
+    message = r"longest route .* at least 50 m, got \d\.\d+ m"
+    with pytest.raises(InfeasibleFlightError, match=message):
         draw_start_and_goal(esdf, RADIUS, seed, least=50.0)

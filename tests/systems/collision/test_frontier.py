@@ -46,7 +46,7 @@ def test_obstacles_begin_two_voxels_behind_what_was_seen():
     corners; distances before it are the nearer of walls' and plane's, what planners trust stays."""
     field = half_seen_room()
     reachable = reachable_space(field, 0.35)
-    hidden, before = hidden_frontier(field, reachable, [], K, [])
+    hidden, before, _ = hidden_frontier(field, reachable, [], K, [])
     assert set(np.argwhere(hidden)[:, 0]) == {28}
     assert hidden[28, 2:22, 2:22].all()
     centers, normals = frontier_faces(before, hidden)
@@ -64,15 +64,16 @@ def test_obstacles_begin_two_voxels_behind_what_was_seen():
     )
 
 
-@pytest.mark.parametrize("sky", [np.inf, 1000.0])
-def test_space_before_the_sky_stays_open(sky):
-    """Where a camera that looks along x sees sky the frontier stays open, elsewhere it is closed:
-    also where a wall farther away was seen."""
+@pytest.mark.parametrize(("seen", "surface"), [(np.inf, False), (1000.0, False), (50.0, True)])
+def test_space_before_the_sky_and_far_surfaces_stays_open(seen, surface):
     field = half_seen_room()
     R_WC = RollPitchYaw(0.0, np.pi / 2, 0.0).ToRotationMatrix()  # x of the image is -z
     X_WC = RigidTransform(R_WC, [0.8, 1.2, 1.2])
-    depth = np.full((60, 80), 50.0)
-    depth[:, :40] = sky
-    hidden, _ = hidden_frontier(field, reachable_space(field, 0.35), [depth], K, [X_WC])
+    depth = np.zeros((60, 80))
+    depth[:, :40] = seen
+    hidden, _, before_surface = hidden_frontier(
+        field, reachable_space(field, 0.35), [depth], K, [X_WC]
+    )
+    assert before_surface is surface
     assert hidden[28, 2:22, 2:11].all()
     assert not hidden[28, 2:22, 13:].any()

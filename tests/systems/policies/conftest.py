@@ -7,6 +7,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
+from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy
 from splatpilot.systems.collision.shapes import Box, Cylinder, HalfSpace
 
 VOXEL_SIZE = 0.2
@@ -66,6 +67,16 @@ def doorway() -> Esdf:
     """12 x 8 x 4 m in two rooms, joined by a door 1.2 m wide at y = 4 in a wall at x = 6."""
     walls = [box([6, -1, -1], [6.2, 3.4, 5]), box([6, 4.6, -1], [6.2, 9, 5])]
     return field_of(walls, [12.0, 8.0, 4.0])
+
+
+@pytest.fixture(scope="session")
+def narrow_bend() -> Esdf:
+    """6 x 4 x 1.6 m, voxels of 0.05 m: a duct 0.9 m wide from (1, 1) in an S to (4.2, 2.6)."""
+    occupied = np.ones((120, 80, 32), dtype=bool)
+    for x, y in ((slice(11, 61), slice(11, 29)), (slice(43, 61), slice(11, 61))):
+        occupied[x, y, 3:-3] = False
+    occupied[43:93, 43:61, 3:-3] = False
+    return esdf_from_occupancy(occupied, np.zeros_like(occupied), np.zeros(3), 0.05).conservative()
 
 
 @pytest.fixture(scope="session")

@@ -188,7 +188,7 @@ def test_cameras_that_cannot_be_pooled_are_refused(name, files):
     config = configure(weights=files[name], camera=OnboardCamera(width=50, height=30))
     with pytest.raises(ValueError, match=r"50x30 pixels, but this policy pools it to"):
         make(config)
-    with pytest.raises(ValueError, match=r"speed is 0"):
+    with pytest.raises(ValueError, match=r"speed .* got 0"):
         make(configure(weights=files[name], speed=0.0))
 
 

@@ -116,5 +116,5 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(file, tmp_path):
     with pytest.raises(ValueError, match=r"camera\.fov_x is 80\.0 deg"):
         camera = OnboardCamera(width=160, height=90, fov_x=80.0)
         DiffAeroRgb(DiffAeroRgbConfig(weights=file, camera=camera))
-    with pytest.raises(ValueError, match=r"DiffAeroRgbConfig\.speed is 0\.0 m/s"):
+    with pytest.raises(ValueError, match=r"DiffAeroRgbConfig\.speed .* got 0\.0"):
         DiffAeroRgb(DiffAeroRgbConfig(weights=file, speed=0.0))

@@ -145,7 +145,7 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
     expected, found = hypotheses(2.0), hypotheses(1.0)
     np.testing.assert_allclose(2.0 * found.waypoints_B, expected.waypoints_B, atol=1e-5)
     np.testing.assert_array_equal(found.costs, expected.costs)
-    with pytest.raises(ValueError, match=r"speed is 0.0 m/s but must be 0\.1 to 10"):
+    with pytest.raises(ValueError, match=r"speed .* got 0.0"):
         Student(replace(config_of(name, files), speed=0.0))
 
 

@@ -86,16 +86,16 @@ def test_best_are_in_order_and_distinct(pillar):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": 0.0}, "speed is 0.0 but must be positive"),
-        ({"horizon": 0.9}, "horizon is 0.9 but must be a multiple of 0.1 s and at least 1.0 s"),
+        ({"speed": 0.0}, r"speed must be in \(0, 20\] m/s, got 0.0"),
+        ({"horizon": 0.9}, "horizon must be a multiple of 0.1 s and at least 1.0 s, got 0.9"),
         ({"horizon": 1.55}, "multiple of 0.1 s"),
-        ({"num_yaws": 0}, "num_yaws is 0 but must be at least 1"),
-        ({"max_pitch": 1.6}, "max_pitch is 1.6 but must be less than pi/2"),
-        ({"margin": -0.1}, "margin is -0.1 but must be 0 to 1e6"),
+        ({"num_yaws": 0}, "num_yaws must be at least 1, got 0"),
+        ({"max_pitch": 1.6}, "max_pitch must be less than pi/2, got 1.6"),
+        ({"margin": -0.1}, "margin must be 0 to 1e6, got -0.1"),
         ({"speed_fractions": []}, "one or more values"),
         ({"speed_fractions": [0.5, 1.2]}, r"values in \(0, 1\]"),
         ({"num_hypotheses": 600}, "at most 525"),
-        ({"jerk_weight": float("nan")}, "jerk_weight is nan"),
+        ({"jerk_weight": float("nan")}, "jerk_weight .* got nan"),
     ],
 )
 def test_configs_out_of_range_are_refused(changes, message):

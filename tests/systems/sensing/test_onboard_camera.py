@@ -40,5 +40,5 @@ def test_mount_looks_ahead_and_up():
 )
 def test_bad_config_is_named(field, value):
     """A value out of range names the field."""
-    with pytest.raises(ValueError, match=rf"OnboardCamera.{field} is"):
+    with pytest.raises(ValueError, match=rf"OnboardCamera.{field} must"):
         OnboardCamera(**{field: value}).validate()

@@ -125,7 +125,7 @@ def test_system_gives_the_same_grid():
 )
 def test_bad_config_is_named(field, value):
     """A value out of range names the field."""
-    with pytest.raises(ValueError, match=rf"TimeOfFlight.{field} is"):
+    with pytest.raises(ValueError, match=rf"TimeOfFlight.{field} must"):
         TimeOfFlightGrid(TimeOfFlight(**{field: value}))
 
 

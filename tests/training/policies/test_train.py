@@ -209,7 +209,9 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
         run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"schedule\.updates is 0"):
         run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"there is no scenario 'P99'; there are P01"):
+    with pytest.raises(ValueError, match=r"seed must be in \[0, 999\], got 10{20}$"):
+        run(config=tiny(f"seed={10**20}"), out=tmp_path, make=TRAINERS.find("diffaero").make)
+    with pytest.raises(ValueError, match=r"there is no scenario 'P99'; did you mean P09"):
         run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
@@ -245,7 +247,7 @@ def test_training_seeds_are_not_the_benchmarks(monkeypatch):
     training_worlds.validation_worlds(selection)
     assert len(asked) == len(set(asked)) == 4000
     assert min(asked) >= TRAINING_SEEDS
-    with pytest.raises(ValueError, match="seed is 1000"):
+    with pytest.raises(ValueError, match=r"seed must be .*, got 1000"):
         training_worlds.training_worlds(selection, 1000)
 
 
