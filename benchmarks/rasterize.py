@@ -149,41 +149,6 @@ def print_depth_alone() -> None:
             row(name, f"{width}x{height}", *(f"{milliseconds(call)[0]:.2f}" for call in calls))
 
 
-def print_distorted(scene: GaussianScene, X_WC: RigidTransform) -> None:
-    header("distorted cameras, 320x240", "forward", "+ backward")
-    viewmats, Ks = cameras_of(X_WC, 320, 240)
-    renderer = create_renderer()
-    lenses: dict[str, dict[str, Any]] = {
-        "pinhole": {},
-        "OpenCV, k1 k2 k3 and p1 p2": {
-            "radial_coeffs": torch.tensor([[-0.28, 0.09, -0.012]]),
-            "tangential_coeffs": torch.tensor([[0.003, -0.002]]),
-        },
-        "fisheye": {
-            "camera_model": "fisheye",
-            "radial_coeffs": torch.tensor([[0.04, -0.01, 0, 0]]),
-        },
-    }
-    for name, lens in lenses.items():
-        leaves = {n: t.clone().requires_grad_() for n, t in tensors_of(scene).items()}
-        view = {"viewmats": viewmats, "Ks": Ks, "width": 320, "height": 240}
-        view["renderer"] = renderer
-
-        def forward(leaves: dict = leaves, view: dict = view, lens: dict = lens) -> torch.Tensor:
-            return rasterize(**leaves, **view, **lens)[0]
-
-        def forward_only(forward: Callable = forward) -> None:
-            with torch.no_grad():
-                forward()
-
-        def both(forward: Callable = forward, leaves: dict = leaves) -> None:
-            for leaf in leaves.values():
-                leaf.grad = None
-            forward().sum().backward()
-
-        row(name, *(f"{milliseconds(call, 10)[0]:.1f}" for call in (forward_only, both)))
-
-
 def print_lenses(scene: GaussianScene, X_WC: RigidTransform) -> None:
     header("lenses in flight, 320x240", "ms")
     baked, K = BakedScene(scene), intrinsics(320, 240)
@@ -233,7 +198,6 @@ def main() -> None:
     print_baked(scene, X_WC)
     print_depth_alone()
     print_lenses(scene, X_WC)
-    print_distorted(scene, X_WC)
     print_torch(scene, X_WC, calls)
     print_raster_kernel(scene, X_WC, arguments.opensplat)
     print_limits(scene, X_WC)

@@ -1,6 +1,5 @@
 """Gaussian splatting with gsplat's interface: native kernels on the CPU, gsplat on CUDA."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,6 @@ from splatpilot.systems.splats.rasterization_checks import (
     check_values,
     depth_mode_of,
     pair_meta,
-)
-from splatpilot.systems.splats.rasterization_unscented import (
-    RADIAL_COUNTS,
-    camera_projections,
-    check_camera_model,
-    render_unscented,
 )
 from splatpilot.systems.splats.rasterization_views import Drawing, Views, joined, to_numpy
 
@@ -52,10 +45,6 @@ def rasterize(
     render_mode: str = "RGB",
     absgrad: bool = False,
     rasterize_mode: str = "classic",
-    camera_model: str = "pinhole",
-    radial_coeffs: Tensor | None = None,
-    tangential_coeffs: Tensor | None = None,
-    max_angle: float = math.pi / 2,
     renderer: _native.Renderer | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders N Gaussians into C cameras (Kerbl et al. 2023, with gsplat's conventions).
@@ -77,11 +66,6 @@ def rasterize(
     colors, viewmats (all twelve numbers, taken as free) and backgrounds; a Gaussian that is skipped
     or held at a = .99 has no part in the derivative there, and a median depth is constant. Equal
     input gives equal bits, gradients included, whatever the number of threads.
-
-    With distortion coefficients, or for a fisheye, S and the centre on the image are those of the
-    unscented projection (see `camera_models`), and Ks and the coefficients are differentiable too.
-    Gaussians that reach where the camera model is not valid are left out, and so are those whose
-    centre lies more than half an image outside the image.
 
     Args:
         means: (N, 3) centres [m].
@@ -106,11 +90,6 @@ def rasterize(
             absolute values of what they add to the gradient of means2d.
         rasterize_mode: "classic", or "antialiased": opacities are multiplied by
             sqrt(det S / det(S + eps2d)), so that Gaussians narrower than a pixel keep their light.
-        camera_model: "pinhole", with OpenCV's distortion if coefficients are given, or "fisheye".
-        radial_coeffs: (C, 2), (C, 3) or (C, 6) k1 k2 [k3 [k4 k5 k6]] of a pinhole; (C, 4) k1 to k4
-            of a fisheye, zero if None.
-        tangential_coeffs: (C, 2) p1 p2 of a pinhole.
-        max_angle: Fisheye: Gaussians farther from the optical axis are left out, <= pi/2 [rad].
         renderer: Of `create_renderer`: CPU threads, which do not influence the result, SIMD level
             and memory for one image after another; None: one thread, for this call alone.
 
@@ -123,15 +102,12 @@ def rasterize(
 
     Raises:
         ValueError: a tensor has the wrong shape, dtype, device or values (the message names it),
-            or Ks of an undistorted pinhole requires a gradient.
-        NotImplementedError: two of these come together: tensors on a GPU, distorted cameras, median
-            depth.
+            or Ks requires a gradient.
+        NotImplementedError: median depth of tensors on a GPU.
         ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    tensors = by_name(*scene, Ks, backgrounds, radial_coeffs, tangential_coeffs)
-    check_camera_model(camera_model, tangential_coeffs, max_angle)
-    unscented = camera_model != "pinhole" or not (radial_coeffs is tangential_coeffs is None)
+    tensors = by_name(*scene, Ks, backgrounds)
     check_render_mode(render_mode)
     median = "MD" in render_mode
     if rasterize_mode not in RASTERIZE_MODES:
@@ -143,17 +119,12 @@ def rasterize(
             f"render_mode {render_mode!r} needs rasterize_mode 'classic': antialiasing makes small "
             "Gaussians fainter than they are in the median depth"
         )
-    if median and (unscented or means.device.type == "cuda"):
+    if median and means.device.type == "cuda":
         raise NotImplementedError(
-            f"render_mode {render_mode!r} is there for undistorted pinholes on the CPU alone; undo "
-            "the distortion, and move the tensors with .cpu()"
+            f"render_mode {render_mode!r} is for the CPU only; move the tensors with .cpu()"
         )
-    check_shapes(tensors, sh_degree, RADIAL_COUNTS[camera_model])
+    check_shapes(tensors, sh_degree)
     if means.device.type == "cuda":
-        if unscented:
-            raise NotImplementedError(
-                "distorted cameras are rendered on the CPU alone; move the tensors with .cpu()"
-            )
         return rasterize_by_gsplat(
             scene,
             Ks,
@@ -170,7 +141,7 @@ def rasterize(
             rasterize_mode=rasterize_mode,
         )
     check_device(means)
-    if torch.is_grad_enabled() and Ks.requires_grad and not unscented:
+    if torch.is_grad_enabled() and Ks.requires_grad:
         raise ValueError("Ks requires a gradient, which is not available; use Ks.detach()")
 
     renderer = create_renderer() if renderer is None else renderer
@@ -198,14 +169,10 @@ def rasterize(
         absgrad=absgrad,
     )
     wants_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
-    if unscented:
-        cameras = camera_projections(camera_model, Ks, radial_coeffs, tangential_coeffs, max_angle)
-        drawing, splats = render_unscented(views, scene, cameras, wants_gradients)
-    else:
-        drawing = views.draw(arrays, keep=wants_gradients)
-        splats = Project.apply(views, drawing, *scene) if wants_gradients else None
-    if splats is None:
+    drawing = views.draw(arrays, keep=wants_gradients)
+    if not wants_gradients:
         return drawing.image, drawing.alpha, _meta(drawing, drawing.means2d())
+    splats = Project.apply(views, drawing, *scene)
     image, alpha = Composite.apply(views, drawing, *splats, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
     return image, alpha, _meta(drawing, splats[0])
 

@@ -12,7 +12,7 @@ from splatpilot import _native
 TILE_SIZE = 16  # [px]
 CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "MD": 1, "RGB+D": 4, "RGB+ED": 4, "RGB+MD": 4}
 SCENE = ("means", "quats", "scales", "opacities", "colors")
-TENSORS = (*SCENE, "viewmats", "Ks", "backgrounds", "radial_coeffs", "tangential_coeffs")
+TENSORS = (*SCENE, "viewmats", "Ks", "backgrounds")
 
 
 def by_name(*tensors: Tensor | None) -> dict[str, Tensor]:
@@ -21,9 +21,7 @@ def by_name(*tensors: Tensor | None) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in given if tensor is not None}
 
 
-def check_shapes(
-    tensors: dict[str, Tensor], sh_degree: int | None, radial_counts: tuple[int, ...] = ()
-) -> None:
+def check_shapes(tensors: dict[str, Tensor], sh_degree: int | None) -> None:
     """Raises ValueError for a tensor of another shape, dtype or device than `rasterize` takes."""
     N = tensors["means"].shape[0] if tensors["means"].ndim else 0
     C = tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
@@ -36,8 +34,6 @@ def check_shapes(
         "viewmats": ((C, 4, 4),),
         "Ks": ((C, 3, 3),),
         "backgrounds": ((C, 3),),
-        "radial_coeffs": tuple((C, count) for count in radial_counts),
-        "tangential_coeffs": ((C, 2),),
     }
     if sh_degree is not None:
         if sh_degree not in (0, 1, 2, 3):

@@ -5,14 +5,11 @@ import math
 import cv2
 import numpy as np
 import pytest
-import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot import _native
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import sensor_of
-from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.distortion import Distortion, pixel_slopes
@@ -91,35 +88,6 @@ def test_pixels_beyond_the_lens_look_nowhere():
     folding = Distortion("opencv", [-0.3])
     assert folding.limit == pytest.approx(math.sqrt(1 / 0.9))  # (r - 0.3 r^3)' = 0
     assert np.isnan(folding.project(np.array([1.1, 0.0]))).all()
-
-
-@pytest.mark.parametrize("simd", _native.simd_levels())
-@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: f"{lens.model}{len(lens.radial)}")
-def test_agrees_with_the_unscented_projection(lens, simd):
-    """Of small Gaussians the native image and that of `rasterize`, projected in torch by another
-    method, are the same."""
-    scene = blobs(4000, 1 / 400)
-    view = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, RigidTransform(), distortion=lens)
-    radial = [*lens.radial, *[0.0] * (4 - len(lens.radial))] if lens is FISHEYE else lens.radial
-    with torch.no_grad():
-        image, alpha, _ = rasterize(
-            *map(torch.from_numpy, (scene.means, scene.quats, scene.scales, scene.opacities)),
-            colors=torch.from_numpy(scene.sh),
-            viewmats=torch.eye(4)[None],
-            Ks=torch.from_numpy(K).float()[None],
-            width=WIDTH,
-            height=HEIGHT,
-            sh_degree=0,
-            radial_coeffs=torch.tensor([radial]),
-            tangential_coeffs=torch.tensor([lens.tangential]) if lens.tangential else None,
-            camera_model="fisheye" if lens.model == "fisheye" else "pinhole",
-        )
-    assert (view.alpha > 0.1).mean() > 0.3
-    error = np.abs(view.color - image[0].numpy())
-    assert error.mean() < 1e-4
-    # But for contributions of 1/255 that cross the cut.
-    assert np.quantile(error, 0.999) < 5e-3
-    assert np.abs(view.alpha - alpha[0, ..., 0].numpy()).mean() < 1e-4
 
 
 @pytest.mark.parametrize("lens", [FISHEYE, BARREL], ids=lambda lens: lens.model)

@@ -166,12 +166,9 @@ def test_it_is_constant_in_gradients():
     assert torch.equal(*gradients)
 
 
-def test_it_needs_an_undistorted_classic_pinhole():
-    """What has no median depth says so, by name: antialiasing, distortion, surfels' own modes."""
+def test_antialiased_images_and_surfels_have_no_median_depth():
     scene = random_scene(count=10)
     with pytest.raises(ValueError, match=r"'RGB\+MD' needs rasterize_mode 'classic'"):
         rasterize(**scene, **SIZE, render_mode="RGB+MD", rasterize_mode="antialiased")
-    with pytest.raises(NotImplementedError, match="undistorted pinholes"):
-        rasterize(**scene, **SIZE, render_mode="MD", camera_model="fisheye")
     with pytest.raises(ValueError, match="'MD'; it must be one of RGB, D, ED"):
         rasterize_surfels(**scene, **SIZE, render_mode="MD")
