@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from matplotlib import colormaps
 
-from splatpilot.systems.files import written_atomically
+from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.sample import EXPERT, SOURCES
+from splatpilot.training.corpus.samples import EXPERT, SOURCES
 
 _SCALE = 3  # pixels of the sheet a pixel of an image
 _COLUMNS = 4

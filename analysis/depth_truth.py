@@ -11,23 +11,23 @@ from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.analysis.depth_errors import DepthFrame
-from splatpilot.analysis.reconstruction.scene_views import SceneViews
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.sensors import make_camera
-from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.analysis.reconstruction.scene_measures import SceneViews
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
 from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.drake_images import ranged_depth, render_view
-from splatpilot.systems.splats.gaussian_ply import read_ply
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.splats.splat_camera import ranged_depth, render_view
+from splatpilot.systems.splats.splat_files import read_ply
+from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
-from splatpilot.training.reconstruction.measures import has_true_depth
+from splatpilot.training.reconstruction.metrics import has_true_depth
 
 _BEYOND = 0.1
 """[m], how far outside the volume scenery may begin."""

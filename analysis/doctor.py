@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from splatpilot.diagrams.scenario_files import benchmark_scenarios
-from splatpilot.systems.cores import available_cores
-from splatpilot.systems.environment import DATA, SCENES, data_folder, scenes_folder
-from splatpilot.systems.extras import packages_of_extras
+from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.systems.common.extras import packages_of_extras
+from splatpilot.systems.common.files import DATA, SCENES, data_folder, scenes_folder
+from splatpilot.systems.common.processes import available_cores
 
 _DRIVER = Path("/proc/driver/nvidia")
 
@@ -104,7 +104,7 @@ def _gpu() -> list[Finding]:
 
 
 def _opengl() -> list[Finding]:
-    from splatpilot.systems.opengl import require_opengl
+    from splatpilot.systems.common.extras import require_opengl
 
     try:
         require_opengl()
@@ -114,7 +114,7 @@ def _opengl() -> list[Finding]:
 
 
 def _messages() -> list[Finding]:
-    from splatpilot.systems.messaging.open_lcm import DEFAULT_URL, open_lcm
+    from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
 
     try:
         open_lcm()
@@ -177,10 +177,10 @@ def _data() -> list[Finding]:
 
 
 def _scenes() -> list[Finding]:
-    from splatpilot.analysis.benchmark.run import absent_scenes
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.diagrams.worlds.scene import SceneSource
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.analysis.benchmark.run_study import absent_scenes
+    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.diagrams.worlds.scene_folder import SceneSource
+    from splatpilot.systems.common.config import load_config
 
     scenarios = {
         name: scenario

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatpilot.analysis.shown_place import generated_scenario
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.analysis.view import generated_scenario
 from splatpilot.diagrams.worlds.scene_folder import read_scene_folder
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.field_mesh import field_mesh, require_mesh_name, write_mesh
 

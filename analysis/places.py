@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatpilot.analysis.tour import TourConfig, make_scene
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.environment import DATA
-from splatpilot.systems.messages import unknown
-from splatpilot.training.captures import render_capture
-from splatpilot.training.captures.render_config import RenderConfig
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.files import DATA
+from splatpilot.systems.common.messages import unknown
+from splatpilot.training.captures import render as render_capture
+from splatpilot.training.captures.render import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 

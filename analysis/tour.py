@@ -6,13 +6,13 @@ from pathlib import Path
 from splatpilot.analysis.reconstruction import run as reconstruction
 from splatpilot.analysis.reconstruction.measure_scene import measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import METRICS
-from splatpilot.diagrams import fly
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.make_world import SceneConfig
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.output_folders import claim_folder, holds_folder
-from splatpilot.training.captures import render_capture
-from splatpilot.training.captures.render_config import RenderConfig
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.diagrams.worlds.world_registry import SceneConfig
+from splatpilot.systems.common.files import claim_folder, holds_folder
+from splatpilot.training.captures import render as render_capture
+from splatpilot.training.captures.render import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 

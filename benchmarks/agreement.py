@@ -22,8 +22,8 @@ from scenes import cameras_of, load_scene, scene_name, tensors_of
 from torch import Tensor
 
 from splatpilot.systems.splats import rasterize
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.surfels import rasterize_surfels
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 sys.path.append(str(Path(__file__).parents[1] / "tests/systems/splats"))
 

@@ -23,9 +23,8 @@ from splatpilot.analysis.depth_truth import (
     frames_of_capture,
     ghosts_along_flight,
 )
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios, scenario_file
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 CAMERAS = [OnboardCamera(64, 36), OnboardCamera(320, 240)]

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from scipy.stats import t
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.systems.common.config import load_config
 from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 MEASURES = "success", "clear", "error", "best_chosen"
 

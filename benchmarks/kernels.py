@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from scenes import cameras_of, tensors_of
 
 from splatpilot import _native
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 WIDTH, HEIGHT = 320, 240
 # Vector instructions of the backward pass in the inner loops of native/raster_backward.hpp, counted

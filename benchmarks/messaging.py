@@ -84,7 +84,7 @@ class Listener:
 
 def fly(words: list[str], url: str, folder: Path) -> tuple[str, str, float]:
     """Flies once by two processes; the outcomes of vehicle and bridge, and the bridge's gaps."""
-    program = [sys.executable, "-c", "from splatpilot.analysis.cli import run; run()"]
+    program = [sys.executable, "-c", "from splatpilot.analysis.commands.main import run; run()"]
     words = [*words, "--patience", "120", "--lcm-url", url]
     vehicle = subprocess.Popen(
         [*program, "vehicle", *words, "--out", str(folder)], stdout=subprocess.PIPE, text=True

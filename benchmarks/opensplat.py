@@ -24,7 +24,7 @@ from torch.utils.cpp_extension import load
 
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import create_renderer
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 SOURCE = Path("rasterizer/gsplat-cpu/gsplat_cpu.cpp")
 WIDTH, HEIGHT = 320, 240

@@ -21,24 +21,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Cylinder, HalfSpace
-from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
-from splatpilot.systems.policies.privileged_planner import (
-    PrivilegedPlanner,
-    PrivilegedPlannerConfig,
-    plan,
-)
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
+from splatpilot.systems.policies.hypotheses import HypothesisSelector
+from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig, plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessController,
-    FlatnessControllerConfig,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 SIZE = np.array([36.0, 16.0, 6.0])
 START = np.array([1.5, 8.0, 1.5])

@@ -26,16 +26,15 @@ from pydrake.math import RigidTransform
 from scenes import cameras_of, intrinsics, load_scene, scene_name, tensors_of
 
 from splatpilot import _native
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.flight.flight import sample_initial_state
+from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
-from splatpilot.systems.splats.distortion import Distortion
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.scene import GaussianScene
 
 COUNTS = (100_000, 500_000)
 SIZES = ((160, 120), (320, 240), (640, 480))

@@ -20,23 +20,19 @@ from harness import header, machine, row
 from torch import Tensor
 from torch_geometry import TorchGeometry
 
-from splatpilot.diagrams.worlds.make_world import make_blueprint
-from splatpilot.systems.seeds import first_training_seed
-from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from splatpilot.training.policies.differentiable_rollout import (
-    NEAREST,
-    DifferentiableRollout,
-    RolloutConfig,
-)
+from splatpilot.diagrams.worlds.world_registry import make_blueprint
+from splatpilot.systems.common.seeds import first_training_seed
+from splatpilot.training.corpus.library import world_of
 from splatpilot.training.policies.evaluation import render_depth
 from splatpilot.training.policies.ray_casting import Geometry
+from splatpilot.training.policies.rollouts import NEAREST, DifferentiableRollout, RolloutConfig
 from splatpilot.training.policies.train import step_optimizer
+from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.training_worlds import (
+    WorldBatch,
     WorldSelection,
     training_worlds,
 )
-from splatpilot.training.policies.world_batch import WorldBatch
-from splatpilot.training.world_kinds import world_of
 
 COUNT = 16
 WORLDS = {"forests": ["P02", "P03"], "walls": ["P06", "P09"], "rooms": ["P04", "P05"]}

@@ -13,15 +13,14 @@ import argparse
 import os
 import time
 
+from splatpilot.analysis.benchmark.run_study import fly_all
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.analysis.benchmark.workers import fly_all
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

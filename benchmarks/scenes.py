@@ -14,7 +14,7 @@ import torch
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 # Optical axes (x right, y down, z forward) in the forward-right-down body of TartanAir's poses.
 R_BC = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from harness import seconds
 
-from splatpilot.systems.policies.student_inference import StudentNetwork, plan
-from splatpilot.systems.policies.student_spec import StudentSpec
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.policies.student import StudentTrainer
+from splatpilot.systems.policies.student import StudentNetwork, StudentSpec, plan
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.training.policies.student_config import StudentDepthTraining
 from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.train import step_optimizer
+from splatpilot.training.policies.train_student import StudentTrainer
 
 
 def tick_time(observation: str, width: int, height: int) -> float:

@@ -17,7 +17,7 @@ from splatpilot import _native
 from splatpilot._native import Renderer
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import create_renderer
-from splatpilot.systems.splats.surfels import rasterize_surfels
+from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 COUNT = 100_000  # surfels
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import yaml
 
 from splatpilot.diagrams.worlds import splits
-from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.captures.render_capture import mesh_digests
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.render import mesh_digests
 
 SOURCES = {
     "hospital": "tartanair/hospital",

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from harness import seconds
 
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK, decide
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, decide_acceleration
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.training.policies.evaluation import render_depth
+from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
 from splatpilot.training.policies.train import step_optimizer
+from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
 
 
@@ -57,7 +57,7 @@ def main() -> None:
 
     def tick() -> None:
         for _ in range(100):
-            decide(network, depth, X_WB, np.zeros(3), p_WG, 2.0, memory)
+            decide_acceleration(network, depth, X_WB, np.zeros(3), p_WG, 2.0, memory)
 
     print(f"one tick of diffaero in flight: {10.0 * seconds(tick, 5):.3f} ms")
 

@@ -19,17 +19,16 @@ from playwright.sync_api import Page, sync_playwright
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.diagrams.flight_diagram import MakeCamera
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios
-from splatpilot.diagrams.sensors import make_camera
-from splatpilot.diagrams.worlds.make_world import is_procedural, make_world
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.sensing.observation_noise import ObservationNoise, expose, image_generator
+from splatpilot.diagrams.flight.flight import sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios
+from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.worlds.world_registry import is_procedural, make_world
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.sensing.noise import ObservationNoise, expose, image_generator
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.splats.drake_images import color_pixels
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.splats.splat_camera import color_pixels
+from splatpilot.systems.vehicle.state import pose_from_state
 
 Picture = np.ndarray  # (H, W, 3) uint8, red first
 

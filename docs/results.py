@@ -21,18 +21,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from splatpilot.analysis.benchmark.statistics import (
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark.tables import (
+    PAPER,
+    PAPER_FLIGHTS,
     Interval,
     cluster_interval,
     holm,
     sign_flip,
     wilson_interval,
 )
-from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.tables import PAPER, PAPER_FLIGHTS
-from splatpilot.diagrams.scenario_files import benchmark_scenarios
-from splatpilot.systems.seeds import describe_seeds
+from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.systems.common.seeds import describe_seeds
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"

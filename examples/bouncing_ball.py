@@ -27,7 +27,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
 import splatpilot as sp
-from splatpilot.diagrams.worlds.make_world import place_config
+from splatpilot.diagrams.worlds.world_registry import place_config
 
 RADIUS = 0.15  # [m]
 

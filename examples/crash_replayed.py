@@ -15,9 +15,9 @@ from PIL import Image
 
 import splatpilot as sp
 from splatpilot.analysis.benchmark import replay
-from splatpilot.analysis.benchmark.run import run as fly_study
+from splatpilot.analysis.benchmark.run_study import run as fly_study
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 
 def main(out: Path, scenario: str, before: float) -> None:

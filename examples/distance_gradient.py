@@ -14,7 +14,7 @@ import numpy as np
 
 import splatpilot as sp
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def main(points: int, steps: int) -> None:

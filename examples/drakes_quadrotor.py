@@ -17,7 +17,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 import splatpilot as sp
-from splatpilot.systems.visualization.video_recorder import VideoRecorder
+from splatpilot.systems.visualization.video import VideoRecorder
 
 
 class PoseOfDrakesQuadrotor(LeafSystem):

@@ -17,7 +17,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
 import splatpilot as sp
-from splatpilot.systems.vehicle.quadrotor_dynamics import GRAVITY
+from splatpilot.systems.vehicle.quadrotor import GRAVITY
 
 
 def main(seconds: float) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from splatpilot.analysis.benchmark.run import run as fly_study
+from splatpilot.analysis.benchmark.run_study import run as fly_study
 from splatpilot.analysis.benchmark.study import StudyConfig
 
 NOISE = ["observation.depth_multiplicative=0.03", "observation.latency=0.05"]

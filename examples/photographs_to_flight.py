@@ -18,8 +18,8 @@ import argparse
 from pathlib import Path
 
 import splatpilot as sp
-from splatpilot.diagrams.fly import run as fly_and_film
-from splatpilot.diagrams.worlds.scene import SceneConfig
+from splatpilot.diagrams.flight.fly import run as fly_and_film
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig
 from splatpilot.training.captures.capture_config import ScaleConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 

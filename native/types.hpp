@@ -32,7 +32,7 @@ constexpr float kExponentScale = 0.849321800288f;
 
 enum class DistortionModel : int { kNone, kOpenCv, kFisheye };
 
-// How a lens bends rays, see systems/splats/distortion.py.
+// How a lens bends rays, see systems/splats/lens.py.
 struct Distortion {
   DistortionModel model;
   float radial[6], tangential[2];

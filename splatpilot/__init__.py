@@ -14,7 +14,7 @@ from typing import Any
 
 import lazy_loader
 
-from splatpilot.systems.numpy_kernels import fix_numpy_kernels
+from splatpilot.systems.common.numpy_kernels import fix_numpy_kernels
 
 fix_numpy_kernels()
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
@@ -28,7 +28,7 @@ def __getattr__(name: str) -> Any:
     try:
         return _load(name)
     except ModuleNotFoundError as error:
-        from splatpilot.systems.extras import missing_extra
+        from splatpilot.systems.common.extras import missing_extra
 
         missing = missing_extra(error, f"splatpilot.{name}")
         if missing is None:

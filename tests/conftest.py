@@ -4,8 +4,8 @@ import pytest
 from hypothesis import settings
 from tqdm import tqdm
 
-from splatpilot.systems.messaging.open_lcm import open_lcm
-from splatpilot.systems.opengl import require_opengl
+from splatpilot.systems.common.extras import require_opengl
+from splatpilot.systems.messaging.lcm_ports import open_lcm
 
 # Without tqdm's own thread, in which garbage may be collected: Drake aborts the process where a
 # Meshcat is freed by another thread than the one that made it.

@@ -14,25 +14,24 @@ from typing import Any
 
 import pytest
 
-from splatpilot.analysis.cli import main
-from splatpilot.analysis.commands.checks import SCENARIOS
-from splatpilot.analysis.faults.run import FaultsConfig
-from splatpilot.analysis.fidelity.config import FidelityConfig
+from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.commands.options import SCENARIOS
+from splatpilot.analysis.faults.campaign import FaultsConfig
+from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 from splatpilot.analysis.places import PlaceConfig
 from splatpilot.analysis.tour import TourConfig
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.policies import POLICIES, policy_named
-from splatpilot.diagrams.px4_config import Px4Config
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.sensors import SENSORS
-from splatpilot.diagrams.worlds.make_world import WORLDS
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.field_descriptions import describe_fields
+from splatpilot.diagrams.flight.policies import POLICIES, policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.hardware.bridge import HardwareConfig
+from splatpilot.diagrams.hardware.px4 import Px4Config
+from splatpilot.diagrams.worlds.world_registry import WORLDS
+from splatpilot.systems.common.config import describe_fields, load_config
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.check import CheckConfig
-from splatpilot.training.captures.render_config import RenderConfig
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.captures.render import RenderConfig
+from splatpilot.training.corpus.corpus import CorpusConfig
+from splatpilot.training.policies.trainer_registry import TRAINERS
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 ROOT = Path(__file__).parents[1]
@@ -83,7 +82,7 @@ def parse(monkeypatch):
 
     monkeypatch.setattr(ArgumentParser, "parse_args", parse_only)
     # Modules that pages name for the reader to write are not there.
-    monkeypatch.setattr("splatpilot.systems.registry.import_modules", lambda names: None)
+    monkeypatch.setattr("splatpilot.systems.common.registry.import_modules", lambda names: None)
 
     def parse(words: list[str]) -> Namespace:
         with pytest.raises(ParsedError):

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.provenance import program
+from splatpilot.systems.common.provenance import program
 
 # Flies in a process of its own: what numpy computes with is decided when it is imported.
 _FLY = """
 import json
 from splatpilot.analysis.benchmark.rollout import digest
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
 
 WORLD = "world={length: 10, width: 6, height: 4, rocks: 1, logs: 1, voxel_size: 0.25}"
 scenario = load_config(Scenario(), overrides=[WORLD, "timeout=1", "seed=3"])

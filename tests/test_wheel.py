@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES
+from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES
 
 CHECKOUT = Path(__file__).parents[1]
 PACKAGES = "api", "systems", "diagrams", "training", "analysis"
@@ -139,7 +139,7 @@ def test_verb_without_its_extra_says_which(run, tmp_path, words, missing, extra)
 
 def test_checkout_does_not_hide_what_is_installed(environment):
     """Python that is started in the checkout's root imports the installed package, whole."""
-    program = "import splatpilot.systems.registry as r; print(r.__file__)"
+    program = "import splatpilot.systems.common.registry as r; print(r.__file__)"
     answer = subprocess.run(
         [environment / "bin" / "python", "-c", program],
         cwd=CHECKOUT,

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.training.policies.network import TrainableNetwork
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
+from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.trainer import Schedule
 
 

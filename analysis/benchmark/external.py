@@ -4,9 +4,8 @@ from html import escape
 from typing import Any, NamedTuple
 
 from splatpilot.analysis.benchmark import html_page
-from splatpilot.analysis.benchmark.statistics import wilson_interval
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.benchmark.tables import mean_of, select
+from splatpilot.analysis.benchmark.tables import mean_of, select, wilson_interval
 
 
 class Published(NamedTuple):

@@ -6,11 +6,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.benchmark.run import Row, conclude, flights_there
+from splatpilot.analysis.benchmark.run_study import Row, conclude, flights_there
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.systems.files import written_atomically
-from splatpilot.systems.output_folders import holds_folder
+from splatpilot.systems.common.files import holds_folder, written_atomically
 
 
 @holds_folder("out")

@@ -7,25 +7,23 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from splatpilot.analysis.benchmark.foreign_code import foreign_code
 from splatpilot.analysis.benchmark.rollout import digest, study_world
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import kept_flights
-from splatpilot.diagrams.flight import Flight
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_page import (
+from splatpilot.analysis.benchmark.study_folder import StudyFolder, foreign_code, kept_flights
+from splatpilot.diagrams.flight.flight import Flight
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.fly import (
+    fly_with_bar,
     recorded_frames,
     replayed_flight,
     write_flight_page,
 )
-from splatpilot.diagrams.fly import fly_with_bar
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.files import require_unused, require_writable_folder
-from splatpilot.systems.provenance import program
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-from splatpilot.systems.visualization.replay_page import ReplayedFlight
-from splatpilot.systems.visualization.video_recorder import VideoRecorder
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.files import require_unused, require_writable_folder
+from splatpilot.systems.common.provenance import program
+from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.visualization.pages import ReplayedFlight
+from splatpilot.systems.visualization.video import VideoRecorder
 
 
 class Agreement(NamedTuple):

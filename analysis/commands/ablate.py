@@ -3,10 +3,8 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import find_place
-from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.options import add_overrides, add_overwrite, add_verb, find_place
 from splatpilot.analysis.commands.reconstruct import reconstruction_defaults
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -35,11 +33,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _ablate(options: argparse.Namespace) -> None:
     options.captures = [find_place(path, "capture", "scene") for path in options.captures]
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")
     from splatpilot.analysis.reconstruction import ablation
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.common.config import load_config
 
     config = load_config(reconstruction_defaults(), overrides=options.overrides)
     ablation.run(options.captures, options.out, config, options.overwrite)

@@ -4,10 +4,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.benchmark.variants import parse_variant, split_policies, sweep
-from splatpilot.analysis.commands.checks import check_policy, check_scenario
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import FailureWithResultError, add_json, add_verb
+from splatpilot.analysis.benchmark.study import parse_variant, split_policies, sweep
+from splatpilot.analysis.commands.options import (
+    FailureWithResultError,
+    add_json,
+    add_overrides,
+    add_verb,
+    check_policy,
+    check_scenario,
+)
 
 QUICK_SCENARIOS = "P02", "P06", "P08"
 QUICK_POLICIES = "planner", "straight", "reactive"
@@ -85,7 +90,7 @@ def _names(text: str) -> list[str]:
 
 
 def _scenario_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.diagrams.scenario import Scenario
+    from splatpilot.diagrams.flight.scenario import Scenario
 
     return Scenario()
 
@@ -99,10 +104,10 @@ def _benchmark(options: argparse.Namespace) -> Any:
         named = [*split_policies(options.policies or ""), *swept]
         for policy in named:
             check_policy(parse_variant(policy))
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"flying a study in {options.out}")
-    from splatpilot.analysis.benchmark import run as benchmark
+    from splatpilot.analysis.benchmark import run_study as benchmark
     from splatpilot.analysis.benchmark.external import DODGEDRONE, DODGEDRONE_SPEEDS
     from splatpilot.analysis.benchmark.shard import Shard
     from splatpilot.analysis.benchmark.study import StudyConfig, default_policies

@@ -4,9 +4,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import find_place
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import FailureWithResultError, add_json, add_verb
+from splatpilot.analysis.commands.options import (
+    FailureWithResultError,
+    add_json,
+    add_overrides,
+    add_verb,
+    find_place,
+)
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -53,10 +57,10 @@ def _check_defaults(options: argparse.Namespace) -> Any:
 
 def _check(options: argparse.Namespace) -> Any:
     options.capture = find_place(options.capture, "capture")
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"checking {options.capture}")
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.common.config import load_config
     from splatpilot.training.captures import check
 
     config = load_config(_check_defaults(options), overrides=options.overrides)
@@ -94,18 +98,18 @@ def _add_render(actions: argparse._SubParsersAction) -> None:
 
 
 def _render_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.training.captures.render_config import RenderConfig
+    from splatpilot.training.captures.render import RenderConfig
 
     return RenderConfig()
 
 
 def _render(options: argparse.Namespace) -> None:
     options.world = find_place(options.world, "mesh", "scenario")
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"rendering {options.world} to {options.out}")
-    from splatpilot.systems.configuration import load_config
-    from splatpilot.training.captures import render_capture
+    from splatpilot.systems.common.config import load_config
+    from splatpilot.training.captures import render as render_capture
 
     config = _render_defaults(options)
     if options.up is not None:

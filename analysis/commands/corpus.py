@@ -4,11 +4,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_config
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing, require_unused
-from splatpilot.systems.messages import require
+from splatpilot.analysis.commands.options import (
+    add_overrides,
+    add_overwrite,
+    add_verb,
+    check_config,
+)
+from splatpilot.systems.common.files import require_existing, require_unused
+from splatpilot.systems.common.messages import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -51,18 +54,18 @@ def _add_make(actions: argparse._SubParsersAction) -> None:
 
 
 def _make_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.training.corpus.config import CorpusConfig
+    from splatpilot.training.corpus.corpus import CorpusConfig
 
     return CorpusConfig()
 
 
 def _make(options: argparse.Namespace) -> None:
     check_config(options.config)
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"collecting a corpus of {options.worlds} worlds in {options.out}")
-    from splatpilot.systems.configuration import load_config
-    from splatpilot.training.corpus import make
+    from splatpilot.systems.common.config import load_config
+    from splatpilot.training.corpus import collect as make
 
     config = load_config(_make_defaults(options), options.config, options.overrides)
     corpus = make.run(config=config, out=options.out, worlds=options.worlds, jobs=options.jobs)

@@ -2,9 +2,8 @@
 
 import argparse
 
-from splatpilot.analysis.commands.checks import SCENARIOS, check_scenario
-from splatpilot.analysis.commands.verb import add_named, add_verb
-from splatpilot.systems.messages import require
+from splatpilot.analysis.commands.options import SCENARIOS, add_named, add_verb, check_scenario
+from splatpilot.systems.common.messages import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from splatpilot.analysis.commands.verb import add_json, add_verb
+from splatpilot.analysis.commands.options import add_json, add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

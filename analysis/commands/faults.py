@@ -5,9 +5,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_config
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.analysis.commands.options import add_overrides, add_verb, check_config
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -29,15 +27,15 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.analysis.faults.run import FaultsConfig
+    from splatpilot.analysis.faults.campaign import FaultsConfig
 
     return FaultsConfig()
 
 
 def _faults(options: argparse.Namespace) -> None:
     check_config(options.config)
-    from splatpilot.analysis.faults.run import run
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.analysis.faults.campaign import run
+    from splatpilot.systems.common.config import load_config
 
     config = load_config(_defaults(options), options.config, options.overrides)
     # Thousands of packets are refused, and policies raise, on purpose.

@@ -4,10 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_kind
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.options import add_overrides, add_overwrite, add_verb, check_kind
+from splatpilot.systems.common.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -33,7 +31,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 
 def _defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.analysis.fidelity.config import FidelityConfig
+    from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 
     return FidelityConfig()
 
@@ -41,13 +39,13 @@ def _defaults(options: argparse.Namespace) -> Any:
 def _fidelity(options: argparse.Namespace) -> None:
     for scene in options.scenes:
         require_existing(scene, "a scene folder")
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
     for scene in options.scenes:
         check_kind(scene, "scene")
-    from splatpilot.analysis.fidelity import run as fidelity
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.analysis.fidelity import fidelity as fidelity
+    from splatpilot.systems.common.config import load_config
 
     config = load_config(_defaults(options), overrides=options.overrides)
     fidelity.run(options.scenes, options.out, config, overwrite=options.overwrite)

@@ -4,18 +4,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.scenario_options import (
-    add_scenario,
-    name_of_flight,
-    read_scenario,
-)
-from splatpilot.analysis.commands.verb import (
+from splatpilot.analysis.commands.options import (
     FailureWithResultError,
     add_json,
     add_overwrite,
+    add_scenario,
     add_verb,
+    name_of_flight,
+    read_scenario,
 )
-from splatpilot.systems.files import require_unused
+from splatpilot.systems.common.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -51,7 +49,7 @@ def _fly(options: argparse.Namespace) -> Any:
             require_unused(path, options.overwrite)
     scenario = read_scenario(options)
 
-    from splatpilot.diagrams import fly
+    from splatpilot.diagrams.flight import fly
 
     summary = fly.run(
         scenario=scenario,

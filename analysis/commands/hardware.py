@@ -5,11 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import check_config
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.scenario_options import add_scenario, read_scenario
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_unused
+from splatpilot.analysis.commands.options import (
+    add_overrides,
+    add_overwrite,
+    add_scenario,
+    add_verb,
+    check_config,
+    read_scenario,
+)
+from splatpilot.systems.common.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -74,7 +78,7 @@ def _vehicle(options: argparse.Namespace) -> None:
     require_unused(options.out, options.overwrite)
     check_config(options.hardware)
     scenario = read_scenario(options)
-    from splatpilot.diagrams import vehicle
+    from splatpilot.diagrams.hardware import vehicle
 
     vehicle.run(scenario=scenario, config=_config(options), out=options.out)
 
@@ -84,7 +88,7 @@ def _bridge(options: argparse.Namespace) -> None:
         require_unused(options.log, options.overwrite)
     check_config(options.hardware)
     scenario = read_scenario(options)
-    from splatpilot.diagrams import bridge
+    from splatpilot.diagrams.hardware import bridge
 
     bridge.run(
         scenario=scenario,
@@ -95,15 +99,15 @@ def _bridge(options: argparse.Namespace) -> None:
 
 
 def _px4_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.diagrams.px4_config import Px4Config
+    from splatpilot.diagrams.hardware.px4 import Px4Config
 
     return Px4Config()
 
 
 def _px4(options: argparse.Namespace) -> None:
     check_config(options.config)
-    from splatpilot.diagrams import px4
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.diagrams.hardware import px4
+    from splatpilot.systems.common.config import load_config
 
     config = load_config(_px4_defaults(options), options.config, options.overrides)
     if options.lcm_url is not None:
@@ -114,8 +118,8 @@ def _px4(options: argparse.Namespace) -> None:
 
 
 def _config(options: argparse.Namespace):
-    from splatpilot.diagrams.hardware_config import HardwareConfig
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.diagrams.hardware.bridge import HardwareConfig
+    from splatpilot.systems.common.config import load_config
 
     given = {"url": options.lcm_url, "patience": options.patience}
     given = {name: value for name, value in given.items() if value is not None}

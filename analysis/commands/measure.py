@@ -3,9 +3,8 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import check_kind
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.options import add_overwrite, add_verb, check_kind
+from splatpilot.systems.common.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -24,7 +23,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _measure(options: argparse.Namespace) -> None:
     require_existing(options.scene, "a scene folder")
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"measuring {options.scene}")
     check_kind(options.scene, "scene")

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands.benchmark import require_flown
-from splatpilot.analysis.commands.verb import add_json, add_verb
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.options import add_json, add_verb
+from splatpilot.systems.common.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

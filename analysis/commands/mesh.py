@@ -3,12 +3,10 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import find_place
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
+from splatpilot.analysis.commands.options import add_overrides, add_overwrite, add_verb, find_place
 from splatpilot.analysis.commands.view import scenario_defaults
-from splatpilot.systems.extras import import_extra
-from splatpilot.systems.files import require_unused
+from splatpilot.systems.common.extras import import_extra
+from splatpilot.systems.common.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

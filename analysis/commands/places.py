@@ -4,10 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_verb
-from splatpilot.systems.environment import data_folder, scenes_folder
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.options import add_overrides, add_verb
+from splatpilot.systems.common.files import data_folder, require_existing, scenes_folder
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -42,7 +40,7 @@ def _places(options: argparse.Namespace) -> None:
     data = options.data or data_folder()
     if data is not None:
         require_existing(data, "the folder of captures and meshes")
-    from splatpilot.systems.progress import resumable, say
+    from splatpilot.systems.common.progress import resumable, say
 
     scenes = options.out or scenes_folder()
     say(f"making {', '.join(options.names) or 'the scenes of the benchmark'} in {scenes}")

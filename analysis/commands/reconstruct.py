@@ -4,9 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import find_place
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
+from splatpilot.analysis.commands.options import add_overrides, add_overwrite, add_verb, find_place
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -40,11 +38,11 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def _reconstruct(options: argparse.Namespace) -> None:
     options.capture = find_place(options.capture, "capture")
-    from splatpilot.systems.progress import say
+    from splatpilot.systems.common.progress import say
 
     say(f"reconstructing {options.capture} as {options.out}")
     from splatpilot.analysis.reconstruction import run as reconstruction
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.common.config import load_config
 
     overrides = list(options.overrides)
     if options.iterations is not None:

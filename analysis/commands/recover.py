@@ -3,10 +3,14 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import LEARN_FROM_CORPORA, check_config, check_corpora
-from splatpilot.analysis.commands.overrides import add_overrides
+from splatpilot.analysis.commands.options import (
+    LEARN_FROM_CORPORA,
+    add_overrides,
+    add_verb,
+    check_config,
+    check_corpora,
+)
 from splatpilot.analysis.commands.train import trainer_defaults
-from splatpilot.analysis.commands.verb import add_verb
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -49,14 +53,14 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 def _recover(options: argparse.Namespace) -> None:
     check_config(options.config)
     check_corpora([options.policy], options.overrides, options.config)
-    from splatpilot.systems.progress import resumable, say
+    from splatpilot.systems.common.progress import resumable, say
 
     say(f"training {options.policy} with recovery in {options.out}")
-    from splatpilot.systems.configuration import load_config
-    from splatpilot.systems.cores import available_cores
-    from splatpilot.training.policies import recovery
-    from splatpilot.training.policies.registry import TRAINERS
+    from splatpilot.systems.common.config import load_config
+    from splatpilot.systems.common.processes import available_cores
+    from splatpilot.training.policies import recover as recovery
     from splatpilot.training.policies.torchrun import require_one_process
+    from splatpilot.training.policies.trainer_registry import TRAINERS
 
     require_one_process("recover")
     config = load_config(trainer_defaults(options), options.config, options.overrides)

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.options import add_overwrite, add_verb
+from splatpilot.systems.common.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

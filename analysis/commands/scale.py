@@ -4,9 +4,8 @@ import argparse
 import re
 from pathlib import Path
 
-from splatpilot.analysis.commands.checks import check_kind
-from splatpilot.analysis.commands.verb import add_verb
-from splatpilot.systems.files import require_existing
+from splatpilot.analysis.commands.options import add_verb, check_kind
+from splatpilot.systems.common.files import require_existing
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

@@ -4,9 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import find_place
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_verb
+from splatpilot.analysis.commands.options import add_overrides, add_verb, find_place
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -46,7 +44,7 @@ def _defaults(options: argparse.Namespace) -> Any:
 def _tour(options: argparse.Namespace) -> None:
     options.world = find_place(options.world, "mesh", "scenario")
     from splatpilot.analysis import tour
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.common.config import load_config
 
     config = _defaults(options)
     if options.up is not None:

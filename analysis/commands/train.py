@@ -4,16 +4,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import (
+from splatpilot.analysis.commands.options import (
     TRAINERS,
+    add_named,
+    add_overrides,
+    add_verb,
     check_config,
     check_corpora,
     check_scenario,
     check_trainer,
 )
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_named, add_verb
-from splatpilot.systems.messages import require
+from splatpilot.systems.common.messages import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -67,7 +68,7 @@ def trainer_defaults(options: argparse.Namespace) -> Any:
     named = getattr(options, "policy", None) or getattr(options, "policies", None)
     if not named:
         raise ValueError("fields depend on the policy; name it before --set help")
-    from splatpilot.training.policies.registry import TRAINERS
+    from splatpilot.training.policies.trainer_registry import TRAINERS
 
     return TRAINERS.find(named if isinstance(named, str) else named[0]).config()
 
@@ -84,14 +85,14 @@ def _train(options: argparse.Namespace) -> None:
             raise ValueError(f"the {what} {twice[0]} is given twice; leave one out")
     check_config(options.config)
     check_corpora(options.policies, options.overrides, options.config)
-    from splatpilot.systems.progress import resumable, say
+    from splatpilot.systems.common.progress import resumable, say
 
     say(f"training {', '.join(options.policies)} in {options.out}")
-    from splatpilot.systems.configuration import load_config
-    from splatpilot.systems.cores import available_cores
-    from splatpilot.training.policies.registry import TRAINERS
+    from splatpilot.systems.common.config import load_config
+    from splatpilot.systems.common.processes import available_cores
     from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
     from splatpilot.training.policies.torchrun import require_one_process
+    from splatpilot.training.policies.trainer_registry import TRAINERS
 
     runs = []
     for policy in options.policies:
@@ -111,7 +112,7 @@ def _train(options: argparse.Namespace) -> None:
     with resumable(lambda: f"checkpoints are in {options.out}; the same command resumes"):
         summaries = run_side_by_side(runs, options.jobs or available_cores())
     if scenarios:
-        from splatpilot.analysis.benchmark import run as benchmark
+        from splatpilot.analysis.benchmark import run_study as benchmark
         from splatpilot.analysis.benchmark.study import StudyConfig
 
         weights = [

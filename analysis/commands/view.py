@@ -4,12 +4,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.checks import SCENARIOS, find_place
-from splatpilot.analysis.commands.overrides import add_overrides
-from splatpilot.analysis.commands.verb import add_overwrite, add_verb
-from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.systems.extras import import_extra
-from splatpilot.systems.files import require_unused
+from splatpilot.analysis.commands.options import (
+    SCENARIOS,
+    add_overrides,
+    add_overwrite,
+    add_verb,
+    find_place,
+)
+from splatpilot.diagrams.flight.scenario import scenario_file
+from splatpilot.systems.common.extras import import_extra
+from splatpilot.systems.common.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -42,8 +46,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
 
 def scenario_defaults(options: argparse.Namespace) -> Any:
     """Of the scenario that is named; of a capture other fields are set."""
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.systems.common.config import load_config
 
     what = getattr(options, "what", None)
     return load_config(Scenario(), scenario_file(what) if what in SCENARIOS else None)

@@ -9,17 +9,11 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from splatpilot.analysis.reconstruction.ablation_result import (
-    ARMS,
-    COLUMNS,
-    AblationResult,
-    Arm,
-    paper_rows,
-)
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     colorize,
@@ -30,27 +24,149 @@ from splatpilot.analysis.reconstruction.figures import (
 )
 from splatpilot.analysis.reconstruction.measure_scene import measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import (
+    NAMES,
     SceneMeasures,
+    SceneViews,
     format_measure,
     read_measures,
 )
-from splatpilot.analysis.reconstruction.scene_views import SceneViews
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.configuration import dump_config
-from splatpilot.systems.files import written_atomically
-from splatpilot.systems.output_folders import claim_folder, holds_folder
-from splatpilot.systems.progress import resumable
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.progress import resumable
+from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_of_scene import read_capture_of
-from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.device import require_renderer
+from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
-from splatpilot.training.reconstruction.initialization import MOST_STEPS, held_out_frames
-from splatpilot.training.reconstruction.measures import fit_exposure, floaters, has_true_depth
+from splatpilot.training.reconstruction.initialize import MOST_STEPS, held_out_frames, triangulate
+from splatpilot.training.reconstruction.metrics import fit_exposure, floaters, has_true_depth
 from splatpilot.training.reconstruction.reconstruct import reconstruct
-from splatpilot.training.reconstruction.triangulation import triangulate
+
+COLUMNS = (
+    "psnr_db",
+    "ssim",
+    "lpips",
+    "depth_mae_m",
+    "floater_fraction",
+    "hole_fraction",
+    "psnr_on_black_db",
+)
+
+
+STEPS = {
+    "points": "from points, photometric",
+    "depth_start": "from depth, photometric",
+    "surfaces": "+ surface and outline losses",
+    "depth_term": "+ depth term",
+}
+"""Titles of the steps from one arm of a representation to the next, by the end of its key."""
+
+_PAPER = {
+    "3dgs_points": (29.35, 0.8706, 0.215, 0.974, 0.115),
+    "2dgs_points": (29.07, 0.8656, 0.228, 1.466, 0.130),
+    "2dgs_depth_term": (28.26, 0.8518, 0.213, 0.212, 0.015),
+    "3dgs_depth_term": (28.89, 0.8676, 0.184, 0.085, 0.004),
+}
+"""The paper's figures for its one scene, in the order of the first of COLUMNS: of its vanilla and
+its "+ depth" arms, whose initialization it does not state."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One way to reconstruct: a representation, and the last of the `STEPS` that it takes."""
+
+    representation: str
+    step: str
+
+    @property
+    def key(self) -> str:
+        """The name of its folder."""
+        return f"{self.representation}_{self.step}"
+
+    @property
+    def title(self) -> str:
+        """Its name in tables."""
+        return f"{self.representation.upper()} {STEPS[self.step]}"
+
+
+ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") for step in STEPS)
+
+
+@dataclass(frozen=True)
+class AblationResult:
+    """The measures of all arms on one capture or more."""
+
+    captures: dict[str, dict[str, SceneMeasures]]  # by name of the capture and key of the arm
+
+    def values(self, arm: Arm, name: str) -> list[float]:
+        """Returns a measure of an arm on each capture that has it."""
+        found = (measures[arm.key].mean(name) for measures in self.captures.values())
+        return [value for value in found if value is not None]
+
+    def verdicts(self) -> list[str]:
+        """Returns what each step did to the arm before it on each capture."""
+        lines = []
+        for name, arms in self.captures.items():
+            for plain, other in pairwise(ARMS):
+                if plain.representation != other.representation:
+                    continue
+                before, after = arms[plain.key], arms[other.key]
+                gain = (after.mean("psnr_db") or 0) - (before.mean("psnr_db") or 0)
+                lines.append(
+                    f"{name}, {other.title}: depth error divided by "
+                    f"{_ratio(before, after, 'depth_mae_m')}, floaters by "
+                    f"{_ratio(before, after, 'floater_fraction')}, PSNR {gain:+.2f} dB"
+                )
+        return lines
+
+    def table(self) -> list[list[str]]:
+        """Returns the table, heading first: each capture, the mean over them, and the paper."""
+        rows = [["capture", "arm", *(NAMES[name][0] for name in COLUMNS)]]
+        for capture, arms in self.captures.items():
+            for arm in ARMS:
+                cells = [
+                    format_measure(arms[arm.key].mean(name), NAMES[name][1]) for name in COLUMNS
+                ]
+                rows.append([capture, arm.title, *cells])
+        if len(self.captures) > 1:
+            for arm in ARMS:
+                cells = [_spread(self.values(arm, name), NAMES[name][1]) for name in COLUMNS]
+                rows.append(["mean ± spread", arm.title, *cells])
+        for arm, known in paper_rows():
+            cells = [format_measure(known.get(name), NAMES[name][1]) for name in COLUMNS]
+            rows.append(["paper", arm.title, *cells])
+        return rows
+
+    def __str__(self) -> str:
+        rows = self.table()
+        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
+        return "\n".join([*lines, "", *self.verdicts()])
+
+
+def paper_rows() -> list[tuple[Arm, dict[str, float]]]:
+    """Returns the arms of the paper with its figures by column."""
+    return [
+        (arm, dict(zip(COLUMNS, _PAPER[arm.key], strict=False)))
+        for arm in ARMS
+        if arm.key in _PAPER
+    ]
+
+
+def _ratio(before: SceneMeasures, after: SceneMeasures, name: str) -> str:
+    a, b = before.mean(name), after.mean(name)
+    if a is None or b is None:
+        return "-"
+    return f"{a / b:.1f}" if b > 0 else "infinity"
+
+
+def _spread(values: Sequence[float], form: str) -> str:
+    if not values:
+        return "-"
+    return f"{form.format(np.mean(values))} ± {form.format(np.std(values, ddof=1))}"
+
 
 _RECIPE = "reconstruct.yaml"
 _ERROR_LIMIT = 0.5  # [m], brightest colour of depth errors

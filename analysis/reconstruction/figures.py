@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from splatpilot.systems.files import written_atomically
+from splatpilot.systems.common.files import written_atomically
 
 DEPTH_COLORS = "turbo_r"
 ERROR_COLORS = "inferno"

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.analysis.reconstruction.default_flight import unseen_share
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     Scale,
@@ -18,16 +17,17 @@ from splatpilot.analysis.reconstruction.figures import (
 from splatpilot.analysis.reconstruction.scene_measures import (
     METRICS,
     SceneMeasures,
+    SceneViews,
     format_measure,
+    unseen_share,
 )
-from splatpilot.analysis.reconstruction.scene_views import SceneViews
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.files import require_unused, written_atomically
-from splatpilot.systems.progress import Progress
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
+from splatpilot.systems.common.files import require_unused, written_atomically
+from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.reconstruction.lpips import Lpips
-from splatpilot.training.reconstruction.measures import fit_exposure, has_true_depth
+from splatpilot.training.reconstruction.metrics import fit_exposure, has_true_depth
 
 SHEET = "views.png"
 _SHEET_ROWS = 4

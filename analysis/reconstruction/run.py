@@ -5,15 +5,13 @@ from pathlib import Path
 
 from splatpilot.analysis.reconstruction.measure_scene import SHEET, measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
-from splatpilot.diagrams.worlds.scene_folder import check_scene_target
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.files import require_unused
-from splatpilot.systems.output_folders import held_folder
-from splatpilot.systems.progress import resumable
+from splatpilot.diagrams.worlds.scene_folder import check_scene_target, read_scene_metadata
+from splatpilot.systems.common.files import held_folder, require_unused
+from splatpilot.systems.common.progress import resumable
+from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.check import doubts
-from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.device import require_renderer
 from splatpilot.training.reconstruction.checkpoint import kept_work, work_folder
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, reconstruct

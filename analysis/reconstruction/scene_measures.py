@@ -1,10 +1,40 @@
 """The figures of a scene against the frames of its capture: `metrics.json`."""
 
 import json
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
-from splatpilot.training.reconstruction.measures import ViewMeasures, mean_measure
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from splatpilot.diagrams.flight.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.scene_folder import (
+    FRONTIER,
+    SceneMetadata,
+    read_background,
+    read_scene_folder,
+    read_scene_metadata,
+)
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.splats.background import put_behind
+from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.scene import C0, GaussianScene
+from splatpilot.systems.splats.splat_files import read_ply
+from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
+from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.reconstruction.lpips import Lpips
+from splatpilot.training.reconstruction.metrics import (
+    SceneRenderer,
+    ViewMeasures,
+    mean_measure,
+    measure_view,
+)
+from splatpilot.training.reconstruction.photometry import ThinnedFrame, seen_pixels
 
 METRICS = "metrics.json"
 NAMES = {
@@ -120,3 +150,128 @@ def read_measures(scene: Path) -> SceneMeasures | None:
         return SceneMeasures(**said)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: {error!r}; delete the file and measure again") from error
+
+
+class SceneViews:
+    """A scene folder beside its capture: frames as they were, and as the scene shows them.
+
+    Args:
+        scene: the scene folder.
+        capture: what it was made from; read from where `scene.yaml` says if None.
+
+    Raises:
+        FileNotFoundError, ValueError: for a damaged scene, or one whose capture is not found.
+    """
+
+    def __init__(self, scene: Path, capture: Capture | None = None):
+        self.metadata: SceneMetadata = read_scene_metadata(scene)
+        self.background = read_background(scene, self.metadata)
+        if capture is None:
+            capture = read_capture_of(scene, self.metadata)
+        self.capture = capture
+        lost = [i for i in self.metadata.held_out if i >= len(capture)]
+        if lost:
+            raise ValueError(
+                f"{scene / 'scene.yaml'}: frame {lost[0]} is held out, but {capture.source} has "
+                f"only {len(capture)} frames; the capture has changed, reconstruct the scene again"
+            )
+        self.factor = shrink_factor(capture.width, self.metadata.image_width)
+        self.renderer = SceneRenderer(
+            read_ply(scene / "gaussians.ply"), self.metadata.representation
+        )
+
+    @property
+    def measured(self) -> Sequence[int]:
+        """The frames on which the scene is measured: those held out, or every eighth."""
+        return self.metadata.held_out or range(0, len(self.capture), 8)
+
+    def frame(self, i: int) -> CaptureFrame:
+        """Returns frame i of the capture in the size at which the scene was made."""
+        return self.shrink(self.capture.frame(i))
+
+    def shrink(self, frame: CaptureFrame) -> CaptureFrame:
+        """Returns a frame of the capture's camera in the size at which the scene was made."""
+        return shrink(frame, self.factor)
+
+    @property
+    def fitted_poses(self) -> list[RigidTransform]:
+        """The poses of the cameras that the scene was made from."""
+        held_out = set(self.metadata.held_out)
+        return [X_WC for i, X_WC in enumerate(self.capture.X_WCs) if i not in held_out]
+
+    def render(self, frame: CaptureFrame) -> RenderedView:
+        """Returns what the scene shows the camera of `frame`."""
+        return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
+
+    @cached_property
+    def _fitted(self) -> list[ThinnedFrame]:
+        """The frames that the scene was made from."""
+        held_out = set(self.metadata.held_out)
+        numbers = [i for i in range(len(self.capture)) if i not in held_out]
+        return [ThinnedFrame.of(self.frame(i)) for i in numbers]
+
+    def seen(self, frame: CaptureFrame) -> NDArray[np.bool_]:
+        """Returns the pixels (H, W) of `frame` that show what the scene was made from."""
+        return seen_pixels(frame, self._fitted)
+
+    def measure(
+        self,
+        frame: CaptureFrame,
+        seen: NDArray[np.bool_] | None = None,
+        lpips: Lpips | None = None,
+        *,
+        fit_gain: bool = True,
+    ) -> ViewMeasures:
+        """Compares both, in the pixels `seen` or in all, see `measure_view`."""
+        on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
+        return measure_view(
+            on_black, self.background, frame, vignetting, seen, lpips, fit_gain=fit_gain
+        )
+
+    def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
+        height, width = frame.depth.shape
+        return self.renderer.render(frame.K, width, height, frame.X_WC)
+
+
+_POSES = 36
+
+
+def unseen_share(scene: Path) -> float | None:
+    """Returns the mean share of the onboard camera's pixels that show the frontier, along the route
+    from the start to the goal of a scene folder, looking ahead; None if there is no route.
+
+    Raises:
+        FileNotFoundError, ValueError: for a damaged scene.
+    """
+    metadata = read_scene_metadata(scene)
+    if not metadata.metric:
+        return None
+    world = read_scene_folder(scene)
+    try:
+        toa = time_of_arrival(world.esdf.conservative(), world.p_WG)
+    except InfeasibleFlightError:
+        return None
+    if not toa.is_reachable(world.p_WS):
+        return None
+    if not metadata.frontier:
+        return 0.0
+    frontier = _painted(read_ply(scene / FRONTIER), 1.0)
+    seen = _painted(read_ply(scene / "gaussians.ply"), 0.0).merged_with(frontier)
+    camera = MakeCamera(Scenario(), replace(world, gaussians=seen, background=(0.0, 0.0, 0.0)))
+    # Every point beyond the goal is the goal: the poses are those before it.
+    reach = float(toa.value(world.p_WS))  # [m] at 1 m/s in the open, and no less than the length
+    points, directions = toa.way(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
+    before = np.flatnonzero(np.linalg.norm(directions[:, :2], axis=1) > 0.0)
+    chosen = before[np.linspace(0, len(before) - 1, _POSES).astype(int)]
+    shares = []
+    for p_WB, direction in zip(points[chosen], directions[chosen], strict=True):
+        yaw = np.arctan2(direction[1], direction[0])
+        view = camera.render(RigidTransform(RollPitchYaw(0.0, 0.0, yaw), p_WB))
+        shares.append((view.color[..., 0] > 0.5).mean())
+    return float(np.mean(shares))
+
+
+def _painted(gaussians: GaussianScene, level: float) -> GaussianScene:
+    """The same Gaussians in one grey, 0 to 1."""
+    sh = np.full((len(gaussians), 1, 3), (level - 0.5) / C0, dtype=np.float32)
+    return replace(gaussians, sh=sh)

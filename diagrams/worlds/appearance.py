@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.solids.light import GAMMA
+from splatpilot.diagrams.worlds.solids.shading import GAMMA
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.trilinear import corner_offsets, grid_strides, trilinear
+from splatpilot.systems.collision.esdf import corner_offsets, grid_strides, trilinear
 from splatpilot.systems.splats.background import Background, EnvironmentMap
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.spherical_harmonics import C0
+from splatpilot.systems.splats.scene import C0, GaussianScene
 
 _PAINT = 0.35  # sRGB, largest change of a colour of paint
 _PAINTS = 4  # along each axis of the colour cube

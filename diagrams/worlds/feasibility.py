@@ -1,17 +1,21 @@
 """Whether a way from start to goal exists, proven by search on the distance field."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
 
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
 from splatpilot.systems.collision.distance_field import DistanceField
-from splatpilot.systems.collision.esdf_from_distance_field import cubes_of_points
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.seeds import check_seed
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import cubes_of_points
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
 """[m], least distance of start and goal from everything, the bounds included."""
@@ -96,3 +100,191 @@ def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
     for part, p_WQ in cubes_of_points(x, y, z):
         grid[part] = conservative_distance(field, p_WQ)
     return grid
+
+
+SHORTEST = 1.0
+"""[m], length of the shortest route that is worth a flight."""
+
+LONG_ENOUGH = 8.0
+"""[m], length from which on a route shows how a policy flies; the benchmark's own minimum."""
+
+_GAIN = 1.5
+"""[-] How many times as long a path with half of the margin must be to be preferred."""
+
+_MAX_NODES = 250_000
+_DRAWS = 20
+
+
+class _Part(NamedTuple):
+    """A connected part of the free space."""
+
+    graph: csr_array
+    """Of all free space; the other parts are not reached from this one."""
+    p_WN: NDArray[np.float64]
+    """(N, 3) [m], the nodes of the graph."""
+    nodes: NDArray[np.intp]
+    """Of the part."""
+    end: int
+    """The node that begins (nearly) the longest of all shortest paths in the part."""
+    length: float
+    """[m], of that path."""
+
+
+def choose_start_and_goal(
+    esdf: Esdf, radius: float, margin: float = 0.2, longest: float = 40.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
+
+    The ends of (nearly) the longest of all shortest paths that a sphere of `radius` can fly through
+    space known to be free, at least `SHORTEST`, with `margin` [m] to spare or half of that, see
+    `_longest_part`: through less, vehicles hover before gaps that planners do not trust. Paths
+    longer than `longest` [m] are not considered: a flight should end in good time.
+
+    Raises:
+        InfeasibleFlightError: if no free space holds a sphere of `radius` and lets it fly so far.
+    """
+    part = _longest_part(esdf, radius, margin, longest, SHORTEST)
+    goal, length = _farthest(part.graph, part.end, longest)
+    return part.p_WN[part.end], part.p_WN[goal], length
+
+
+def draw_start_and_goal(
+    esdf: Esdf,
+    radius: float,
+    seed: int,
+    margin: float = 0.2,
+    longest: float = 40.0,
+    least: float = SHORTEST,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
+
+    As `choose_start_and_goal`, but anywhere: the start is drawn from the part of free space with
+    the longest path, the goal from those nodes whose shortest path from it is at least 60 % of
+    that, up to `longest` [m], and at least `least` [m]. The same seed gives the same bits; if no
+    start in so many draws has such a goal, it is an end of the longest path.
+
+    Raises:
+        InfeasibleFlightError: if no free space holds a sphere of `radius` and lets it fly so far.
+    """
+    rng = np.random.default_rng(seed)
+    part = _longest_part(esdf, radius, margin, longest, least)
+    for attempt in range(_DRAWS + 1):
+        start = int(rng.choice(part.nodes)) if attempt < _DRAWS else part.end
+        lengths = dijkstra(part.graph, directed=False, indices=start, limit=longest)
+        desired = max(0.6 * min(part.length, longest), least)
+        far = np.flatnonzero(np.isfinite(lengths) & (lengths >= desired))
+        if len(far):
+            goal = int(rng.choice(far))
+            return part.p_WN[start], part.p_WN[goal], float(lengths[goal])
+    raise _no_room(esdf, radius, margin, part.length, least)
+
+
+def short_route_warning(length: float) -> str:
+    """Says that a route of this length [m] is too short to show much; empty if it is not."""
+    if length >= LONG_ENOUGH:
+        return ""
+    return (
+        f"the longest route from a start to a goal is {length:.1f} m, and flights shorter than "
+        f"{LONG_ENOUGH:g} m show little; free space is narrow or cut up, and unknown space counts "
+        "as occupied"
+    )
+
+
+def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
+    """Returns the connected part of the free space with the longest path, up to `longest` [m].
+
+    It has all of `margin` [m] if that path is `LONG_ENOUGH`, and else half of it where that makes
+    the path `_GAIN` times as long.
+
+    Raises:
+        InfeasibleFlightError: if no path is at least `least` [m] long.
+    """
+    best, reach = None, 0.0
+    for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
+        if best is not None and best.length >= max(LONG_ENOUGH, least):
+            break
+        _, label = connected_components(graph, directed=False)
+        sizes = np.bincount(label)
+        for number in np.argsort(-sizes, kind="stable"):
+            # No path is longer than one along the diagonals through all nodes of a part.
+            if min(np.sqrt(3.0) * spacing * (sizes[number] - 1), longest) <= reach:
+                break
+            nodes = np.flatnonzero(label == number)
+            end, _ = _farthest(graph, int(nodes[0]))
+            _, length = _farthest(graph, end)
+            if length > reach:
+                best, reach = _Part(graph, p_WN, nodes, end, length), length
+        reach *= _GAIN
+    if best is None or best.length < least:
+        raise _no_room(esdf, radius, margin, 0.0 if best is None else best.length, least)
+    return best
+
+
+def _free_graphs(
+    esdf: Esdf, radius: float, margin: float
+) -> Iterator[tuple[csr_array, NDArray[np.float64], float]]:
+    """Graphs of the space free for a sphere of `radius` [m], their nodes (N, 3) [m] and the spacing
+    of these [m], with ever less margin: all of `margin` [m] and half of it."""
+    field = esdf.conservative()
+    extent = esdf.upper_W - esdf.lower_W
+    spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
+    axes = [
+        low + spacing * (np.arange(max(int(size / spacing), 1)) + 0.5)
+        for low, size in zip(esdf.lower_W, extent, strict=True)
+    ]
+    p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
+    clearance = field.distance(p_WN) - radius  # [m]
+    for need in (margin, margin / 2):
+        if np.count_nonzero(clearance > need) >= 2:
+            graph, nodes = grid_graph(clearance > need, spacing)
+            yield graph, p_WN.reshape(-1, 3)[nodes], spacing
+
+
+def _no_room(
+    esdf: Esdf, radius: float, margin: float, reach: float, least: float
+) -> InfeasibleFlightError:
+    room = f"a vehicle of radius {radius} m with {margin / 2:g} m to spare"
+    if reach > 0:
+        return InfeasibleFlightError(
+            f"the longest route of {room} through free space must be at least {least:g} m, got "
+            f"{reach:.2f} m; unknown space counts as occupied: capture more of the scene"
+        )
+    largest = float(esdf.conservative().distances.max())
+    return InfeasibleFlightError(
+        f"no free space for {room}: the largest clearance is {largest:.2f} m, and unknown space "
+        "counts as occupied; capture more of the scene"
+    )
+
+
+def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
+    """Returns the graph that joins each free node to its free neighbours among the 26 around it,
+    weighted by distance [m], and the flat index of each of its nodes."""
+    nodes = np.flatnonzero(free)
+    number = np.full(free.shape, -1)
+    number.flat[nodes] = np.arange(len(nodes))
+    rows, columns, weights = [], [], []
+    for offset in np.ndindex(3, 3, 3):
+        step = np.array(offset) - 1
+        if tuple(step) <= (0, 0, 0):
+            continue  # the other half of the neighbours follows by symmetry
+        here = tuple(
+            slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, free.shape, strict=True)
+        )
+        there = tuple(
+            slice(max(s, 0), n - max(-s, 0)) for s, n in zip(step, free.shape, strict=True)
+        )
+        both = free[here] & free[there]
+        rows.append(number[here][both])
+        columns.append(number[there][both])
+        weights.append(np.full(len(rows[-1]), spacing * np.linalg.norm(step)))
+    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+    return csr_array(coo_array(entries, shape=(len(nodes), len(nodes)))), nodes
+
+
+def _farthest(graph: csr_array, node: int, longest: float = np.inf) -> tuple[int, float]:
+    """Returns the node with the longest shortest path from `node` of at most `longest` [m], and the
+    length of that [m]."""
+    lengths = dijkstra(graph, directed=False, indices=node, limit=longest)
+    lengths[np.isinf(lengths)] = -1
+    farthest = int(np.argmax(lengths))
+    return farthest, float(lengths[farthest])

@@ -7,21 +7,18 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
-from splatpilot.diagrams.worlds.feasibility import TRIES
-from splatpilot.diagrams.worlds.fittings import TIGHT_CLEARING, check_range
-from splatpilot.diagrams.worlds.scene import SceneSource, read_scene_world
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.illumination import Lamplight
-from splatpilot.diagrams.worlds.solids.solid import Solid, faces_of
+from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, check_range
+from splatpilot.diagrams.worlds.feasibility import TRIES, draw_start_and_goal
+from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
+from splatpilot.diagrams.worlds.solids.shading import Lamplight
+from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid, faces_of
 from splatpilot.diagrams.worlds.solids.surfels import draw
-from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import Box, Capsule, Shape, Sphere
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Shape, Sphere
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 GAP = 1.3 * 2 * VEHICLE_RADIUS
 """[m], least width of a gap."""

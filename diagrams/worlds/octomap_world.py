@@ -8,8 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
-from splatpilot.diagrams.worlds.scene import SceneSource, find_scene
-from splatpilot.diagrams.worlds.solids.light import GAMMA, Daylight, develop
+from splatpilot.diagrams.worlds.feasibility import (
+    choose_start_and_goal,
+    draw_start_and_goal,
+    short_route_warning,
+)
+from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
+from splatpilot.diagrams.worlds.solids.shading import GAMMA, Daylight, develop
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     Surfels,
@@ -17,18 +22,13 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
     to_gaussians,
 )
 from splatpilot.diagrams.worlds.solids.textures import fbm, hash_unit, ramp
-from splatpilot.diagrams.worlds.start_and_goal import (
-    choose_start_and_goal,
-    draw_start_and_goal,
-    short_route_warning,
-)
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.octomap import Octomap, read_octomap
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 OCTOMAP = ".bt"
 """Suffix of binary OctoMaps."""

@@ -6,31 +6,191 @@ of what lies infinitely far (`EnvironmentMap`). `frontier.ply`, if there is one,
 where nobody looked any further: cameras of flights see it too, measures of the scene do not.
 """
 
+import functools
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.worlds.scene_metadata import (
-    ENVIRONMENT,
-    FRONTIER,
-    SceneMetadata,
-    read_scene_metadata,
-    write_scene_metadata,
+from splatpilot.diagrams.worlds.feasibility import (
+    SHORTEST,
+    choose_start_and_goal,
+    draw_start_and_goal,
+    short_route_warning,
 )
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, short_route_warning
+from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
+from splatpilot.diagrams.worlds.splits import check_split
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
-from splatpilot.systems.files import folder_written_atomically, require_writable_folder
-from splatpilot.systems.splats.background import Background, EnvironmentMap, mean_color
-from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.splat_files import read_splats
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.esdf_build import (
+    bounds_of_depth_images,
+    esdf_from_depth_images,
+    esdf_from_gaussians,
+)
+from splatpilot.systems.collision.frontier import (
+    frontier_faces,
+    hidden_frontier,
+    reachable_space,
+    with_obstacles,
+)
+from splatpilot.systems.common.config import yaml_problem
+from splatpilot.systems.common.files import (
+    folder_written_atomically,
+    require_scene,
+    require_writable_folder,
+    written_atomically,
+)
+from splatpilot.systems.common.readers import read_text, reason_of, require_shallow
+from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+
+FORMAT_VERSION = 2
+ENVIRONMENT = "environment.png"
+FRONTIER = "frontier.ply"
+WORLD_FRAME = "z up"
+REPRESENTATIONS = ("3dgs", "2dgs")
+
+
+@dataclass(kw_only=True)
+class SceneMetadata:
+    """The content of `scene.yaml`. Fields that a file lacks have the defaults given here, except
+    for the vectors, which it must give."""
+
+    format_version: int = FORMAT_VERSION
+    name: str = ""
+    provenance: str = ""
+    """What the scene was made from, and how."""
+    split: str = ""
+    """What the scene is for: "train", "validation" or "test"; empty if unknown."""
+    source_digest: list[str] = field(default_factory=list)
+    """Digest of what the scene was made from, see `splits.source_digest`: of the images that it was
+    fitted to, or of the mesh or generated world that they were rendered of. Empty if unknown."""
+    world_frame: str = WORLD_FRAME
+    metric: bool = True
+    """Whether the unit of length is the metre."""
+    origin: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """[m], position of the scene's origin in the world of the capture's files, upright and in
+    meters; all positions of the scene are relative to it."""
+    lower_W: list[float] = field(default_factory=list)
+    """[m], lower corner of the distance field."""
+    upper_W: list[float] = field(default_factory=list)
+    """[m], upper corner of the distance field."""
+    observed_free_volume: float = 0.0
+    """[m^3], space seen to be free."""
+    gains: list[float] = field(default_factory=list)
+    """Brightness of each image of the capture relative to the scene, in frame order."""
+    vignetting: float = 0.0
+    """Logarithm of the brightness of the capture's image corners relative to their centres; it
+    falls with the square of the distance from the centre. The scene is free of it."""
+    background: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Colour where no Gaussian is seen; red, green, blue in 0 to 1."""
+    environment: bool = False
+    """Whether `environment.png` has that colour for each direction; `background` is their mean."""
+    frontier: bool = False
+    """Whether `frontier.ply` stands where the distance field has obstacles that nobody saw."""
+    p_WS: list[float] = field(default_factory=list)
+    """[m], default start."""
+    p_WG: list[float] = field(default_factory=list)
+    """[m], default goal."""
+    representation: str = "3dgs"
+    """"3dgs": Gaussians; "2dgs": surfels, kept as Gaussians that are as flat as allowed."""
+    capture: str = ""
+    """Folder of the capture that the scene was made from; empty if unknown."""
+    capture_settings: list[str] = field(default_factory=list)
+    """What was set about the capture when it was read, "depth_unit=5000.0" for example; without it
+    the folder would be read otherwise."""
+    capture_notes: list[str] = field(default_factory=list)
+    """What was assumed or not used when the capture was read, and where intrinsics come from."""
+    held_out: list[int] = field(default_factory=list)
+    """Frames of the capture that had no part in making the scene."""
+    image_width: int = 0
+    """[px], to which images were scaled down for the making; 0 if they were not."""
+    perturbation_bound: float | None = None
+    """[m], how far from the poses of the capture images of the scene can be trusted, as
+    `splatpilot fidelity` measured it; None before."""
+    pose_perturbation_bounds: list[float] = field(default_factory=list)
+    """[m], the same for each pose of the capture, in frame order; empty before."""
+
+
+def read_scene_metadata(path: str | Path) -> SceneMetadata:
+    """Reads `scene.yaml` of the scene folder `path`.
+
+    Raises:
+        ValueError: for unknown or missing fields, values of the wrong kind, vectors that have not
+            three finite components and a format version that is not known.
+    """
+    file = Path(path) / "scene.yaml"
+    text = read_text(file)
+    require_shallow(text, str(file))
+    try:
+        metadata = yaml_load_typed(schema=SceneMetadata, data=text)
+    except Exception as error:  # Drake's reader raises anything of values of other types
+        wrong = yaml_problem(error) if isinstance(error, yaml.YAMLError) else reason_of(error)
+        raise ValueError(f"{file}: {wrong}; reconstruct the scene again or repair it") from None
+    if metadata.format_version < FORMAT_VERSION:
+        raise ValueError(
+            f"{file}: format version {metadata.format_version}, from when scenes had no background "
+            "of their own and translucent surfaces; reconstruct the scene again"
+        )
+    if metadata.format_version > FORMAT_VERSION:
+        raise ValueError(
+            f"{file}: format version {metadata.format_version}, this program knows "
+            f"{FORMAT_VERSION}; use the version of the program that wrote the scene"
+        )
+    for name in ("origin", "lower_W", "upper_W", "background", "p_WS", "p_WG"):
+        value = getattr(metadata, name)
+        if len(value) != 3 or not np.isfinite(value).all():
+            raise ValueError(f"{file}: {name} is {value}, three finite numbers are needed")
+    if metadata.world_frame != WORLD_FRAME:
+        raise ValueError(
+            f"{file}: world_frame is {metadata.world_frame!r}, it must be {WORLD_FRAME!r}; "
+            "turn the scene and reconstruct it again"
+        )
+    if not all(0 <= value <= 1 for value in metadata.background):
+        raise ValueError(f"{file}: background is {metadata.background}, 0 to 1 is needed")
+    if metadata.representation not in REPRESENTATIONS:
+        raise ValueError(
+            f"{file}: representation is {metadata.representation!r}, it must be one of "
+            f"{REPRESENTATIONS}"
+        )
+    if metadata.image_width < 0 or any(frame < 0 for frame in metadata.held_out):
+        raise ValueError(
+            f"{file}: image_width is {metadata.image_width} and held_out {metadata.held_out}; "
+            "neither may be negative"
+        )
+    try:
+        check_split(metadata.split)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    bounds = np.array([metadata.perturbation_bound or 0.0, *metadata.pose_perturbation_bounds])
+    if not (np.isfinite(bounds) & (bounds >= 0)).all():
+        raise ValueError(
+            f"{file}: perturbation_bound is {metadata.perturbation_bound} and "
+            f"pose_perturbation_bounds {metadata.pose_perturbation_bounds}; finite lengths [m] of "
+            "at least 0 are needed, run `splatpilot fidelity` again"
+        )
+    return metadata
+
+
+def write_scene_metadata(path: str | Path, metadata: SceneMetadata) -> None:
+    """Replaces `scene.yaml` of the scene folder `path`, whole or not at all.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    with written_atomically(Path(path) / "scene.yaml") as partial:
+        yaml_dump_typed(metadata, filename=str(partial))
+
 
 _log = logging.getLogger(__name__)
 _MAX_VOXELS = 2e7
@@ -214,3 +374,158 @@ def _read_bare_gaussians(path: Path) -> World:
         p_WS=p_WS,
         p_WG=p_WG,
     )
+
+
+@dataclass
+class SceneSource:
+    """A place on disk."""
+
+    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat); one that is not there is looked
+    # for in the folder that the environment variable SPLATPILOT_SCENES names, or in `scenes`.
+    path: str = ""
+    # How to get the scene: what the error says if it is not there.
+    source: str = ""
+    # Whether start and goal are drawn from the seed; otherwise they are the scene's own.
+    draw_ends: bool = False
+    # [m] Least length of the shortest way between ends that are drawn.
+    least_way: float = SHORTEST
+
+    def validate(self) -> None:
+        """
+        Raises:
+            ValueError: if no path is given, or the least way is negative or infinite.
+        """
+        if not self.path:
+            raise ValueError("world.path is empty; name a scene folder or a file of Gaussians")
+        if not 0 <= self.least_way < math.inf:
+            raise ValueError(
+                f"world.least_way is {self.least_way} m; it must be finite and at least 0"
+            )
+
+
+@dataclass
+class SceneConfig(SceneSource):
+    """A scene on disk. It is no base of others, for the reason that `ForestConfig` gives."""
+
+
+def find_scene(config: SceneSource) -> Path:
+    """The place of a scene.
+
+    Raises:
+        FileNotFoundError: if it is in none of the places where scenes are looked for; the message
+            says how to get it.
+    """
+    config.validate()
+    return require_scene(config.path, config.source)
+
+
+def read_scene_world(config: SceneSource, seed: int) -> World:
+    """Reads the scene of `config`.
+
+    Raises:
+        FileNotFoundError, ValueError: see `find_scene` and `read_scene`.
+        InfeasibleFlightError: see `draw_start_and_goal`.
+    """
+    world = read_scene(find_scene(config))
+    if not config.draw_ends:
+        return world
+    p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed, least=config.least_way)
+    return replace(world, p_WS=p_WS, p_WG=p_WG)
+
+
+_CELL = 2
+"""[-] Voxels along the edge of the cells whose faces one surfel covers."""
+
+_SUNK = 0.5
+"""[-] Voxels from the faces into what is hidden, so that no edge of a surfel hangs out of it."""
+
+_COVERAGE = 0.55
+"""Standard deviation of a surfel over the edge of its square. Less than in generated worlds, whose
+patches may hang over edges a little more: here that would hide what was captured."""
+
+_WIDTH = 160
+"""[px], about as wide depth images are thinned to."""
+
+_FAR_VOXEL, _FAR_VOXELS = 2, 2e6
+"""[-] Edge of the voxels in which the frontier beyond the field's range is found, in voxels of the
+field, and how many there may be."""
+
+_STRIPE = 0.4
+"""[m], period of the hatching along each axis."""
+
+_SHADES = np.array([0.62, 0.42])
+"""Grey of its two tones, 0 to 1."""
+
+
+def close_frontier(
+    esdf: Esdf, depths: Iterable[np.ndarray], K: np.ndarray, X_WCs: Sequence[RigidTransform]
+) -> tuple[Esdf, GaussianScene | None]:
+    """Closes a captured scene where space that the vehicle can look into ends in unknown space.
+
+    Without it nothing would be seen there, and flights would end all the same. What nobody looked
+    into begins with obstacles, and hatched surfels are drawn on them. Space before the sky, and
+    before what was captured beyond the field's range, stays open. There the surfels begin where
+    the images saw no farther, on a coarse grid of its own: none hides what was captured.
+
+    Args:
+        esdf: the distance field of the scene.
+        depths, K, X_WCs: what it was made of, see `esdf_from_depth_images`.
+
+    Returns:
+        The distance field with these obstacles, and the surfels; `esdf` and None where there is
+        nothing to close.
+    """
+    images = []
+    for depth in depths:
+        step = max(depth.shape[1] // _WIDTH, 1)
+        images.append(depth[step // 2 :: step, step // 2 :: step])
+        if len(images) == 1:
+            K = np.diag([1 / step, 1 / step, 1.0]) @ K
+    views = images, K, X_WCs
+    hidden, before, beyond = hidden_frontier(esdf, reachable_space(esdf, VEHICLE_RADIUS), *views)
+    parts = []
+    if hidden.any():
+        parts.append(_draw(esdf, *frontier_faces(before, hidden)))
+    if beyond:
+        parts.append(_far_frontier(_FAR_VOXEL * esdf.voxel_size, *views))
+    if not parts:
+        return esdf, None
+    return with_obstacles(esdf, hidden), functools.reduce(GaussianScene.merged_with, parts)
+
+
+def _far_frontier(
+    voxel_size: float, images: Sequence[np.ndarray], K: np.ndarray, X_WCs: Sequence[RigidTransform]
+) -> GaussianScene:
+    """Draws the frontier of all that images show, on a grid of at least `voxel_size` [m]."""
+    reach = 2.0 * max(float(image[image < FAR].max(initial=0.0)) for image in images)  # [m]
+    lower_W, upper_W = bounds_of_depth_images(images, K, X_WCs, reach)
+    voxel_size = max(voxel_size, float(np.cbrt(np.prod(upper_W - lower_W) / _FAR_VOXELS)))
+    far = esdf_from_depth_images(images, K, X_WCs, lower_W, upper_W, voxel_size, reach)
+    reachable = reachable_space(far, VEHICLE_RADIUS)
+    hidden, before, _ = hidden_frontier(far, reachable, images, K, X_WCs)
+    return _draw(far, *frontier_faces(before, hidden))
+
+
+def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> GaussianScene:
+    """Faces of voxels (F, 3), (F, 3), see `frontier_faces`, as surfels: one for those in each cell,
+    of their mean and their spread, so that it lies across the steps of a slanted frontier."""
+    _, cell = np.unique((centers // _CELL).astype(int), axis=0, return_inverse=True)
+    count = np.bincount(cell)
+
+    def mean(values: NDArray) -> NDArray[np.float64]:
+        return np.bincount(cell, values) / count
+
+    middle, normal = (np.stack([mean(x) for x in v.T], axis=-1) for v in (centers, normals))
+    offset = centers - middle[cell]
+    covariance = np.empty((len(count), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            covariance[:, i, j] = mean(offset[:, i] * offset[:, j])
+        covariance[:, i, i] += mean(normals[:, i] == 0.0) / 12.0  # of faces along axis i
+    variance, R_WP = np.linalg.eigh(covariance)  # ascending
+    p = esdf.lower_W + esdf.voxel_size * (middle - _SUNK * normal)
+    # A square of edge a has the deviation a / sqrt(12); a surfel of _COVERAGE a covers it.
+    extent = _COVERAGE * np.sqrt(12.0 * variance[:, [2, 1]]) * esdf.voxel_size
+    surfels = Surfels(p, R_WP[:, :, 0], R_WP[:, :, 2], extent)
+    shade = _SHADES[np.floor(2.0 * p.sum(axis=1) / _STRIPE).astype(int) % 2]
+    return to_gaussians(surfels, np.repeat(shade[:, None], 3, axis=1), 0.99)

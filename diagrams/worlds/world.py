@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.moving_balls import MovingBalls
+from splatpilot.systems.collision.shapes import MovingBalls
 from splatpilot.systems.splats.background import Background
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import MovingGaussians
+from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 @dataclass(frozen=True, eq=False)

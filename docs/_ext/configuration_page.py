@@ -7,26 +7,22 @@ from typing import Any
 
 import yaml
 
-from splatpilot.analysis.faults.run import FaultsConfig
-from splatpilot.analysis.fidelity.config import FidelityConfig
+from splatpilot.analysis.faults.campaign import FaultsConfig
+from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 from splatpilot.analysis.places import PlaceConfig
 from splatpilot.analysis.tour import TourConfig
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.policies import POLICIES
-from splatpilot.diagrams.px4_config import Px4Config
-from splatpilot.diagrams.scenario import WITHOUT_EFFECT, Scenario
-from splatpilot.diagrams.sensors import SENSORS
-from splatpilot.diagrams.worlds.make_world import WORLDS
-from splatpilot.systems.field_descriptions import (
-    FieldDescription,
-    describe_fields,
-    is_configuration,
-)
-from splatpilot.systems.registry import Registry
+from splatpilot.diagrams.flight.policies import POLICIES
+from splatpilot.diagrams.flight.scenario import WITHOUT_EFFECT, Scenario
+from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.hardware.bridge import HardwareConfig
+from splatpilot.diagrams.hardware.px4 import Px4Config
+from splatpilot.diagrams.worlds.world_registry import WORLDS
+from splatpilot.systems.common.config import FieldDescription, describe_fields, is_configuration
+from splatpilot.systems.common.registry import Registry
 from splatpilot.training.captures.check import CheckConfig
-from splatpilot.training.captures.render_config import RenderConfig
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.training.captures.render import RenderConfig
+from splatpilot.training.corpus.corpus import CorpusConfig
+from splatpilot.training.policies.trainer_registry import TRAINERS
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 GROUPS: list[tuple[str, str, list[type] | Registry]] = [

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,12 +10,136 @@ from numpy.typing import ArrayLike
 from splatpilot import _native
 from splatpilot.systems.collision.distance_field import FieldSample, FieldState
 from splatpilot.systems.collision.distance_transform import conservative_distances
-from splatpilot.systems.collision.esdf_file import read_esdf_arrays, write_esdf_arrays
-from splatpilot.systems.collision.trilinear import (
-    corner_offsets,
-    grid_strides,
-    trilinear_with_gradient,
-)
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.readers import read_archive
+
+FORMAT_VERSION = 1
+
+# Name, number of dimensions and kinds of dtype of every entry.
+_ENTRIES = {
+    "version": (0, "iu"),
+    "distances": (3, "f"),
+    "states": (3, "u"),
+    "lower_W": (1, "f"),
+    "voxel_size": (0, "f"),
+    "occupied_outside": (0, "b"),
+}
+
+
+def write_esdf_arrays(
+    path: str | Path,
+    *,
+    distances: np.ndarray,
+    states: np.ndarray,
+    lower_W: np.ndarray,
+    voxel_size: float,
+    occupied_outside: bool,
+) -> None:
+    """Write the arrays of an `Esdf`; a temporary file beside `path` is renamed at the end.
+
+    Raises:
+        OSError: if the folder is missing or not writable.
+    """
+    with written_atomically(Path(path)) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            version=np.int64(FORMAT_VERSION),
+            distances=distances,
+            states=states,
+            lower_W=lower_W,
+            voxel_size=np.float64(voxel_size),
+            occupied_outside=np.bool_(occupied_outside),
+        )
+
+
+def read_esdf_arrays(path: str | Path) -> dict[str, Any]:
+    """The constructor arguments of an `Esdf` from a file that `write_esdf_arrays` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no numpy archive, is damaged, lacks an entry, holds one of another type
+            or was written by a newer version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such distance field file (esdf.npz).")
+    archive = read_archive(path)
+    arrays = {name: archive[name] for name in _ENTRIES if name in archive}
+    missing = [name for name in _ENTRIES if name not in arrays]
+    if missing:
+        raise ValueError(
+            f"{path}: not a distance field; the entries {missing} are missing. Write one with "
+            "Esdf.save."
+        )
+    for name, (ndim, kinds) in _ENTRIES.items():
+        array = arrays[name]
+        if array.ndim != ndim or array.dtype.kind not in kinds:
+            raise ValueError(
+                f"{path}: the entry {name!r} is {array.dtype} of shape {array.shape}; needed is an "
+                f"array of {ndim} dimensions and a dtype of kind {' or '.join(kinds)}."
+            )
+    version = int(arrays.pop("version"))
+    if version != FORMAT_VERSION:
+        raise ValueError(
+            f"{path}: distance field format {version}; this program reads format "
+            f"{FORMAT_VERSION}. Build the field anew."
+        )
+    return {
+        **arrays,
+        "voxel_size": float(arrays["voxel_size"]),
+        "occupied_outside": bool(arrays["occupied_outside"]),
+    }
+
+
+def grid_strides(shape: tuple[int, ...]) -> np.ndarray:
+    """Distance, in elements, between neighbours along x, y and z of a C-ordered grid; (3,) int."""
+    return np.array([shape[1] * shape[2], shape[2], 1], dtype=np.intp)
+
+
+def corner_offsets(shape: tuple[int, ...]) -> np.ndarray:
+    """Flat-index offsets of the eight corners of a cell from its lowest one; (2, 2, 2, 1) int."""
+    sx, sy, sz = grid_strides(shape)
+    step = np.arange(2)
+    return (
+        step[:, None, None, None] * sx + step[:, None, None] * sy + step[:, None] * sz
+    )  # (2, 2, 2, 1)
+
+
+def trilinear(corners: Any, fx: Any, fy: Any, fz: Any) -> Any:
+    """The interpolant of eight corner values at the fractions (fx, fy, fz) of the cell.
+
+    Fractions outside [0, 1] extrapolate the cell's polynomial.
+
+    Args:
+        corners: (2, 2, 2, N), indexed by the corner's x, y and z.
+        fx, fy, fz: (N,) each.
+
+    Returns:
+        (N,) values.
+    """
+    along_yz = corners[0] + fx * (corners[1] - corners[0])  # (2, 2, N)
+    along_z = along_yz[0] + fy * (along_yz[1] - along_yz[0])  # (2, N)
+    return along_z[0] + fz * (along_z[1] - along_z[0])
+
+
+def trilinear_with_gradient(corners: Any, fx: Any, fy: Any, fz: Any) -> tuple[Any, Any, Any, Any]:
+    """`trilinear` with its exact partial derivatives by fx, fy and fz.
+
+    Returns:
+        value, d/dfx, d/dfy, d/dfz: (N,) each.
+    """
+    slope_x = corners[1] - corners[0]  # (2, 2, N)
+    along_yz = corners[0] + fx * slope_x
+    slope_y = along_yz[1] - along_yz[0]  # (2, N)
+    along_z = along_yz[0] + fy * slope_y
+    slope_z = along_z[1] - along_z[0]  # (N,)
+    slope_x = slope_x[0] + fy * (slope_x[1] - slope_x[0])  # (2, N)
+    return (
+        along_z[0] + fz * slope_z,
+        slope_x[0] + fz * (slope_x[1] - slope_x[0]),
+        slope_y[0] + fz * (slope_y[1] - slope_y[0]),
+        slope_z,
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)

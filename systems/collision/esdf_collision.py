@@ -7,12 +7,11 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, ValueProducer
 
-from splatpilot.systems.collision.distance_field import DistanceField
-from splatpilot.systems.collision.moving_balls import MovingBalls
-from splatpilot.systems.collision.soft_barrier import in_collision, soft_barrier
-from splatpilot.systems.ports import input_port, output_port
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.collision.distance_field import DistanceField, in_collision, soft_barrier
+from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 
 class EsdfCollision(LeafSystem):

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.trilinear import (
+from splatpilot.systems.collision.esdf import (
+    Esdf,
     corner_offsets,
     grid_strides,
     trilinear,

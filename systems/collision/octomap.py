@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpilot.systems import git_lfs
-from splatpilot.systems.array_files import reason_of
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_occupancy import MAX_VOXELS, esdf_from_occupancy
+from splatpilot.systems.collision.occupancy import MAX_VOXELS, esdf_from_occupancy
+from splatpilot.systems.common import readers as git_lfs
+from splatpilot.systems.common.readers import reason_of
 
 _DEPTH = 16  # levels of children below the root
 _FREE, _OCCUPIED, _INNER = 1, 2, 3  # the two bits of a child

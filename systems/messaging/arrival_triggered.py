@@ -15,7 +15,7 @@ from pydrake.systems.framework import (
     System,
 )
 
-from splatpilot.systems.ports import input_port, output_port
+from splatpilot.systems.common.drake import input_port, output_port
 
 _log = logging.getLogger(__name__)
 

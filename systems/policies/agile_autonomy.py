@@ -8,6 +8,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
+from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.policies.agile_autonomy_inference import (
     AGILE_NETWORK,
     FARTHEST,
@@ -20,9 +21,8 @@ from splatpilot.systems.policies.agile_autonomy_inference import (
 )
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
 from splatpilot.systems.policies.hypotheses import Hypotheses, no_plan
-from splatpilot.systems.ports import input_port, output_port
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 
 @dataclass

@@ -5,17 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.policies.convolutions import (
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
+from splatpilot.systems.policies.observations import pool_depth, target_velocity
+from splatpilot.systems.policies.recurrent_network import (
     Convolutions,
     Layer,
     convolution_shapes,
     layer_sizes,
     leaky_relu,
 )
-from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses
-from splatpilot.systems.policies.observation import pool_depth, target_velocity
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, check_weights
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 RATE = 15.0  # [Hz]
 IMAGE_SIZE = 128, 96  # [px] width and height before pooling

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatpilot.systems.vehicle.flatness import cross
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
 

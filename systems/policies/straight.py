@@ -5,13 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.messages import require_field
-from splatpilot.systems.policies.velocity_tracking import (
-    approach_velocity,
-    tracking_acceleration,
-)
-from splatpilot.systems.ports import input_port, output_port
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.common.messages import require_field
+from splatpilot.systems.policies.velocity import approach_velocity, tracking_acceleration
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 
 @dataclass

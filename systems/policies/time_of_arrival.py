@@ -17,16 +17,16 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from splatpilot import _native
-from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.soft_barrier import soft_barrier
-from splatpilot.systems.collision.trilinear import (
+from splatpilot.systems.collision.distance_field import soft_barrier
+from splatpilot.systems.collision.esdf import (
+    Esdf,
     corner_offsets,
     grid_strides,
     trilinear,
     trilinear_with_gradient,
 )
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 OPEN_CLEARANCE = 0.6
 """Clearance [m] from which on the vehicle may fly at full speed."""

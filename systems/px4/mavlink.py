@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from splatpilot.systems.extras import import_extra
+from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.px4.frames import (
     attitude_from_px4,
     attitude_to_px4,

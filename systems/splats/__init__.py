@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from splatpilot.systems.splats.rasterization import rasterize
-    from splatpilot.systems.splats.surfels import rasterize_surfels
+    from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 __all__ = ["rasterize", "rasterize_surfels"]
 
@@ -19,7 +19,7 @@ def __getattr__(name: str) -> Any:
 
         return rasterize
     if name == "rasterize_surfels":
-        from splatpilot.systems.splats.surfels import rasterize_surfels
+        from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
         return rasterize_surfels
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

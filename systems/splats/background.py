@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from splatpilot.systems.files import written_atomically
-from splatpilot.systems.png_chunks import require_whole_chunks
-from splatpilot.systems.read_limit import require_readable_size
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.readers import require_readable_size, require_whole_chunks
 from splatpilot.systems.splats.baked_scene import RenderedView
-from splatpilot.systems.splats.distortion import Distortion, pixel_slopes
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

@@ -1,10 +1,14 @@
 """A camera that sees Gaussians."""
 
+import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import Value
+from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import (
@@ -15,24 +19,131 @@ from pydrake.systems.sensors import (
     ImageRgba8U,
 )
 
-from splatpilot.systems.ports import input_port, output_port
-from splatpilot.systems.splats.background import BLACK, Background
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
-from splatpilot.systems.splats.distortion import Distortion
-from splatpilot.systems.splats.drake_images import (
-    color_pixels,
-    ranged_depth,
-    render_view,
-    surface_labels,
-)
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import (
+from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, put_behind
+from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
+    BakedScene,
     MovingGaussians,
     PlacedGaussians,
+    RenderedView,
 )
-from splatpilot.systems.splats.rolling_shutter import camera_bands
-from splatpilot.systems.weakly import weakly
+from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.state import pose_between
+
+
+def render_view(
+    scene: BakedScene,
+    K: NDArray[np.float64],
+    width: int,
+    height: int,
+    X_WC: RigidTransform,
+    near: float,
+    far: float,
+    background: Background = BLACK,
+    moving: PlacedGaussians = NO_GAUSSIANS,
+    distortion: Distortion | None = None,
+    max_depth: float = np.inf,
+) -> RenderedView:
+    """What a camera of intrinsics K [px] at X_WC sees, through a lens; see `BakedScene.render`.
+
+    Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so its
+    intrinsics are taken as they are.
+    """
+    camera = (K, width, height, X_WC, near, far)
+    if not isinstance(background, EnvironmentMap):
+        return scene.render(*camera, background, moving, distortion, max_depth)
+    view = scene.render(*camera, BLACK, moving, distortion, max_depth)
+    return put_behind(view, background, K, X_WC, distortion)
+
+
+def color_pixels(color: NDArray) -> NDArray[np.uint8]:
+    """Colours in [0, 1], clipped, as the nearest of 0 to 255."""
+    return np.clip(color * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+
+
+def ranged_depth(
+    depth: NDArray[np.float32], min_depth: float, max_depth: float
+) -> NDArray[np.float32]:
+    """Planar depth (H, W) [m], 0 where there is no surface, as Drake's cameras show it.
+
+    Nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so does a pixel
+    without a surface.
+    """
+    seen = (depth > 0) & (depth <= max_depth)
+    return np.where(seen, np.where(depth < min_depth, np.float32(0), depth), np.inf)
+
+
+def surface_labels(view: RenderedView) -> NDArray[np.int16]:
+    """`RenderLabel.kUnspecified` where there is a surface and `RenderLabel.kEmpty` elsewhere:
+    Gaussians carry no semantics  # (H, W).
+    """
+    unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
+    return np.where(view.depth > 0, unspecified, empty).astype(np.int16)
+
+
+# Rolling shutters: each row of an image is seen from where the camera was when it was read.
+#
+# Rows are read one after the other at even times, the first at the pose X_WC0 and the last at
+# X_WC1, those between at `pose_between`. Rows between which an image hardly moves are rendered
+# together, as a band, from the pose of their middle.
+
+
+_STEP = 0.5
+"""[px] that an image may move between two bands, so that no row is off by more than half of it."""
+_NEAREST = 1.0
+"""[m] Depth of what is told to move so far; what is nearer moves more."""
+
+
+def row_bands(
+    X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, fewest: int = 1
+) -> list[tuple[int, int]]:
+    """First row and row after the last of each band of an image.
+
+    Args:
+        X_WC0, X_WC1: poses of the camera at the first and the last row.
+        focal: [px]
+        height: [px]
+        fewest: bands at least, for what moves before a camera at rest.
+    """
+    turned = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
+    travelled = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
+    moved = focal * (abs(turned) + float(travelled) / _NEAREST)
+    count = min(height, max(fewest, math.ceil(moved / _STEP)))
+    edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
+    return list(pairwise(edges))
+
+
+class Band(NamedTuple):
+    """Rows of an image that are rendered from one pose, as an image of their own."""
+
+    K: NDArray[np.float64]
+    """Its intrinsics (3, 3) [px]."""
+    height: int
+    """[px]"""
+    X_WC: RigidTransform
+    """Where its middle row is read."""
+    s: float
+    """When: 0 as the first row of all is, 1 as the last."""
+
+
+def camera_bands(
+    K: NDArray[np.float64],
+    height: int,
+    X_WC0: RigidTransform,
+    X_WC1: RigidTransform,
+    fewest: int = 1,
+) -> Iterator[Band]:
+    """The bands of an image of intrinsics K (3, 3) [px] from its first row to its last; else as
+    `row_bands`."""
+    focal = float(max(K[0, 0], K[1, 1]))
+    for first, last in row_bands(X_WC0, X_WC1, focal, height, fewest):
+        s = 0.5 * (first + last) / height
+        cropped = K.copy()
+        cropped[1, 2] -= first
+        yield Band(cropped, last - first, pose_between(X_WC0, X_WC1, s), s)
+
 
 _BANDS = 8
 """Into which an image with a rolling shutter is cut at least where something moves."""

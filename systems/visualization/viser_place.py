@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 
-from splatpilot.systems.extras import import_extra
+from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.splats.background import mean_color
-from splatpilot.systems.visualization.drawing import (
+from splatpilot.systems.visualization.meshcat_drawing import (
     BALL,
     GOAL_COLOR,
     START_COLOR,
     box_edges,
     distance_slice,
 )
-from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace
+from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace
 
 if TYPE_CHECKING:
     import viser

@@ -13,8 +13,8 @@ from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.captures import capture_of_scene
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.training.captures import capture_registry as capture_of_scene
 from splatpilot.training.captures.capture import Capture, SfmPoints
 
 WIDTH, HEIGHT = 64, 48

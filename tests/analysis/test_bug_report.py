@@ -6,9 +6,9 @@ import tempfile
 
 import pytest
 
-from splatpilot.analysis import cli
-from splatpilot.analysis.cli import main
-from splatpilot.systems.registry import import_modules
+from splatpilot.analysis.commands import main as cli
+from splatpilot.analysis.commands.main import main
+from splatpilot.systems.common.registry import import_modules
 
 
 @pytest.fixture

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis import places
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.configuration import load_config
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.policies.straight import StraightConfig
-from splatpilot.systems.progress import resumable
-from splatpilot.systems.splats.gaussian_ply import write_ply
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_files import write_ply
 
 SHORT = ["--set", "world.length=10", "--set", "world.width=6", "--set", "timeout=15"]
 
@@ -104,7 +104,7 @@ def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path
     """Help and version come at once, and so does the answer to a wrong name or path: no package
     that takes long to load is imported for them, and nothing is written."""
     script = (
-        "import sys; from splatpilot.analysis.cli import main\n"
+        "import sys; from splatpilot.analysis.commands.main import main\n"
         f"try: status = main({words.split()})\n"
         "except SystemExit as ended: status = ended.code\n"
         "print(status, *{name.partition('.')[0] for name in sys.modules})"
@@ -140,7 +140,7 @@ def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path
 def test_long_commands_say_what_they_do_before_anything_slow_is_imported(words, tmp_path):
     (tmp_path / "out" / "corpus" / "shards").mkdir(parents=True)
     script = (
-        "import sys; from splatpilot.analysis.cli import main\n"
+        "import sys; from splatpilot.analysis.commands.main import main\n"
         # Importing these fails.
         "sys.modules |= dict.fromkeys(['numpy', 'pydrake', 'torch', 'yaml'])\n"
         f"main({words.split()})"
@@ -320,7 +320,7 @@ def test_signals_end_with_one_line(number, status, tmp_path):
     """A flight that is ended from outside says so in one line, and leaves no half of anything."""
     out = tmp_path / "flight"
     script = (
-        "import signal, sys; from splatpilot.analysis.cli import main\n"
+        "import signal, sys; from splatpilot.analysis.commands.main import main\n"
         # Shells have what runs in their background ignore it.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.exit(main(['fly', '--out', {str(out)!r}]))"
@@ -349,7 +349,7 @@ def test_signal_while_something_is_imported(number, status, tmp_path):
         "    raise ImportError('a core of it failed to import')\n"
     )
     script = (
-        "import signal, sys; from splatpilot.analysis.cli import main\n"
+        "import signal, sys; from splatpilot.analysis.commands.main import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "print('before', flush=False)\n"
         "sys.exit(main(['--import', 'interrupted', 'doctor']))"
@@ -380,7 +380,7 @@ def test_signal_after_the_last_result(number, status):
 def test_signal_while_modules_are_taken_apart(number):
     """A signal that comes when Python answers none any more does not make a failure of success."""
     script = (
-        "import os, signal, threading, time; from splatpilot.analysis.cli import run\n"
+        "import os, signal, threading, time; from splatpilot.analysis.commands.main import run\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         # What the main thread does not take goes to any other.
         "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
@@ -409,7 +409,7 @@ def test_what_is_said_stands_below_progress_bars(how, status, message, tmp_path)
         f"import signal; from tqdm import tqdm\nbar = tqdm(total=3)\nbar.update()\n{how}\n"
     )
     script = (
-        "import sys; from splatpilot.analysis.cli import main\n"
+        "import sys; from splatpilot.analysis.commands.main import main\n"
         "sys.exit(main(['--import', 'working', 'doctor']))"
     )
     words = [sys.executable, "-c", script]
@@ -434,7 +434,7 @@ def test_an_interruption_says_what_is_kept(tmp_path, capsys, monkeypatch):
 def test_drake_says_nothing_but_warnings(tmp_path):
     """Pages are written by a Meshcat that nobody is to connect to, so its address is not told."""
     script = (
-        "import sys; from splatpilot.analysis.cli import main\n"
+        "import sys; from splatpilot.analysis.commands.main import main\n"
         f"main(['view', 'nowhere', '--out', {str(tmp_path / 'page.html')!r}])\n"
         "from pydrake.geometry import Meshcat; Meshcat()"
     )

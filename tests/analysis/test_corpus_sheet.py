@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.corpus_sheet import project
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.corpus import Corpus

@@ -12,13 +12,12 @@ from splatpilot.analysis.depth_truth import (
     frames_of_capture,
     ghosts_along_flight,
 )
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
+from splatpilot.systems.collision.shapes import AnalyticDistanceField
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 CAMERA = OnboardCamera(64, 36)
 

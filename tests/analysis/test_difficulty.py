@@ -5,24 +5,26 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.analysis import difficulty as difficulty_module
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.difficulty import (
+    SPACING,
     angle_over_length,
     bottleneck,
     difficulty,
+    path_length,
     relative_gap_size,
+    resampled,
     run,
+    shortest_path,
     traversability,
     traversability_obstacle,
     view_obstacle,
 )
-from splatpilot.analysis.path_lengths import SPACING, path_length, resampled, shortest_path
 from splatpilot.diagrams.worlds.feasibility import grid_distances
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import Box, Capsule
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS as R
 
 LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
 EMPTY = AnalyticDistanceField([], LOWER, UPPER)

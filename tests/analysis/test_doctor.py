@@ -6,10 +6,10 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 
 from splatpilot.analysis import doctor
-from splatpilot.diagrams.scenario_files import benchmark_scenarios
-from splatpilot.systems import opengl
-from splatpilot.systems.extras import packages_of_extras
-from splatpilot.systems.messaging import open_lcm
+from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.systems.common import extras as opengl
+from splatpilot.systems.common.extras import packages_of_extras
+from splatpilot.systems.messaging import lcm_ports as open_lcm
 
 
 def only(findings: list[doctor.Finding]) -> doctor.Finding:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
 
 SMALL = ["world.length=9", "world.width=6"]
 

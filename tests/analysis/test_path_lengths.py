@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.analysis.path_lengths import SPACING, march, shortest_path
+from splatpilot.analysis.difficulty import SPACING, march, shortest_path
 from splatpilot.diagrams.worlds.feasibility import grid_distances
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import Box
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS as R
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS as R
 
 WALL = Box(RigidTransform([6.0, 0.0, 2.0]), [0.2, 9.0, 8.0])
 CLOSED = AnalyticDistanceField([WALL], np.array([0.0, -4, 0]), np.array([12.0, 4, 4]))

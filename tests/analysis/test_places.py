@@ -5,11 +5,9 @@ import trimesh
 
 from splatpilot.analysis import places
 from splatpilot.analysis.places import BENCHMARK_PLACES, PLACES, Place, PlaceConfig
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios, other_scenarios
-from splatpilot.diagrams.worlds.scene import SceneSource
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, other_scenarios
+from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_metadata
+from splatpilot.systems.common.config import load_config
 
 
 def scenes_of(files):

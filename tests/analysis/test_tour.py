@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from pydrake.math import RigidTransform
 
-from splatpilot.analysis.cli import main
-from splatpilot.training.captures.render_capture import true_camera
+from splatpilot.analysis.commands.main import main
+from splatpilot.training.captures.render import true_camera
 
 SMALL = [
     "render.width=64",

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.analysis import shown_place, view
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import scenario_file
+from splatpilot.analysis import view
+from splatpilot.analysis import view as shown_place
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
 from splatpilot.diagrams.worlds import octomap_world
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata, write_scene_metadata
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.octomap import Octomap
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.splats.gaussian_ply import write_ply
-from splatpilot.training.captures.capture_gaussians import capture_gaussians
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.splats.splat_files import write_ply
+from splatpilot.training.captures.render import capture_gaussians
 
 
 def data_of(page) -> dict:

@@ -20,7 +20,7 @@ from crash.verbs import VERBS, Verb, prepare
 WAYS = "kill -9", "SIGTERM", "full disk", "no permission"
 _BLOCKS = ",".join(f"-{name}" for name in ("dac_override", "dac_read_search"))
 _MARK = "SPLATPILOT_CRASH_ROUND"
-_PROGRAM = "from splatpilot.analysis.cli import run; run()"
+_PROGRAM = "from splatpilot.analysis.commands.main import run; run()"
 _PATIENCE = 20.0  # [s], after which what a command has started must have ended with it
 
 

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Cylinder
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 @pytest.fixture(scope="session")

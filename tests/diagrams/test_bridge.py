@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from splatpilot.diagrams import bridge, vehicle
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.hardware import bridge, vehicle
+from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.messaging.codecs import StateCodec, VehicleStatusCodec
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
+from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_quadrotor_state
-from splatpilot.systems.messaging.message_publisher import MessagePublisher
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.messaging.lcm_ports import MessagePublisher
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 SPLATPILOT = Path(sys.executable).with_name("splatpilot")
 SMALL = ["--set", "world.length=10", "--set", "world.width=6", "--seed", "2"]

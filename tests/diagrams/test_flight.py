@@ -12,16 +12,21 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight import FlightError, Outcome, flight_outcome, fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.diagrams.flight.flight import (
+    FlightError,
+    Outcome,
+    flight_outcome,
+    fly,
+    sample_initial_state,
+)
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 
 
 def test_flies_round_the_post_to_the_goal(post_world):
@@ -188,10 +193,10 @@ def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
 def test_same_seed_gives_the_same_bits_in_two_processes():
     """Two processes that fly the default scenario for three seconds leave identical samples."""
     script = (
-        "import hashlib; from splatpilot.diagrams.scenario import Scenario;"
-        "from splatpilot.diagrams.flight import fly;"
-        "from splatpilot.diagrams.flight_diagram import BuildFlightDiagram;"
-        "from splatpilot.diagrams.worlds.make_world import make_world;"
+        "import hashlib; from splatpilot.diagrams.flight.scenario import Scenario;"
+        "from splatpilot.diagrams.flight.flight import fly;"
+        "from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram;"
+        "from splatpilot.diagrams.worlds.world_registry import make_world;"
         "s = Scenario(seed=3, timeout=3.0); w = make_world(s.world, s.seed);"
         "f = fly(BuildFlightDiagram(s, w, video=True), s, w);"
         "print(len(f.times), *(hashlib.sha256(a.tobytes()).hexdigest()"
@@ -212,7 +217,7 @@ def test_same_seed_gives_the_same_bits_in_two_processes():
 def test_flight_path_does_not_import_torch():
     """What `splatpilot fly` imports does not load torch, which would cost every user seconds."""
     script = (
-        "import sys; import splatpilot.diagrams.fly, splatpilot.analysis.cli;"
+        "import sys; import splatpilot.diagrams.flight.fly, splatpilot.analysis.commands.main;"
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0

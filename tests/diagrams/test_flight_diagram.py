@@ -7,17 +7,17 @@ import pytest
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from splatpilot.diagrams.flight import Outcome, fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import POLICIES, policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.sensors import SENSORS
-from splatpilot.diagrams.worlds.make_world import WORLDS, make_world
-from splatpilot.systems.configuration import dump_config, load_config, parse_config
+from splatpilot.diagrams.flight.flight import Outcome, fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import POLICIES, policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.worlds.world_registry import WORLDS, make_world
+from splatpilot.systems.common.config import dump_config, load_config, parse_config
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.flatness_controller import FlatnessController
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.flatness import FlatnessController
+from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 
 
 def flown(scenario: Scenario, world, **systems):

@@ -12,29 +12,27 @@ import pytest
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.vehicle_diagram import BuildVehicleDiagram
+from splatpilot.diagrams.flight.flight import fly, sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
+from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status, lcmt_trajectory_hypotheses
-from splatpilot.systems.messaging.message_publisher import PUBLISH_OFFSET
-from splatpilot.systems.messaging.time_of_flight_receiver import (
+from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
+from splatpilot.systems.messaging.tof_receiver import (
     TimeOfFlightReceiver,
     TimeOfFlightStream,
+    UdpConfig,
 )
-from splatpilot.systems.messaging.udp_inbox import UdpConfig
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.flight_limits import FlightLimits
 
 TICK = HardwareConfig().tick
 

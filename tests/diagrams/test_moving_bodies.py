@@ -7,17 +7,16 @@ import pytest
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 
-from splatpilot.diagrams.flight import Outcome, fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.flight import Outcome, fly, sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import MovingBodies, World
-from splatpilot.systems.collision.moving_balls import MovingBalls
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import MovingGaussians
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def with_ball(world: World, path: np.ndarray, radius: float = 0.5) -> World:

@@ -8,16 +8,15 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.sensors import make_camera
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.diagrams.flight.flight import fly, sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 
 def states(world, **noise) -> np.ndarray:

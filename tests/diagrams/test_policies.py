@@ -7,10 +7,10 @@ import pytest
 from pydrake.geometry import Meshcat
 from pydrake.systems.primitives import ConstantVectorSource
 
-from splatpilot.diagrams import policies
-from splatpilot.diagrams.flight import Outcome, fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import (
+from splatpilot.diagrams.flight import policies
+from splatpilot.diagrams.flight.flight import Outcome, fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import (
     BENCHMARK_POLICIES,
     POLICIES,
     PolicyKind,
@@ -20,11 +20,10 @@ from splatpilot.diagrams.policies import (
     register_policy,
     speed_of,
 )
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.policies.depthnav import DepthNavConfig
-from splatpilot.systems.policies.depthnav_inference import DEPTHNAV_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-from splatpilot.systems.registry import Registry
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK, DepthNavConfig
 
 
 @dataclass

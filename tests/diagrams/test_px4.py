@@ -4,10 +4,10 @@ import re
 
 import pytest
 
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams import px4
-from splatpilot.diagrams.px4_config import Px4Config
-from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.hardware import px4
+from splatpilot.diagrams.hardware.px4 import Px4Config
+from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
 
 
 def test_it_says_what_it_will_not_do(udp_url, capsys):

@@ -12,21 +12,19 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 from pymavlink.dialects.v20 import common as dialect
 
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.px4_config import Px4Config
-from splatpilot.diagrams.px4_diagram import BuildPx4Diagram
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
+from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
+from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
-from splatpilot.systems.messaging.message_publisher import MessagePublisher
-from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
-from splatpilot.systems.px4.motion_capture_receiver import MotionCaptureConfig
-from splatpilot.systems.px4.px4_commander import Px4CommanderConfig
-from splatpilot.systems.vehicle.flight_limits import FlightLimits
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.messaging.lcm_ports import MessagePublisher
+from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.px4.commander import Px4CommanderConfig
+from splatpilot.systems.px4.motion_capture import MotionCaptureConfig
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 START, GOAL = [1.0, 2.0, 2.0], [9.0, 2.0, 2.0]
 EPOCH = 1_800_000_000.0  # [s] Unix time when a test begins.

@@ -28,15 +28,13 @@ from mavsdk.plugins.telemetry_server.telemetry_server import (
 )
 from pydrake.systems.analysis import Simulator
 
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.hardware_diagram import BuildHardwareDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.px4_config import Px4Config
-from splatpilot.diagrams.px4_diagram import BuildPx4Diagram
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
-from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
-from splatpilot.systems.px4.px4_commander import Px4CommanderConfig
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
+from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
+from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.px4.commander import Px4CommanderConfig
 
 START, GOAL = [1.0, 2.0, 2.0], [9.0, 6.0, 2.0]
 

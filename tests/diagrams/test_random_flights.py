@@ -7,14 +7,13 @@ import numpy as np
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import MonteCarloSimulation
 
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.random_flights import random_flights
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.seeds import MONTE_CARLO_SEEDS
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.diagrams.flight.flight import fly, sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.monte_carlo import random_flights
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS
+from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 
 
 def test_default_context_is_the_start_of_the_scenario(post_world):

@@ -7,8 +7,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from splatpilot.diagrams.real_time import MAX_LAG, run_in_real_time
-from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.diagrams.hardware.real_time import MAX_LAG, run_in_real_time
+from splatpilot.systems.messaging.bridge_status import UnixClock
 
 
 class Worker(LeafSystem):

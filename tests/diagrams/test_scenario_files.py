@@ -2,9 +2,13 @@
 
 import pytest
 
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios, other_scenarios, scenario_file
-from splatpilot.systems.configuration import dump_config, load_config, parse_config
+from splatpilot.diagrams.flight.scenario import (
+    Scenario,
+    benchmark_scenarios,
+    other_scenarios,
+    scenario_file,
+)
+from splatpilot.systems.common.config import dump_config, load_config, parse_config
 
 
 def test_names_and_paths_are_found(tmp_path):

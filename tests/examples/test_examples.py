@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatpilot.training.captures import render_capture
-from splatpilot.training.captures.render_config import RenderConfig
+from splatpilot.training.captures import render as render_capture
+from splatpilot.training.captures.render import RenderConfig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILES = sorted(EXAMPLES.glob("*.py"))
-MAIN = "from splatpilot.analysis.cli import main; raise SystemExit(main())"
+MAIN = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
 SHORT = "world: {length: 9, width: 6}\ntimeout: 12\n"
 
 
@@ -95,7 +95,7 @@ def test_own_policy_that_no_module_registers(tmp_path):
     """Named as `module:attribute` it flies in worker processes too."""
     own = (EXAMPLES / "own_policy.py").read_text().replace("sp.register_policy(", "build = (")
     kind = 'PolicyKind(*build, speed_field="speed")'
-    own += f"\nfrom splatpilot.diagrams.policies import PolicyKind\nKIND = {kind}\n"
+    own += f"\nfrom splatpilot.diagrams.flight.policies import PolicyKind\nKIND = {kind}\n"
     (tmp_path / "loose_policy.py").write_text(own)
     (tmp_path / "short.yaml").write_text(SHORT)
     words = ["benchmark", "--policies", "mine=loose_policy:KIND", "--scenarios", "short.yaml"]

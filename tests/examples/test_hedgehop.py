@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hedgehop"
-MAIN = "from splatpilot.analysis.cli import main; raise SystemExit(main())"
+MAIN = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
 
 
 @pytest.fixture(scope="module")

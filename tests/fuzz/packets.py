@@ -11,19 +11,24 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from fuzz.readers import Reader
 from splatpilot.systems.messaging.codecs import (
     Codec,
+    ColorImageCodec,
     CommandCodec,
     DepthGridCodec,
+    DepthImageCodec,
     HypothesesCodec,
     MotionCaptureCodec,
     StateCodec,
     VehicleStatusCodec,
     VelocitySetpointCodec,
 )
-from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec
-from splatpilot.systems.messaging.message_subscriber import decode_message
+from splatpilot.systems.messaging.lcm_ports import decode_message
 from splatpilot.systems.policies.hypotheses import hypotheses_size
-from splatpilot.systems.sensing.time_of_flight import TimeOfFlight
-from splatpilot.systems.sensing.time_of_flight_packets import FRAME_MAGIC, Stream, after_packet
+from splatpilot.systems.sensing.time_of_flight import (
+    FRAME_MAGIC,
+    Stream,
+    TimeOfFlight,
+    after_packet,
+)
 
 _SENSOR = TimeOfFlight()
 _STATE = np.array([1.0, 2, 3, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0])

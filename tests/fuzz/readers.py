@@ -75,7 +75,7 @@ def _write_ply(text: bool) -> Callable[[Path], None]:
     def write(folder: Path) -> None:
         from plyfile import PlyData
 
-        from splatpilot.systems.splats.gaussian_ply import write_ply
+        from splatpilot.systems.splats.splat_files import write_ply
 
         write_ply(samples.gaussians(), folder / "scene.ply")
         if text:
@@ -86,7 +86,7 @@ def _write_ply(text: bool) -> Callable[[Path], None]:
 
 
 def _read_ply(folder: Path) -> Any:
-    from splatpilot.systems.splats.gaussian_ply import read_ply
+    from splatpilot.systems.splats.splat_files import read_ply
 
     return read_ply(folder / "scene.ply")
 
@@ -138,16 +138,15 @@ def _write_mesh(folder: Path) -> None:
 
 
 def _read_mesh(folder: Path) -> Any:
-    from splatpilot.training.captures.mesh_renderer import check_mesh
-    from splatpilot.training.captures.render_capture import mesh_distance
+    from splatpilot.training.captures.render import check_mesh, mesh_distance
 
     check_mesh(folder / "mesh.gltf", "y")
     return folder / "mesh.gltf", mesh_distance(folder / "mesh.gltf", "y", 0.25)
 
 
 def _use_mesh(mesh: Any) -> None:
-    from splatpilot.systems.opengl import require_opengl
-    from splatpilot.training.captures.mesh_renderer import MeshRenderer
+    from splatpilot.systems.common.extras import require_opengl
+    from splatpilot.training.captures.render import MeshRenderer
 
     file, esdf = mesh
     _query(esdf)
@@ -166,21 +165,21 @@ def _use_mesh(mesh: Any) -> None:
 
 
 def _read_capture(folder: Path) -> Any:
-    from splatpilot.training.captures.read_capture import read_capture
+    from splatpilot.training.captures.capture_registry import read_capture
 
     return read_capture(folder)
 
 
 def _read_photographs(folder: Path) -> Any:
     from splatpilot.training.captures.capture_config import CaptureConfig
-    from splatpilot.training.captures.photographs import read_photographs
+    from splatpilot.training.captures.colmap import read_photographs
 
     config = CaptureConfig(cache=str(folder / "cache"))
     return folder, read_photographs(folder, config)
 
 
 def _use_photographs(read: Any) -> None:
-    from splatpilot.training.captures.photographs import one_camera, photographs_in
+    from splatpilot.training.captures.colmap import one_camera, photographs_in
 
     folder, capture = read
     one_camera([file for file in photographs_in(folder) if file.name in capture.frame_names])

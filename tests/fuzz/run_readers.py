@@ -11,8 +11,8 @@ from fuzz.readers import Reader, require_finite
 
 
 def _scenario(folder: Path) -> Any:
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.systems.common.config import load_config
 
     scenario = load_config(Scenario(), folder / "scenario.yaml")
     scenario.validate()
@@ -20,8 +20,8 @@ def _scenario(folder: Path) -> Any:
 
 
 def _write_scenario(folder: Path) -> None:
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.systems.configuration import dump_config
+    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.systems.common.config import dump_config
 
     (folder / "scenario.yaml").write_text(dump_config(Scenario()))
 
@@ -33,7 +33,7 @@ def _names_field(message: str, folder: Path) -> bool:
 
 
 def _use_config(config: Any) -> None:
-    from splatpilot.systems.configuration import dump_config, parse_config
+    from splatpilot.systems.common.config import dump_config, parse_config
 
     again = parse_config(type(config)(), dump_config(config), "its own text")
     assert dump_config(again) == dump_config(config), "it is not what it writes"
@@ -41,14 +41,14 @@ def _use_config(config: Any) -> None:
 
 
 def _write_training(folder: Path) -> None:
-    from splatpilot.systems.configuration import dump_config
+    from splatpilot.systems.common.config import dump_config
     from splatpilot.training.reconstruction.config import ReconstructConfig
 
     (folder / "config.yaml").write_text(dump_config(ReconstructConfig()))
 
 
 def _training(folder: Path) -> Any:
-    from splatpilot.systems.configuration import load_config
+    from splatpilot.systems.common.config import load_config
     from splatpilot.training.reconstruction.config import ReconstructConfig
 
     config = load_config(ReconstructConfig(), folder / "config.yaml")
@@ -57,8 +57,8 @@ def _training(folder: Path) -> Any:
 
 
 def _write_weights(folder: Path) -> None:
-    from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-    from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+    from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+    from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 
     rng = np.random.default_rng(0)
     weights = {
@@ -70,7 +70,7 @@ def _write_weights(folder: Path) -> None:
 
 
 def _read_weights(folder: Path) -> Any:
-    from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
+    from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
     from splatpilot.systems.policies.recurrent_network import load_network
 
     return load_network(str(folder / "diffaero.npz"), "diffaero", DIFFAERO_NETWORK)
@@ -86,8 +86,7 @@ def _use_weights(network: Any) -> None:
 
 
 def _read_study(folder: Path) -> Any:
-    from splatpilot.analysis.benchmark.study_folder import StudyFolder
-    from splatpilot.analysis.benchmark.study_inputs import kept_flights
+    from splatpilot.analysis.benchmark.study_folder import StudyFolder, kept_flights
 
     study = StudyFolder(folder / "study")
     specs = study.config().rollouts()

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 WIDTH, HEIGHT, FRAMES = 16, 12, 6
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -145,8 +145,8 @@ def write_study(folder: Path) -> None:
     """A study of two flights, as `splatpilot benchmark` would have left it."""
     from splatpilot.analysis.benchmark.study import StudyConfig
     from splatpilot.analysis.benchmark.study_folder import StudyFolder
-    from splatpilot.diagrams.scenario import Scenario
-    from splatpilot.systems.configuration import dump_config
+    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.systems.common.config import dump_config
 
     config = StudyConfig(["P02"], ["straight", "reactive"], [2.0], seeds=1)
     study = StudyFolder(folder / "study")

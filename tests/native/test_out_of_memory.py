@@ -8,7 +8,7 @@ import resource
 import numpy as np
 from pydrake.math import RigidTransform
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 def scene(count):
     g = np.random.default_rng(0)

@@ -6,8 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from splatpilot.systems.array_files import array_layout, read_archive, read_array
-from splatpilot.systems.read_limit import LIMIT
+from splatpilot.systems.common.readers import LIMIT, array_layout, read_archive, read_array
 
 
 def header(shape: str, descr: str = "'<f4'") -> bytes:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import pytest
 
-from splatpilot.diagrams.hardware_config import HardwareConfig
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.forest.config import ForestConfig
-from splatpilot.diagrams.worlds.make_world import SceneConfig, make_world, register_world
-from splatpilot.systems.configuration import dump_config, load_config, parse_config
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.hardware.bridge import HardwareConfig
+from splatpilot.diagrams.worlds.forest.layout import ForestConfig
+from splatpilot.diagrams.worlds.world_registry import SceneConfig, make_world, register_world
+from splatpilot.systems.common.config import dump_config, load_config, parse_config
 from splatpilot.training.corpus.library import LibraryConfig
 
 
@@ -82,9 +82,9 @@ def test_a_field_of_the_type_that_is_there_first_of_all():
     """In a fresh process the first override of a field in what another type than the default's
     holds leaves that type."""
     program = (
-        "from splatpilot.diagrams.scenario import Scenario\n"
-        "from splatpilot.systems.configuration import load_config\n"
-        "from splatpilot.systems.policies.reactive_planner import ReactiveConfig\n"
+        "from splatpilot.diagrams.flight.scenario import Scenario\n"
+        "from splatpilot.systems.common.config import load_config\n"
+        "from splatpilot.systems.policies.reactive import ReactiveConfig\n"
         "scenario = Scenario(policy=ReactiveConfig())\n"
         "config = load_config(scenario, overrides=['policy.rate=9', 'policy.margin=0.3']).policy\n"
         "assert isinstance(config, ReactiveConfig), config\n"

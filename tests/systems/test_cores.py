@@ -1,6 +1,6 @@
 import os
 
-from splatpilot.systems.cores import available_cores
+from splatpilot.systems.common.processes import available_cores
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch):

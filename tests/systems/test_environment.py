@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.environment import DATA, find_data
+from splatpilot.systems.common.files import DATA, find_data
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 import pytest
 
-from splatpilot.systems.extras import import_extra, missing_extra
+from splatpilot.systems.common.extras import import_extra, missing_extra
 
 
 def test_missing_package_says_which_extra_brings_it():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.far_origin import choose_origin
+from splatpilot.systems.splats.scene import choose_origin
 
 NEAR = np.random.default_rng(0).normal(size=(100, 3))
 

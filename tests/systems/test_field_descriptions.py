@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 import pytest
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.systems.configuration import open_field
-from splatpilot.systems.field_descriptions import describe_fields
-from splatpilot.systems.registry import Registry
+from splatpilot.systems.common.config import describe_fields, open_field
+from splatpilot.systems.common.registry import Registry
 
 ENGINES = Registry("engine", "tests.engines", object)
 

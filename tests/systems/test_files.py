@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from splatpilot.systems.files import (
+from splatpilot.systems.common.files import (
     folder_written_atomically,
     remove_leftovers,
     require_existing,
@@ -162,7 +162,7 @@ def test_replaced_folder_is_there_at_every_instant(tmp_path):
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from splatpilot.systems.files import folder_written_atomically, written_atomically
+from splatpilot.systems.common.files import folder_written_atomically, written_atomically
 folder = Path(sys.argv[1])
 with written_atomically(folder / "a.txt") as file, folder_written_atomically(folder / "b") as inner:
     file.write_text("half")

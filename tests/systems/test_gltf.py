@@ -5,7 +5,7 @@ import base64
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from splatpilot.systems.gltf import add_primitive, data_uri, y_up
+from splatpilot.systems.collision.field_mesh import add_primitive, data_uri, y_up
 
 TYPES = {5126: "<f4", 5125: "<u4"}
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}

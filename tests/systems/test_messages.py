@@ -5,7 +5,13 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from splatpilot.systems.messages import FieldError, did_you_mean, require, require_field, unknown
+from splatpilot.systems.common.messages import (
+    FieldError,
+    did_you_mean,
+    require,
+    require_field,
+    unknown,
+)
 
 
 @dataclass

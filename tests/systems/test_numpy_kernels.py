@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.numpy_kernels import KERNELS
+from splatpilot.systems.common.numpy_kernels import KERNELS
 
 
 @pytest.mark.skipif(
@@ -19,7 +19,7 @@ def test_numpy_takes_these_kernels_if_it_comes_second(imported, fixed):
     and the environment says; imported before, as it would without."""
     script = (
         f"import {imported}\n"
-        "from splatpilot.systems.numpy_kernels import fix_numpy_kernels\n"
+        "from splatpilot.systems.common.numpy_kernels import fix_numpy_kernels\n"
         "from numpy._core._multiarray_umath import __cpu_features__ as features\n"
         "print(fix_numpy_kernels(), features.get('X86_V4', features['AVX512F']))\n"
     )

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from splatpilot.systems.opengl import require_opengl
+from splatpilot.systems.common.extras import require_opengl
 
 CAMERA = """
 from pydrake.geometry import *
@@ -15,15 +15,15 @@ core = RenderCameraCore("", CameraInfo(8, 8, 1.0), ClippingRange(0.1, 1), RigidT
 camera = ColorRenderCamera(core)
 """
 MESHES = """
-from splatpilot.systems.opengl import require_opengl
+from splatpilot.systems.common.extras import require_opengl
 require_opengl()
 engine = MakeRenderEngineVtk(RenderEngineVtkParams())
 """
 SPLATS = """
 import numpy as np
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.render_engine import SplatRenderEngine
 rows = [np.ones(shape, np.float32) for shape in ((1, 3), (1, 4), (1, 3), (1,), (1, 1, 3))]
 engine = SplatRenderEngine(BakedScene(GaussianScene(*rows)))
 """

@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.output_folders import claim_folder, held_folder, holds_folder
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.files import claim_folder, held_folder, holds_folder
 
 
 def test_a_folder_is_of_one_configuration(tmp_path):
@@ -35,7 +35,7 @@ def test_second_process_learns_who_holds_a_folder(tmp_path):
     """A folder is one process's at a time; another is told which, and a kill sets it free."""
     holding = (
         "import sys, time; from pathlib import Path\n"
-        "from splatpilot.systems.output_folders import held_folder\n"
+        "from splatpilot.systems.common.files import held_folder\n"
         "with held_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
     )
     folder = tmp_path / "out" / "folder"

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from splatpilot.systems.ply_files import read_ply_file
-from splatpilot.systems.read_limit import LIMIT
+from splatpilot.systems.common.readers import LIMIT, read_ply_file
 
 
 @pytest.mark.parametrize("text", [False, True])

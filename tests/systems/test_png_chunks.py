@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.systems.png_chunks import require_whole_chunks
+from splatpilot.systems.common.readers import require_whole_chunks
 
 
 def test_claims_of_chunks():

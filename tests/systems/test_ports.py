@@ -5,29 +5,25 @@ import pytest
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import InputPort, OutputPort, System
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import HalfSpace
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy
 from splatpilot.systems.policies.depthnav import DepthNav
 from splatpilot.systems.policies.diffaero import DiffAero
-from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
-from splatpilot.systems.policies.privileged_planner import PrivilegedPlanner
+from splatpilot.systems.policies.hypotheses import HypothesisSelector
+from splatpilot.systems.policies.planner import PrivilegedPlanner
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.policies.straight import Straight
-from splatpilot.systems.policies.velocity_tracker import VelocityTracker
-from splatpilot.systems.sensing.color_noise import ColorNoise
-from splatpilot.systems.sensing.delayed_pose import DelayedPose
-from splatpilot.systems.sensing.depth_noise import DepthNoise
-from splatpilot.systems.sensing.frame_times import FrameTimes
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.policies.velocity import VelocityTracker
+from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.noise import ColorNoise, DepthNoise, ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.flatness_controller import FlatnessController
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
-from splatpilot.systems.vehicle.state_to_pose import StateToPose
-from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
-from splatpilot.systems.visualization.video_recorder import VideoRecorder
+from splatpilot.systems.vehicle.flatness import FlatnessController
+from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
+from splatpilot.systems.vehicle.state import StateToPose
+from splatpilot.systems.visualization.meshcat_drawing import FlightVisualizer
+from splatpilot.systems.visualization.video import VideoRecorder
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.pose_between import pose_between
+from splatpilot.systems.vehicle.state import pose_between
 
 
 def test_poses_between():

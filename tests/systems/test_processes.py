@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.processes import map_processes, run_apart
+from splatpilot.systems.common.processes import map_processes, run_apart
 
 
 def _square(number: int) -> tuple[int, int]:
@@ -67,7 +67,7 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import os, pathlib, time\n"
-        "from splatpilot.systems.processes import map_processes\n"
+        "from splatpilot.systems.common.processes import map_processes\n"
         "def work(seconds):\n"
         f"    (pathlib.Path({str(tmp_path)!r}) / f'{{os.getpid()}}.worker').touch()\n"
         "    time.sleep(seconds)\n"

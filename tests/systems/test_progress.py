@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from splatpilot.systems.progress import CheckpointClock, Progress, resumable, say
+from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable, say
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_work_that_may_be_over_at_once_waits_to_be_shown(clock, capsys):
 @pytest.mark.parametrize("columns", [0, 40, 100])
 def test_bars_fit_their_terminal(columns):
     script = (
-        "import time; from splatpilot.systems.progress import Progress\n"
+        "import time; from splatpilot.systems.common.progress import Progress\n"
         "for _ in Progress(range(3), 'training a policy', unit='update'): time.sleep(0.12)\n"
     )
     ours, theirs = os.openpty()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems import provenance
+from splatpilot.systems.common import provenance
 
 VERSION = importlib.metadata.version("splatpilot")
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from splatpilot.systems.registry import Registry, check_name, import_modules
+from splatpilot.systems.common.registry import Registry, check_name, import_modules
 
 
 @dataclass(frozen=True)

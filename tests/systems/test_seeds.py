@@ -4,7 +4,7 @@ from itertools import combinations
 
 import pytest
 
-from splatpilot.systems.seeds import (
+from splatpilot.systems.common.seeds import (
     MONTE_CARLO_SEEDS,
     SEEDS_PER_RUN,
     STUDY_SEEDS,

@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from splatpilot.training.device import require_device, require_renderer
+from splatpilot.systems.common.torch_device import require_device, require_renderer
 
 
 def test_what_is_there_is_accepted():
@@ -44,7 +44,7 @@ def test_other_words_are_refused():
 PASSES = """
 import resource
 import torch
-from splatpilot.training.device import keep_freed_memory
+from splatpilot.systems.common.torch_device import keep_freed_memory
 
 torch.set_num_threads(1)
 layer = torch.nn.Conv2d(3, 96, 1)

@@ -1,6 +1,6 @@
 import pytest
 
-from splatpilot.training.event_log import event_log
+from splatpilot.training.reconstruction.checkpoint import event_log
 
 
 def test_event_log_writes_what_tensorboard_reads(tmp_path):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from splatpilot.training.tensor_files import save_tensors
+from splatpilot.training.reconstruction.checkpoint import save_tensors
 
 
 def test_tensors_come_back(tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpilot.systems.configuration import load_config
+from splatpilot.systems.common.config import load_config
 
 CONFIG_FILE = "capture.yaml"
 """Name of the file in a capture's folder that may hold its `CaptureConfig`."""
@@ -62,7 +62,8 @@ class CaptureConfig:
     """What a capture's files leave open; empty and zero fields take what its kind usually has."""
 
     kind: str = ""
-    """A name in `splatpilot.training.captures.read_capture.CAPTURES`, or `module:attribute` of a
+    """A name in `splatpilot.training.captures.capture_registry.CAPTURES`, or `module:attribute` of
+    a
     `CaptureKind`; empty: told from the files."""
     intrinsics: list[float] = field(default_factory=list)
     """fx, fy, cx, cy [px] of the colour camera."""

@@ -11,24 +11,32 @@ Whether lengths are metres the file does not say: they are taken to be if there 
 import dataclasses
 import json
 from collections.abc import Callable
-from os.path import isfile  # false, too, of names that no file system takes
+from os.path import isfile
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.array_files import reason_of
-from splatpilot.systems.ply_files import read_ply_file
-from splatpilot.systems.read_limit import read_text
-from splatpilot.training.captures.capture import OPENGL_AXES, Capture, SfmPoints
+from splatpilot.systems.common.readers import read_ply_file, read_text, reason_of
+from splatpilot.training.captures.capture import (
+    OPENGL_AXES,
+    Capture,
+    Lens,
+    SfmPoints,
+    fisheye_lens,
+    pinhole,
+    polynomial_lens,
+)
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frame_files import FrameFiles, open_frames
-from splatpilot.training.captures.image_files import image_size, read_depth
-from splatpilot.training.captures.lens import Lens, fisheye_lens, pinhole, polynomial_lens
-from splatpilot.training.captures.metric_scale import make_metric
-from splatpilot.training.captures.poses import pose_from_matrix
-from splatpilot.training.captures.upright import turn_upright
+from splatpilot.training.captures.frames import (
+    FrameFiles,
+    image_size,
+    open_frames,
+    pose_from_matrix,
+    read_depth,
+)
+from splatpilot.training.captures.up_and_scale import make_metric, turn_upright
 
 TRANSFORMS = "transforms.json"
 

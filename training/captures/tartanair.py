@@ -16,16 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
-from splatpilot.training.captures.capture import Capture, FileAxes
+from splatpilot.training.captures.capture import Capture, FileAxes, Lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frame_files import FrameFiles, open_frames
-from splatpilot.training.captures.image_files import (
+from splatpilot.training.captures.frames import (
+    FrameFiles,
     numbered_files,
+    open_frames,
+    pose_from_quaternion,
     read_depth,
     read_packed_depth,
+    read_rows,
 )
-from splatpilot.training.captures.lens import Lens, pinhole
-from splatpilot.training.captures.poses import pose_from_quaternion, read_rows
 
 AXES = FileAxes(
     "north-east-down: camera looks along x, y right, z down",

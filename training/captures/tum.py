@@ -17,15 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.pose_between import pose_between
-from splatpilot.systems.read_limit import read_text
-from splatpilot.training.captures.capture import OPTICAL_AXES, Capture
+from splatpilot.systems.common.readers import read_text
+from splatpilot.systems.vehicle.state import pose_between
+from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, Lens, opencv_lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frame_files import FrameFiles, open_frames
-from splatpilot.training.captures.image_files import read_depth
-from splatpilot.training.captures.lens import Lens, opencv_lens, pinhole
-from splatpilot.training.captures.poses import pose_from_quaternion, read_rows
-from splatpilot.training.captures.upright import turn_upright
+from splatpilot.training.captures.frames import (
+    FrameFiles,
+    open_frames,
+    pose_from_quaternion,
+    read_depth,
+    read_rows,
+)
+from splatpilot.training.captures.up_and_scale import turn_upright
 
 _MAX_APART = 0.02
 """[s] between a colour image and its depth, as the data set's own tools have it."""

@@ -2,23 +2,77 @@
 
 corpus.yaml      how it is gathered, every field
 worlds/NAME/     a world: `world.yaml`, `esdf.npz`
-shards/NAME/     samples of one world, see `splatpilot.training.corpus.shard`
+shards/NAME/     samples of one world, see `splatpilot.training.corpus.samples`
 ledger.csv       where everything comes from, a row for each flight
 """
 
 import csv
+import os
+import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.environment import require_corpus
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.sample import OFF_PATH, Samples
-from splatpilot.training.corpus.shard import Shard
-from splatpilot.training.corpus.world_record import WorldRecord
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.files import (
+    folder_written_atomically,
+    require_corpus,
+    written_atomically,
+)
+from splatpilot.systems.common.seeds import first_training_seed
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus.expert import ExpertConfig
+from splatpilot.training.corpus.library import LibraryConfig, PerturbationConfig, WorldRecord
+from splatpilot.training.corpus.samples import OFF_PATH, SOURCES, Samples, SampleSize, Shard
+
+
+@dataclass
+class CorpusConfig:
+    """Everything that decides what is gathered, but in how many worlds."""
+
+    # Seed of everything random, 0 to 999.
+    seed: int = 0
+    worlds: LibraryConfig = field(default_factory=LibraryConfig)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    # [-] Flights of the expert in each world, all to its goal: the first from its start, the others
+    # from anywhere at least half as far away.
+    flights: int = 16
+    # [-] States in each world that lie on no flight: anywhere in free space, half of them before a
+    # surface; see `training/corpus/collect.py`.
+    off_path: int = 0
+    # What the student will see through.
+    camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(width=160, height=120))
+    perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
+    # [-] How much the look of a world changes from flight to flight: 0 not at all, 1 all it may.
+    appearance: float = 1.0
+
+    def validate(self) -> None:
+        """
+        Raises:
+            FileNotFoundError: for a scene that is not there.
+            ValueError: on a value out of range, naming it, its limit and the remedy.
+        """
+        first_training_seed(self.seed)
+        self.worlds.validate()
+        self.expert.validate()
+        if not 1 <= self.flights <= 1000:
+            raise ValueError(f"flights is {self.flights}; it must be 1 to 1000")
+        if not 0 <= self.off_path <= 100_000:
+            raise ValueError(f"off_path is {self.off_path}; it must be 0 to 100000")
+        self.camera.validate()
+        self.perturbation.validate()
+        if not 0.0 <= self.appearance <= 1.0:
+            raise ValueError(f"appearance is {self.appearance}; it must be 0 to 1")
+
+    @property
+    def size(self) -> SampleSize:
+        """Of the samples."""
+        return SampleSize(self.camera.height, self.camera.width, self.expert.num_hypotheses)
+
 
 CONFIG = "corpus.yaml"
 LEDGER = "ledger.csv"
@@ -152,3 +206,64 @@ def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
                 seen.add(what)
                 kept[-1].append(shard)
     return kept
+
+
+def write_ledger(folder: Path, corpus: Corpus) -> None:
+    """Writes `ledger.csv` anew, from what the shards say.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    rows: list[dict[str, Any]] = []
+    for shard in corpus.shards:
+        same = {
+            "shard": shard.path.name,
+            "world": shard.world,
+            "source": SOURCES[shard.source],
+            "revision": shard.revision,
+        }
+        rows += [same | flight for flight in shard.flights]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with written_atomically(folder / LEDGER) as path, path.open("w", newline="") as file:
+        table = csv.DictWriter(file, columns, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+_PARTS = ("worlds", "world.yaml"), ("shards", "shard.json")  # and what tells one from others
+
+
+def link_corpus(source: Path, folder: Path) -> None:
+    """Makes `folder` a corpus of what `source` has, and of what was added to it; what `folder`
+    lacks of the former is brought there again.
+
+    Raises:
+        ValueError: if it holds others of the same name: what `source` has was gathered anew.
+        OSError: if it cannot be written.
+    """
+    for kind, about in _PARTS:
+        for there in entries(source / kind):
+            target = folder / kind / there.name
+            if not target.exists():
+                _link_folder(there, target)
+            elif (target / about).read_bytes() != (there / about).read_bytes():
+                raise ValueError(
+                    f"{there} is another than when {target} was made of it; choose another --out"
+                )
+    if not (folder / CONFIG).exists():
+        _link(source / CONFIG, folder / CONFIG)
+
+
+def _link_folder(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with folder_written_atomically(target) as partial_folder:
+        for file in source.iterdir():
+            _link(file, partial_folder / file.name)
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # on another disk
+        with written_atomically(target) as path:
+            shutil.copyfile(source, path)

@@ -7,21 +7,23 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness_controller import FlatnessControllerConfig
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.delayed_vehicle import (
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.training.policies.ray_casting import Geometry, PixelRays
+from splatpilot.training.policies.torch_observations import Observation, noisy_depth
+from splatpilot.training.policies.training_worlds import WorldBatch
+from splatpilot.training.policies.vehicles import (
+    BodyRate,
     Frames,
+    PointMass,
+    Vehicle,
     delayed,
     draw_frames,
     frame_ages,
     remember,
     remembered,
 )
-from splatpilot.training.policies.observation import Observation, noisy_depth
-from splatpilot.training.policies.ray_casting import Geometry, PixelRays
-from splatpilot.training.policies.vehicles import BodyRate, PointMass, Vehicle
-from splatpilot.training.policies.world_batch import WorldBatch
 
 CAMERA_AHEAD = 0.1
 """[m], of the camera before the vehicle's centre, along body x."""

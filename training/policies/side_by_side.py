@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatpilot.systems.processes import map_processes
+from splatpilot.systems.common.processes import map_processes
 from splatpilot.training.policies import train
-from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.trainer import TrainingConfig
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 
 @dataclass(frozen=True)

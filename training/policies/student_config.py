@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from splatpilot.systems.seeds import check_seed
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.training.policies.observation import validate_training_noise
+from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.student_images import Appearance
 from splatpilot.training.policies.student_network import IMAGE_MODULES
+from splatpilot.training.policies.torch_observations import validate_training_noise
 from splatpilot.training.policies.trainer import Schedule
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.diagrams.worlds.scene import SceneSource
+from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
+from splatpilot.systems.vehicle.flatness import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
-from splatpilot.training.corpus.sample import RECOVERY
+from splatpilot.training.corpus.library import require_untested
+from splatpilot.training.corpus.samples import RECOVERY
 from splatpilot.training.policies.ray_casting import EsdfGeometry
-from splatpilot.training.world_kinds import require_untested
 
 _PARTS = 1 << 20
 """[-] That a chance is counted in."""

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.array_files import reason_of
-from splatpilot.systems.files import require_writable_folder, written_atomically
-from splatpilot.systems.progress import Progress, say
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.training.corpus.shard import Shard
+from splatpilot.systems.common.files import require_writable_folder, written_atomically
+from splatpilot.systems.common.progress import Progress, say
+from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.training.corpus.samples import Shard
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import (
     Appearance,

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.sensing.observation_noise import ObservationNoise, turned_hue
-from splatpilot.training.policies.observation import noisy_color, noisy_depth
+from splatpilot.systems.sensing.noise import ObservationNoise, turned_hue
 from splatpilot.training.policies.student_network import encode_color, encode_depth
+from splatpilot.training.policies.torch_observations import noisy_color, noisy_depth
 
 
 @dataclass

@@ -2,13 +2,53 @@
 
 import hashlib
 import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from splatpilot.systems.common.extras import import_extra
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.readers import reason_of
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
-from splatpilot.training.tensor_files import load_tensors, save_tensors
+
+
+def save_tensors(content: dict[str, Any], path: Path) -> None:
+    """Writes what `torch.load` reads with `weights_only`, whole or not at all.
+
+    Raises:
+        OSError: if it cannot be written; what was there before is kept.
+    """
+    with written_atomically(path) as partial:
+        try:
+            torch.save(content, partial)
+        except RuntimeError as error:  # so torch says that the disk is full
+            raise OSError(f"perhaps the disk is full: {reason_of(error)}") from error
+
+
+def load_tensors(path: Path) -> Any:
+    """Reads what `save_tensors` wrote.
+
+    Raises:
+        OSError, ValueError: if it cannot be read, or is not what was written: torch takes numbers
+            for what they are, without a look at the checksums that are there.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"its part {damaged} is damaged")
+        return torch.load(path, weights_only=True)
+    except (OSError, ValueError):
+        raise
+    except Exception as error:  # of a damaged file, zipfile and the unpickler may raise anything
+        raise ValueError(reason_of(error)) from None
+
 
 VERSION = 2
 _REMEDY = "start anew with --restart, which discards it"
@@ -131,3 +171,24 @@ def _read(file: Path, config: dict[str, Any]) -> dict[str, Any] | None:
                 f"set it so to go on; or {_REMEDY}"
             )
     return content
+
+
+@contextmanager
+def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
+    """Yields a function that logs numbers of a step for tensorboard; it does nothing without a
+    folder.
+
+    Raises:
+        ModuleNotFoundError: tensorboard is wanted and not installed.
+    """
+    if not folder:
+        yield lambda step, figures: None
+        return
+    tensorboard = import_extra("torch.utils.tensorboard", "tensorboard")
+    with tensorboard.SummaryWriter(folder) as writer:
+
+        def log(step: int, figures: dict[str, float]) -> None:
+            for name, value in figures.items():
+                writer.add_scalar(name, value, step)
+
+        yield log

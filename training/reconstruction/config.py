@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.scene_metadata import REPRESENTATIONS
+from splatpilot.diagrams.worlds.scene_folder import REPRESENTATIONS
 from splatpilot.diagrams.worlds.splits import SPLITS
-from splatpilot.systems.cores import available_cores
-from splatpilot.systems.seeds import check_seed
+from splatpilot.systems.common.processes import available_cores
+from splatpilot.systems.common.seeds import check_seed
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 INITIALIZATIONS = ("auto", "depth", "points", "random")

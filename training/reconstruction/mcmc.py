@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.parameters import SplatParameters
 from splatpilot.training.reconstruction.quaternions import rotate
-from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import Rendering
 
 # Most Gaussians that one may become.

@@ -7,24 +7,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.frontier import close_frontier
-from splatpilot.diagrams.worlds.scene_folder import check_scene_target, write_scene_folder
+from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal, short_route_warning
+from splatpilot.diagrams.worlds.scene_folder import (
+    check_scene_target,
+    close_frontier,
+    write_scene_folder,
+)
 from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source_digest
-from splatpilot.diagrams.worlds.start_and_goal import choose_start_and_goal, short_route_warning
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.progress import Progress
-from splatpilot.systems.torch_threads import one_torch_thread
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.render_capture import RECIPE, rendered_world
-from splatpilot.training.captures.shrink_frame import shrink_factor
+from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.torch_device import one_torch_thread
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.training.captures.capture import Capture, shrink_factor
+from splatpilot.training.captures.render import RECIPE, rendered_world
 from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_same_run
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.environment import learn_background
-from splatpilot.training.reconstruction.initialization import (
+from splatpilot.training.reconstruction.distance_field import FieldDifference, make_distance_field
+from splatpilot.training.reconstruction.initialize import (
     detail_of,
     gaussians_from_depth,
     held_out_frames,
@@ -32,15 +34,18 @@ from splatpilot.training.reconstruction.initialization import (
     resolve_config,
 )
 from splatpilot.training.reconstruction.lpips import Lpips
-from splatpilot.training.reconstruction.measures import HeldOutMeasures
+from splatpilot.training.reconstruction.metrics import HeldOutMeasures
 from splatpilot.training.reconstruction.optimize import Optimization
-from splatpilot.training.reconstruction.overlap import ThinnedFrame
-from splatpilot.training.reconstruction.photometry import Photometry, estimate_photometry
-from splatpilot.training.reconstruction.scene_distance_field import (
-    FieldDifference,
-    make_distance_field,
+from splatpilot.training.reconstruction.photometry import (
+    Photometry,
+    ThinnedFrame,
+    estimate_photometry,
 )
-from splatpilot.training.reconstruction.views import ReconstructionViews, ShrunkFrames
+from splatpilot.training.reconstruction.views import (
+    ReconstructionViews,
+    ShrunkFrames,
+    learn_background,
+)
 
 _NAMED = 10
 """Of frames that lack something, how many are named."""

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from splatpilot._native import Renderer
 from splatpilot.systems.splats.rasterization import EPS2D, rasterize
-from splatpilot.systems.splats.spherical_harmonics import degree_of
-from splatpilot.systems.splats.surfels import rasterize_surfels
+from splatpilot.systems.splats.scene import degree_of
+from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.fittings import CLEARING, INSET
-from splatpilot.diagrams.worlds.forest import ground, surroundings, trees
-from splatpilot.diagrams.worlds.forest.config import ForestConfig, TrunksConfig
-from splatpilot.diagrams.worlds.forest.layout import MARGIN, lay_out
-from splatpilot.diagrams.worlds.forest.light import ForestLight
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.light import Daylight
+from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET
+from splatpilot.diagrams.worlds.forest import scenery as ground
+from splatpilot.diagrams.worlds.forest import scenery as surroundings
+from splatpilot.diagrams.worlds.forest import scenery as trees
+from splatpilot.diagrams.worlds.forest.layout import MARGIN, ForestConfig, TrunksConfig, lay_out
+from splatpilot.diagrams.worlds.forest.scenery import ForestLight
+from splatpilot.diagrams.worlds.solids.shading import Daylight
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
 from splatpilot.diagrams.worlds.solids.surfaces import merge
-from splatpilot.systems.seeds import check_seed
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 def forest_blueprint(config: ForestConfig, seed: int) -> Blueprint:

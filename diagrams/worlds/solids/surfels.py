@@ -3,11 +3,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.illumination import Illumination
-from splatpilot.diagrams.worlds.solids.light import shade
-from splatpilot.diagrams.worlds.solids.materials import MATERIALS, Marks
-from splatpilot.diagrams.worlds.solids.solid import Face, Solid, faces_of
+from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
+from splatpilot.diagrams.worlds.solids.solid import (
+    MATERIALS,
+    Blueprint,
+    Face,
+    Marks,
+    Solid,
+    faces_of,
+)
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     GROUND_REACH,
@@ -15,12 +19,14 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
     Surfels,
     ground_rings,
     inset,
+    merge,
     to_gaussians,
     widest,
 )
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import HalfSpace
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace
+from splatpilot.systems.splats.scene import GaussianScene
 
 Array = NDArray[np.float64]
 
@@ -198,3 +204,24 @@ def _is_seen(blueprint: Blueprint, surfels: Surfels) -> NDArray[np.bool_]:
     rows = np.flatnonzero(seen)
     seen[rows] = field.distance(surfels.p[rows]) > -_BURIED
     return seen
+
+
+def build(blueprint: Blueprint) -> World:
+    """Draws a blueprint's Gaussians and samples its distance grid."""
+    field = blueprint.distance_field
+    esdf = esdf_from_distance_field(field, blueprint.voxel_size)
+    light = blueprint.light(esdf)
+    if blueprint.gaussians is not None:
+        gaussians = blueprint.gaussians(light)
+    else:
+        solids = draw(blueprint, blueprint.solids, light)
+        gaussians = merge([solids, *blueprint.surroundings()])
+    return World(
+        name=blueprint.name,
+        gaussians=gaussians,
+        distance_field=field,
+        esdf=esdf,
+        background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),
+        p_WS=blueprint.p_WS,
+        p_WG=blueprint.p_WG,
+    )

@@ -7,11 +7,9 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot import Capture, register_capture
-from splatpilot.training.captures.capture import FileAxes
+from splatpilot.training.captures.capture import FileAxes, Lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frame_files import FrameFiles, open_frames
-from splatpilot.training.captures.lens import Lens, pinhole
-from splatpilot.training.captures.poses import pose_from_quaternion
+from splatpilot.training.captures.frames import FrameFiles, open_frames, pose_from_quaternion
 
 LOG = "flight_log.csv"
 COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")

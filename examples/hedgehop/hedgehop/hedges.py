@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatpilot import register_world
+from splatpilot.diagrams.worlds.building_blocks import box, daylight, ground, start_and_goal
 from splatpilot.diagrams.worlds.feasibility import draw_feasible
-from splatpilot.diagrams.worlds.fittings import box, daylight, ground, start_and_goal
-from splatpilot.diagrams.worlds.plot import Plot
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.surfaces import Plot
 
 
 @dataclass

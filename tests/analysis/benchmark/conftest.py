@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.study import StudyConfig
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.external import (
     DODGEDRONE,
     DODGEDRONE_SPEEDS,
@@ -11,8 +11,8 @@ from splatpilot.analysis.benchmark.external import (
     format_external,
 )
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.policies import BENCHMARK_POLICIES, policy_named
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, policy_named
 
 CONFIG = StudyConfig(
     scenarios=["P01", "dodgedrone_medium"], policies=["straight"], speeds=[2.0, 3.0], seeds=2

@@ -5,17 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark.flight_measures import (
-    flight_measures,
-    jerk_measures,
-    shortest_length,
-)
-from splatpilot.diagrams.flight import Flight, Outcome
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.analysis.benchmark.rollout import flight_measures, jerk_measures, shortest_length
+from splatpilot.diagrams.flight.flight import Flight, Outcome
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Cylinder
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder
 from splatpilot.systems.policies.time_of_arrival import way_lengths
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def straight_flight(outcome=Outcome.GOAL, clearance=0.5) -> Flight:

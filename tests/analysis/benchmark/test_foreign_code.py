@@ -5,10 +5,10 @@ import sys
 import pytest
 import yaml
 
-from splatpilot.analysis.benchmark.foreign_code import foreign_code
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.policies import POLICIES
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.analysis.benchmark.study_folder import foreign_code
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.policies import POLICIES
+from splatpilot.diagrams.flight.scenario import Scenario
 
 POLICY = """
 from dataclasses import dataclass

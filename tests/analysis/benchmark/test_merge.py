@@ -10,10 +10,10 @@ from dataclasses import replace
 import pytest
 
 from splatpilot.analysis.benchmark import merge
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +60,7 @@ def test_killed_shard_is_refused_until_it_is_finished(study, shards, tmp_path, c
     """
     config, whole = study
     killed = tmp_path / "killed"
-    command = [sys.executable, "-c", "from splatpilot.analysis.cli import main; main()"]
+    command = [sys.executable, "-c", "from splatpilot.analysis.commands.main import main; main()"]
     command += ["benchmark", "--scenarios", config.scenarios[0], "--seeds", "3", "--jobs", "1"]
     command += ["--policies", ",".join(config.policies), "--shard", "1/2", "--out", str(killed)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -9,7 +9,7 @@ import yaml
 
 from splatpilot.analysis.benchmark import replay
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 
 
 def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.study import StudyConfig
 
 

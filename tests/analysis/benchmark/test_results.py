@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.analysis.benchmark.statistics import Interval
+from splatpilot.analysis.benchmark.tables import Interval
 
 SCRIPT = Path(__file__).parents[3] / "docs" / "results.py"
 PAGE = "Before.\n<!-- table {} small -->\nan older table\n<!-- end of table -->\nAfter.\n"

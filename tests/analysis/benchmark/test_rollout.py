@@ -6,18 +6,17 @@ from dataclasses import dataclass, replace
 import pytest
 
 from splatpilot.analysis.benchmark import replay, rollout
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.rollout import Fault
+from splatpilot.analysis.benchmark.run_study import fly_all
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import keep_inputs, kept_flights
-from splatpilot.analysis.benchmark.workers import fly_all
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.forest.config import ForestConfig
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.analysis.benchmark.study_folder import StudyFolder, keep_inputs, kept_flights
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.layout import ForestConfig
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.straight import Straight
 
 

@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import policy_table
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 
 
 def test_study_leaves_what_it_promises(study, rows_of):
@@ -51,7 +51,7 @@ def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_pat
     command = [
         sys.executable,
         "-c",
-        "from splatpilot.analysis.cli import main; main()",
+        "from splatpilot.analysis.commands.main import main; main()",
         "benchmark",
     ]
     command += ["--scenarios", config.scenarios[0], "--policies", ",".join(config.policies)]
@@ -245,6 +245,6 @@ def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(study, 
 def test_cluster_that_is_not_there_is_named(study, tmp_path, monkeypatch):
     """An address nobody answers at is named with what to start."""
     config, _ = study
-    monkeypatch.setattr("splatpilot.analysis.benchmark.workers.CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr("splatpilot.analysis.benchmark.run_study.CONNECT_TIMEOUT", 0.5)
     with pytest.raises(OSError, match=r"tcp://127.0.0.1:1 .*dask worker"):
         benchmark.run(config=config, out=tmp_path / "out", cluster="tcp://127.0.0.1:1")

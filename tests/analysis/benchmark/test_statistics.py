@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from splatpilot.analysis.benchmark.statistics import (
+from splatpilot.analysis.benchmark.tables import (
     cluster_interval,
     holm,
     mcnemar,

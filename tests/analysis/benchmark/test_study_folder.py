@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.systems.provenance import program
+from splatpilot.systems.common.provenance import program
 
 
 @pytest.mark.parametrize("row", [[1, 2], 3, {}, {"success": True, "outcome": "goal"}])
@@ -57,7 +57,7 @@ def test_study_that_was_killed_before_it_began_is_begun(study, tmp_path, content
     out = tmp_path / "killed"
     begun = (
         "import os, signal, sys; from pathlib import Path\n"
-        "from splatpilot.systems.files import written_atomically\n"
+        "from splatpilot.systems.common.files import written_atomically\n"
         "with written_atomically(Path(sys.argv[1])) as file:\n"
         "    file.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
     )

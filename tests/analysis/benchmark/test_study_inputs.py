@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis.benchmark import replay
-from splatpilot.analysis.benchmark import run as benchmark
+from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.study_inputs import (
+from splatpilot.analysis.benchmark.study_folder import (
+    StudyFolder,
     input_digests,
     keep_inputs,
     kept_flights,
     kept_scenario,
 )
-from splatpilot.analysis.cli import main
-from splatpilot.systems.policies import policy_checkpoint
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.analysis.commands.main import main
+from splatpilot.systems.policies import checkpoint as policy_checkpoint
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 
 
 def test_weights_of_ones_own_fly_in_a_study_that_keeps_them(short_scenario, tmp_path, rows_of):

@@ -2,15 +2,10 @@
 
 import pytest
 
-from splatpilot.analysis.benchmark.variants import (
-    Variant,
-    parse_variant,
-    split_policies,
-    sweep,
-)
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.reactive_planner import ReactiveConfig
+from splatpilot.analysis.benchmark.study import Variant, parse_variant, split_policies, sweep
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
+from splatpilot.systems.policies.reactive import ReactiveConfig
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 
 RENDER = "got a mesh; render a capture of it with `splatpilot capture render room.gltf"
 
@@ -46,7 +46,7 @@ def test_another_kind_of_file_is_named_with_what_to_do_with_it(
 def test_a_missing_corpus_is_told_before_torch_is_imported(words, corpus, tmp_path):
     (tmp_path / "there" / "shards").mkdir(parents=True)
     script = (
-        "import sys; from splatpilot.analysis.cli import main\n"
+        "import sys; from splatpilot.analysis.commands.main import main\n"
         f"status = main({[*words, '--out', 'trained']!r})\n"
         "sys.exit(99 if 'torch' in sys.modules else status)"
     )

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams import fly
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight import fly
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.straight import Straight
 
 SHORT = ["--set", "world.length=10", "--set", "world.width=6", "--set", "timeout=0.5"]

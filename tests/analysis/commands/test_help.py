@@ -9,13 +9,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from splatpilot.analysis.cli import build_parser, main
-from splatpilot.analysis.commands.checks import POLICIES, TRAINERS
-from splatpilot.analysis.commands.overrides import SetField
-from splatpilot.analysis.commands.verb import EXAMPLES
-from splatpilot.diagrams import policies
-from splatpilot.systems.configuration import load_config
-from splatpilot.training.policies import registry
+from splatpilot.analysis.commands.main import build_parser, main
+from splatpilot.analysis.commands.options import EXAMPLES, POLICIES, TRAINERS, SetField
+from splatpilot.diagrams.flight import policies
+from splatpilot.systems.common.config import load_config
+from splatpilot.training.policies import trainer_registry as registry
 
 
 def verbs_of(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -107,6 +105,6 @@ def test_shells_complete_words(line, completions, tmp_path):
         "COMP_LINE": line,
         "COMP_POINT": str(len(line)),
     }
-    script = "from splatpilot.analysis.cli import main; main()"
+    script = "from splatpilot.analysis.commands.main import main; main()"
     subprocess.run([sys.executable, "-c", script], env=environment, check=False)
     assert set(out.read_text().split("\n")) == completions

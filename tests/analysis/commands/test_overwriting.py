@@ -2,7 +2,7 @@
 
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 
 SHORT = ["--set", "world.length=10", "--set", "world.width=6"]
 

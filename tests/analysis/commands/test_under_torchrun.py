@@ -2,7 +2,7 @@
 
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 
 
 @pytest.mark.parametrize(

@@ -11,23 +11,29 @@ import numpy as np
 import pytest
 from drake import lcmt_header
 
-from splatpilot.analysis.cli import main
-from splatpilot.analysis.faults.fault import DELAY, KINDS, Fault, Trial
-from splatpilot.analysis.faults.relay import GridStream, Relay
-from splatpilot.analysis.faults.run import FaultsConfig, summarize
-from splatpilot.analysis.faults.trial import fly_trial
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.faults.campaign import FaultsConfig, summarize
+from splatpilot.analysis.faults.trial import (
+    DELAY,
+    KINDS,
+    Fault,
+    GridStream,
+    Relay,
+    Trial,
+    fly_trial,
+)
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.messaging.codecs import (
     CommandCodec,
     DepthGridCodec,
     MotionCaptureCodec,
     StateCodec,
 )
-from splatpilot.systems.vehicle.flight_limits import FlightLimits
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.messaging.flight_limits import FlightLimits
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
 class Line:

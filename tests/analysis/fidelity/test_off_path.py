@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.fidelity.off_path import choose_withheld, displace_pose, drop_frames
+from splatpilot.analysis.fidelity.study import choose_withheld, displace_pose, drop_frames
 
 
 def test_withheld_stretches():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.analysis.cli import main
-from splatpilot.analysis.fidelity import run as fidelity
-from splatpilot.analysis.fidelity.config import FidelityConfig
+from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.fidelity import fidelity as fidelity
+from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 from splatpilot.analysis.fidelity.study import FidelityStudy, Sample
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures.capture import CaptureFrame
 
@@ -173,7 +173,7 @@ def test_bad_settings(place, capsys, setting, message):
 
 def test_capture_without_depth(place, monkeypatch, capsys):
     """Without metric depth there is nothing to compare depth with."""
-    from splatpilot.training.captures import capture_of_scene
+    from splatpilot.training.captures import capture_registry as capture_of_scene
     from splatpilot.training.captures.capture import no_depth
 
     blind = replace(place.capture, load_depth=no_depth)

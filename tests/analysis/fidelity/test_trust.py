@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.analysis.fidelity.trust import band, first_crossing, monotone_fit, reach
+from splatpilot.analysis.fidelity.study import band, first_crossing, monotone_fit, reach
 
 
 def test_fit_pools_violators():

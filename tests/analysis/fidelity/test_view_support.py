@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.fidelity.view_support import ViewSupport
-from splatpilot.training.reconstruction.measures import SceneRenderer
+from splatpilot.analysis.fidelity.study import ViewSupport
+from splatpilot.training.reconstruction.metrics import SceneRenderer
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_the_other_way_nothing_was_seen(place, support):
 
 def test_what_stands_behind_something_is_not_seen(place):
     """A camera behind a pillar sees little of what one before it saw."""
-    from splatpilot.systems.splats.gaussian_scene import GaussianScene
+    from splatpilot.systems.splats.scene import GaussianScene
 
     y, z = (g.ravel() for g in np.meshgrid(np.arange(0, 3, 0.08), np.arange(0, 2.5, 0.08)))
     wall = GaussianScene.from_colors(

@@ -6,14 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction import ablation
-from splatpilot.analysis.reconstruction.ablation import arm_config
-from splatpilot.analysis.reconstruction.ablation_result import ARMS, AblationResult
+from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
 from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.measures import ViewMeasures
+from splatpilot.training.reconstruction.metrics import ViewMeasures
 
 SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=0.2")
 

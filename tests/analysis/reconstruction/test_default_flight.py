@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.analysis.reconstruction.default_flight import unseen_share
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
+from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures, unseen_share
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 def wall(x: float, lower_y: float, color: float) -> GaussianScene:

@@ -5,11 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.measure_scene import measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import read_measures
-from splatpilot.analysis.reconstruction.scene_views import SceneViews
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.analysis.reconstruction.scene_measures import SceneViews, read_measures
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 def with_curtain(gaussians: GaussianScene, x: float) -> GaussianScene:

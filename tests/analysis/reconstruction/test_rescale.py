@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.rescale import rescale, run
 from splatpilot.diagrams.worlds.scene_folder import (
     read_scene,
     read_scene_folder,
+    read_scene_metadata,
     write_scene_folder,
+    write_scene_metadata,
 )
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.training.captures.capture_of_scene import read_capture_of
+from splatpilot.training.captures.capture_registry import read_capture_of
 
 SHRUNK = 0.25
 """Units of the photographs' registration a metre."""

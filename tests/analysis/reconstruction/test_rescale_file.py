@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from splatpilot.analysis.cli import main
-from splatpilot.analysis.reconstruction.rescale import run
-from splatpilot.analysis.reconstruction.rescale_file import UP_AXES
+from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.reconstruction.rescale import UP_AXES, run
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
+from splatpilot.systems.splats.splat_files import read_ply, write_ply
 
 SHRUNK = 0.25
 """Units of the file a metre."""

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
+from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.run import run
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_of_scene import read_capture_of
+from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 SMALL = ReconstructConfig(

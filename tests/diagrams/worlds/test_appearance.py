@@ -12,11 +12,11 @@ from splatpilot.diagrams.worlds.appearance import (
     with_appearance,
 )
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 COUNT = 200
 ARRAYS = "means", "quats", "scales", "opacities", "sh"

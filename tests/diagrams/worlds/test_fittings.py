@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.fittings import check_size, hall, roof, signs_in, start_and_goal
-from splatpilot.diagrams.worlds.plot import Plot
-from splatpilot.diagrams.worlds.room import RoomConfig
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.diagrams.worlds.building_blocks import (
+    check_size,
+    hall,
+    roof,
+    signs_in,
+    start_and_goal,
+)
+from splatpilot.diagrams.worlds.indoor import RoomConfig
+from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.systems.collision.shapes import AnalyticDistanceField
 
 PLOT = Plot.of_size(12.0, 8.0, 4.0)
 

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.diagrams.flight import Outcome, flight_outcome
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds.frontier import close_frontier
+from splatpilot.diagrams.flight.flight import Outcome, flight_outcome
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.scene_folder import close_frontier
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.depth_fusion import esdf_from_depth_images
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_depth import esdf_from_depth_images
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.drake_images import ranged_depth
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import ranged_depth
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 SIZE = np.array([6.0, 4.0, 3.0])  # [m]
 K = np.array([[80.0, 0.0, 80.0], [0.0, 80.0, 60.0], [0.0, 0.0, 1.0]])

@@ -20,12 +20,10 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from splatpilot.diagrams.worlds.gltf import write_gltf
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.build import build
-from splatpilot.diagrams.worlds.solids.illumination import Sunlight
-from splatpilot.diagrams.worlds.solids.light import Daylight
-from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.diagrams.worlds.solids.shading import Daylight, Sunlight
+from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
+from splatpilot.diagrams.worlds.solids.surfels import build
+from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 80.0

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from splatpilot.diagrams.worlds import octomap_world as module
-from splatpilot.diagrams.worlds.make_world import place_config
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
-from splatpilot.diagrams.worlds.scene import SceneConfig
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig
+from splatpilot.diagrams.worlds.world_registry import place_config
 from splatpilot.systems.collision.octomap import Octomap
-from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.common.provenance import InfeasibleFlightError
 
 
 def hall(length: int, width: int) -> Octomap:

@@ -7,10 +7,10 @@ import pytest
 from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
-from splatpilot.diagrams.worlds.office import PARTITION, OfficeConfig, office_blueprint
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.diagrams.worlds.indoor import PARTITION, OfficeConfig, office_blueprint
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.systems.collision.shapes import AnalyticDistanceField
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 EMPTY = OfficeConfig(items=0)
 

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.plot import Plot
+from splatpilot.diagrams.worlds.solids.surfaces import Plot
 
 PLOT = Plot.of_size(6.0, 4.0, 3.0)
 

@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from splatpilot.diagrams.worlds.poisson_disk import poisson_disk
+from splatpilot.diagrams.worlds.building_blocks import poisson_disk
 
 LOWER, UPPER = np.array([-3.0, 2.0]), np.array([27.0, 14.0])
 

@@ -6,30 +6,30 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.worlds import branches, feasibility
-from splatpilot.diagrams.worlds.branches import BranchesConfig
-from splatpilot.diagrams.worlds.clutter import ClutterConfig
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds import feasibility
+from splatpilot.diagrams.worlds import outdoor as branches
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
+from splatpilot.diagrams.worlds.indoor import OfficeConfig, RoomConfig
 from splatpilot.diagrams.worlds.inserted import GAP, InsertedConfig
-from splatpilot.diagrams.worlds.make_world import make_blueprint, make_world
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, voxel_gaussians
-from splatpilot.diagrams.worlds.office import OfficeConfig
-from splatpilot.diagrams.worlds.over_under import OverUnderConfig
-from splatpilot.diagrams.worlds.room import RoomConfig
-from splatpilot.diagrams.worlds.scene import SceneConfig, find_scene
-from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.light import Daylight
-from splatpilot.diagrams.worlds.walls import WallsConfig
+from splatpilot.diagrams.worlds.outdoor import (
+    BranchesConfig,
+    ClutterConfig,
+    OverUnderConfig,
+    WallsConfig,
+)
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig, find_scene, write_scene_folder
+from splatpilot.diagrams.worlds.solids.shading import Daylight
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
-from splatpilot.systems.collision.shapes import Box, Capsule, HalfSpace
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, HalfSpace
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FILES = sorted((Path(__file__).parents[3] / "diagrams" / "scenarios").glob("*.yaml"))
 GENERATED = [file for file in FILES if file.stem.startswith("P")]

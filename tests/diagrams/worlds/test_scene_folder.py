@@ -8,15 +8,16 @@ from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
     read_scene,
     read_scene_folder,
+    read_scene_metadata,
     write_scene_folder,
+    write_scene_metadata,
 )
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import EnvironmentMap, mean_color
-from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_files import read_ply, write_ply
 
 
 def box_of_gaussians(size=(6.0, 3.0, 3.0), step=0.1) -> GaussianScene:

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.start_and_goal import (
+from splatpilot.diagrams.worlds.feasibility import (
     choose_start_and_goal,
     draw_start_and_goal,
     short_route_warning,
 )
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.infeasible import InfeasibleFlightError
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.policies.lattice import LatticeConfig
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.policies.trajectory_lattice import LatticeConfig
 
 RADIUS = 0.354
 

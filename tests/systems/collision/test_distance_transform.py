@@ -6,14 +6,13 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_transform import (
     distance_to_voxels,
     distances_from_band,
     occupancy_distances,
 )
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import Box, Capsule, Sphere
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Sphere
 
 SIZE = 64
 INDEX = np.stack(np.meshgrid(*[np.arange(SIZE) + 0.5] * 3, indexing="ij"), -1)

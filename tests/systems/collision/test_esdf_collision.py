@@ -8,12 +8,10 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.distance_field import FieldState, soft_barrier
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.collision.shapes import Sphere
-from splatpilot.systems.collision.soft_barrier import soft_barrier
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Sphere
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 SIZES = {
     "distance": 1,

@@ -8,14 +8,14 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.depth_fusion import DepthFusion
-from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.esdf_from_depth import (
+from splatpilot.systems.collision.depth_fusion import (
+    DepthFusion,
     bounds_of_depth_images,
     esdf_from_depth_images,
 )
+from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
     Box,
     Cylinder,
     HalfSpace,

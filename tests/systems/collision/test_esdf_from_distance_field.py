@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Cylinder, HalfSpace
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
 
 
 def test_values_at_the_voxel_centers_are_the_fields_own():

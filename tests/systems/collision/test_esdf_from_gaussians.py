@@ -6,8 +6,8 @@ from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.esdf_from_gaussians import density_on_grid, esdf_from_gaussians
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.collision.esdf_build import density_on_grid, esdf_from_gaussians
+from splatpilot.systems.splats.scene import GaussianScene
 
 VOXEL = 0.1
 

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.moving_balls import MovingBalls
-from splatpilot.systems.collision.shapes import Sphere
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingBalls, Sphere
 
 LOWER, UPPER = np.full(3, -5.0), np.full(3, 5.0)
 AWAY = np.full(3, np.inf)

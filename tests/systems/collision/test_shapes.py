@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial import KDTree
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
     Box,
     Capsule,
     Cylinder,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.collision.soft_barrier import in_collision, soft_barrier
+from splatpilot.systems.collision.distance_field import in_collision, soft_barrier
 
 
 def test_equation_three_at_hand_computed_values():

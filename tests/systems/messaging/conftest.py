@@ -5,9 +5,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import Codec
-from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
-from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.messaging.lcm_ports import MessageSubscriber
 
 EPOCH = 1_800_000_000.25  # [s]
 

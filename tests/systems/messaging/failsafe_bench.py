@@ -6,21 +6,17 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from splatpilot.systems.collision.distance_field import DistanceField
-from splatpilot.systems.messaging.failsafe import Failsafe
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
-from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME, tracking_acceleration
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessControllerConfig,
-    flatness_command,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import (
+from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
+from splatpilot.systems.policies.velocity import RESPONSE_TIME, tracking_acceleration
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, flatness_command
+from splatpilot.systems.vehicle.quadrotor import (
     GRAVITY,
     VEHICLE_RADIUS,
     QuadrotorParams,
     hover_state,
     rk4_step,
 )
-from splatpilot.systems.vehicle.state_prediction import predict_state
+from splatpilot.systems.vehicle.state import predict_state
 
 LOWER, UPPER = np.array([0.0, -5.0, 0.0]), np.array([20.0, 5.0, 6.0])
 HOVER = np.array([GRAVITY, 0.0, 0.0, 0.0])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from failsafe_bench import LOWER, UPPER, Bench
 
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
+from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.vehicle.flight_limits import FlightLimits
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 CONFIG = FailsafeConfig(patience=2.0)
 IN_CHARGE, NOT_IN_CHARGE = [1.0, 1.0], [1.0, 0.0]

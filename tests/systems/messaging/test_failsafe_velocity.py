@@ -9,19 +9,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import Box, Cylinder
-from splatpilot.systems.messaging import failsafe_checks
-from splatpilot.systems.messaging.failsafe_config import FailsafeConfig
-from splatpilot.systems.messaging.failsafe_modes import Memory
-from splatpilot.systems.messaging.failsafe_velocity import Motion, Surroundings, flown_setpoint
-from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.vehicle.flight_limits import (
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder
+from splatpilot.systems.messaging import failsafe as failsafe_checks
+from splatpilot.systems.messaging.failsafe import (
+    FailsafeConfig,
+    Memory,
+    Motion,
+    Surroundings,
+    flown_setpoint,
+)
+from splatpilot.systems.messaging.flight_limits import (
     RETURN_SPEED,
     FlightLimits,
     stopping_displacement,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 WIDE = np.full(3, -60.0), np.full(3, 60.0)
 WALL = AnalyticDistanceField([Box(RigidTransform([0.5, 0, 0]), np.array([1.0, 90, 90]))], *WIDE)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.messaging.finite_vector import FiniteVector
+from splatpilot.systems.messaging.failsafe import FiniteVector
 
 
 @pytest.mark.parametrize(

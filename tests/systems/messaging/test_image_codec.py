@@ -17,7 +17,7 @@ from pydrake.systems.sensors import (
     PixelType,
 )
 
-from splatpilot.systems.messaging.image_codec import ColorImageCodec, DepthImageCodec
+from splatpilot.systems.messaging.codecs import ColorImageCodec, DepthImageCodec
 
 
 def depth_image() -> ImageDepth32F:

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from drake import lcmt_header
 
+from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import CommandCodec
-from splatpilot.systems.messaging.message_log import recorded, replay
-from splatpilot.systems.messaging.open_lcm import open_lcm
-from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.messaging.lcm_ports import open_lcm, recorded, replay
 
 TOOLS = Path(lcm.LCM_BIN_DIR)  # The programs themselves: scripts would not pass a signal on.
 CHANNEL = CommandCodec.channel

@@ -7,13 +7,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
+from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import CommandCodec
 from splatpilot.systems.messaging.generated import lcmt_body_rate_command
-from splatpilot.systems.messaging.message_publisher import (
-    MeasurementPublisher,
-    MessagePublisher,
-)
-from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.messaging.lcm_ports import MeasurementPublisher, MessagePublisher
 
 EPOCH = 1_800_000_000.25  # [s]
 

@@ -9,7 +9,7 @@ import pytest
 from drake import lcmt_header
 
 from splatpilot.systems.messaging.codecs import CommandCodec, DepthGridCodec, StateCodec
-from splatpilot.systems.messaging.message_subscriber import MessageSubscriber
+from splatpilot.systems.messaging.lcm_ports import MessageSubscriber
 
 EPOCH = 1_800_000_000.25  # [s], that of the listener.
 

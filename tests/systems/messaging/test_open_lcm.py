@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from splatpilot.systems.messaging.open_lcm import open_lcm
+from splatpilot.systems.messaging.lcm_ports import open_lcm
 
 
 def test_opens(udp_url):

@@ -4,7 +4,7 @@ import copy
 import logging
 from dataclasses import dataclass, replace
 
-from splatpilot.systems.messaging.received import Received
+from splatpilot.systems.messaging.lcm_ports import Received
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

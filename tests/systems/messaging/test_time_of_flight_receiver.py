@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from splatpilot.systems.messaging.time_of_flight_receiver import (
+from splatpilot.systems.messaging.tof_receiver import (
     TimeOfFlightReceiver,
     TimeOfFlightStream,
+    UdpConfig,
 )
-from splatpilot.systems.messaging.udp_inbox import UdpConfig
 
 
 def packet(value: float, seq: int, time_ns: int) -> bytes:

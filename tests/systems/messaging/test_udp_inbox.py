@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
 
 
 def send(inbox: UdpInbox, data: bytes, sender: str) -> None:

@@ -1,6 +1,6 @@
 """Unix time in a Context."""
 
-from splatpilot.systems.messaging.unix_clock import UnixClock
+from splatpilot.systems.messaging.bridge_status import UnixClock
 
 
 def test_unix_time_is_the_epoch_and_the_contexts_time():

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.esdf_from_occupancy import esdf_from_occupancy
-from splatpilot.systems.collision.shapes import Box, Cylinder, HalfSpace
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
 
 VOXEL_SIZE = 0.2
 

@@ -9,20 +9,24 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
-from splatpilot.systems.policies import depthnav_inference as depthnav_policy
-from splatpilot.systems.policies import diffaero_inference as diffaero_policy
-from splatpilot.systems.policies import diffaero_tof_inference as tof_policy
+from splatpilot.systems.policies import depthnav as depthnav_policy
+from splatpilot.systems.policies import diffaero as diffaero_policy
+from splatpilot.systems.policies import diffaero as tof_policy
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
-from splatpilot.systems.policies.diffaero import DiffAero, DiffAeroConfig
-from splatpilot.systems.policies.diffaero_tof import DiffAeroTof, DiffAeroTofConfig
+from splatpilot.systems.policies.diffaero import (
+    DiffAero,
+    DiffAeroConfig,
+    DiffAeroTof,
+    DiffAeroTofConfig,
+)
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.observation import pool_depth
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.observations import pool_depth
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 SPECS = {
     "diffaero": diffaero_policy.DIFFAERO_NETWORK,
@@ -91,7 +95,9 @@ def test_recurrent_policy_decides_and_remembers_at_its_rate(name, files):
     a_WB, heading = np.zeros(3), np.nan
     for _ in range(3):
         if name == "diffaero":
-            a_WB, memory = diffaero_policy.decide(network, depth, X_WB, v_WB, P_WG, 1.7, memory)
+            a_WB, memory = diffaero_policy.decide_acceleration(
+                network, depth, X_WB, v_WB, P_WG, 1.7, memory
+            )
         else:
             a_WB, heading, memory = depthnav_policy.decide(
                 network, depth, X_WB, v_WB, P_WG, 1.7, 0.6, memory
@@ -118,7 +124,7 @@ def test_policy_of_time_of_flight_decides_and_remembers_at_its_rate(tmp_path):
     grid = np.random.default_rng(1).uniform(size=(9, 16))
     velocity, memory = np.zeros(3), network.initial_hidden()
     for _ in range(3):
-        velocity, memory = tof_policy.decide(
+        velocity, memory = tof_policy.decide_velocity(
             network, grid, pose_from_state(state()), state()[3:6], P_WG, 1.7, memory
         )
     for _ in range(2):

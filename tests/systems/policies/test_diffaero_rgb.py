@@ -8,25 +8,21 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageRgba8U
 
-from splatpilot.systems.policies.diffaero_inference import (
-    DIFFAERO_NETWORK,
-    FARTHEST,
-    NEAREST,
-    decide_by_grid,
-)
-from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgb, DiffAeroRgbConfig
-from splatpilot.systems.policies.diffaero_rgb_inference import (
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, FARTHEST, NEAREST, decide_by_grid
+from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
+    DiffAeroRgb,
+    DiffAeroRgbConfig,
     decide,
+    encode_view,
     load_network,
 )
-from splatpilot.systems.policies.monocular_depth import encode_view
-from splatpilot.systems.policies.observation import inverse_depth
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.observations import inverse_depth
 from splatpilot.systems.policies.recurrent_network import load_network as load_recurrent
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 P_WG = np.array([12.0, 3.0, 2.0])
 

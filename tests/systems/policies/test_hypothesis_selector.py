@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.systems.policies.hypotheses import Hypotheses, no_plan
-from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector, no_plan
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
 def waypoint(selector, vector, time):

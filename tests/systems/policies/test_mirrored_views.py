@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.systems.policies.mirrored_views import (
+from splatpilot.systems.policies.student import (
     ALIKE,
     SHARPNESS,
+    StudentNetwork,
+    StudentSpec,
     consensus,
+    mirrored_vectors,
+    plan,
     plan_both_views,
 )
-from splatpilot.systems.policies.student_inference import StudentNetwork, plan
-from splatpilot.systems.policies.student_observation import mirrored_vectors
-from splatpilot.systems.policies.student_spec import StudentSpec
 
 
 @pytest.fixture(scope="module", params=["rgb", "depth"])

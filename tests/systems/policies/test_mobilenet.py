@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 
-from splatpilot.systems.policies.mobilenet import (
+from splatpilot.systems.policies.checkpoint import OnnxModel
+from splatpilot.systems.policies.student import (
     MobileNet,
     adds_input,
     mobilenet_blocks,
     mobilenet_shapes,
 )
-from splatpilot.systems.policies.onnx_model import OnnxModel
 
 
 def convolved(x: np.ndarray, weight: np.ndarray, bias: np.ndarray, stride: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
 
-from splatpilot.systems.policies.monocular_depth import (
+from splatpilot.systems.policies.diffaero_rgb import (
     MonocularDepth,
     MonocularSpec,
     encode_view,

@@ -9,7 +9,7 @@ from splatpilot.systems.policies.motion_primitives import (
     rotation_to,
     select_distinct,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 
 @pytest.mark.parametrize("derivative", [0, 1, 2])

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork, load_network
-from splatpilot.systems.policies.student_inference import load_network as load_student
+from splatpilot.systems.policies.student import load_network as load_student
 
 
 def some_weights(spec=DIFFAERO_NETWORK) -> dict[str, np.ndarray]:

@@ -11,26 +11,18 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import LogVectorOutput
 
-from splatpilot.systems.policies import privileged_planner
-from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size
-from splatpilot.systems.policies.hypothesis_selector import HypothesisSelector
-from splatpilot.systems.policies.privileged_planner import (
-    PrivilegedPlanner,
-    PrivilegedPlannerConfig,
-    plan,
-)
+from splatpilot.systems.policies import planner as privileged_planner
+from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector, hypotheses_size
+from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig, plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessController,
-    FlatnessControllerConfig,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import (
+from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor import (
     VEHICLE_RADIUS,
     QuadrotorParams,
+    QuadrotorPlant,
     hover_state,
 )
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 MARGIN = LatticeConfig().margin
 PARAMS = QuadrotorParams(drag=0.4, gravity=3.7)

@@ -6,8 +6,9 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.systems.policies.reactive import Reactive
-from splatpilot.systems.policies.reactive_planner import (
+from splatpilot.systems.policies.lattice import LatticeConfig, final_velocities
+from splatpilot.systems.policies.reactive import (
+    Reactive,
     ReactiveConfig,
     candidate_costs,
     candidate_velocities,
@@ -15,10 +16,9 @@ from splatpilot.systems.policies.reactive_planner import (
     nearest_points,
     responses,
 )
-from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, final_velocities
-from splatpilot.systems.policies.velocity_tracking import RESPONSE_TIME
+from splatpilot.systems.policies.velocity import RESPONSE_TIME
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 
 CONFIG = ReactiveConfig()
 

@@ -5,13 +5,13 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from splatpilot.systems.policies.straight import Straight, StraightConfig
-from splatpilot.systems.policies.velocity_tracking import (
+from splatpilot.systems.policies.velocity import (
     MAX_ACCELERATION,
     RESPONSE_TIME,
     approach_velocity,
     tracking_acceleration,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
 def test_velocity_points_to_the_goal_and_falls_near_it():

@@ -11,22 +11,24 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, shipped_weights
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.mirrored_views import plan_both_views
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, shipped_weights
+from splatpilot.systems.policies.lattice import unobstructed_way
 from splatpilot.systems.policies.student import (
     PilotRgbConfig,
     Student,
     StudentConfig,
     StudentDepthConfig,
+    StudentNetwork,
     StudentRgbConfig,
+    StudentSpec,
+    load_network,
+    plan,
+    plan_both_views,
 )
-from splatpilot.systems.policies.student_inference import StudentNetwork, load_network, plan
-from splatpilot.systems.policies.student_spec import StudentSpec
-from splatpilot.systems.policies.unobstructed_way import unobstructed_way
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 P_WG = np.array([12.0, 3.0, 2.0])
 CONFIGS = {"rgb": StudentRgbConfig, "depth": StudentDepthConfig}

@@ -5,7 +5,7 @@ import pytest
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.policies.time_of_arrival import slowness, time_of_arrival
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def open_space(voxel_size, size=(8.0, 6.0, 4.0)):

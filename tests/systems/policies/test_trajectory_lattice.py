@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.motion_primitives import rotation_to
-from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.policies.trajectory_lattice import (
+from splatpilot.systems.policies.lattice import (
     LatticeConfig,
     Trajectories,
     TrajectoryLattice,
     final_velocities,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.policies.motion_primitives import rotation_to
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def test_fan_of_final_velocities():

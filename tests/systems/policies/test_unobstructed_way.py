@@ -5,10 +5,14 @@ import pytest
 import torch
 from pydrake.math import RollPitchYaw
 
+from splatpilot.systems.policies.lattice import (
+    BASIS,
+    LatticeConfig,
+    TrajectoryLattice,
+    unobstructed_way,
+)
 from splatpilot.systems.policies.motion_primitives import level_acceleration
-from splatpilot.systems.policies.trajectory_lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.policies.unobstructed_way import BASIS, unobstructed_way
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 
 class _Open:

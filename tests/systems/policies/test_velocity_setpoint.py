@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.velocity_setpoint import VelocitySetpoint
-from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessController,
-    FlatnessControllerConfig,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
+from splatpilot.systems.policies.velocity import VelocitySetpoint, tracking_acceleration
+from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
 
 CONTROLLER = FlatnessControllerConfig(lookahead=0.5)
 STATE = np.array([1.0, 2, 3, 0.5, -0.5, 0.2, 1, 0, 0, 0, 0, 0, 0])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from splatpilot.systems.policies.velocity_tracker import VelocityTracker
+from splatpilot.systems.policies.velocity import VelocityTracker
 
 
 def test_velocities_are_approached_in_four_tenths_of_a_second():

@@ -10,17 +10,9 @@ import numpy as np
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessControllerConfig,
-    flatness_command,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import (
-    GRAVITY,
-    QuadrotorParams,
-    hover_state,
-    rk4_step,
-)
+from splatpilot.systems.policies.velocity import tracking_acceleration
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, flatness_command
+from splatpilot.systems.vehicle.quadrotor import GRAVITY, QuadrotorParams, hover_state, rk4_step
 
 OFFBOARD, LOITER, LAND, POSITION = (6, 0), (4, 3), (4, 6), (3, 0)
 HALF_TURN = Rotation.from_euler("x", 180, degrees=True)

@@ -10,11 +10,8 @@ from natnet_frame import natnet_frame
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.messaging.udp_inbox import UdpConfig
-from splatpilot.systems.px4.motion_capture_receiver import (
-    MotionCaptureConfig,
-    MotionCaptureReceiver,
-)
+from splatpilot.systems.messaging.tof_receiver import UdpConfig
+from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
 
 LATENCY = 0.02
 

@@ -9,9 +9,9 @@ from pydrake.systems.analysis import Simulator
 from pymavlink.dialects.v20 import common as dialect
 
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
-from splatpilot.systems.px4.px4_commander import Px4Commander, Px4CommanderConfig
 
 TICK, UNIX_TIME = 0.002, 1_800_000_000.0  # [s] The latter is that of time 0.
 

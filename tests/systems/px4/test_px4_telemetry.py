@@ -9,9 +9,9 @@ from pydrake.systems.analysis import Simulator
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.messaging.udp_inbox import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.mavlink import Mavlink
-from splatpilot.systems.px4.px4_telemetry import Px4Telemetry
+from splatpilot.systems.px4.telemetry import Px4Telemetry
 
 EPOCH = 1_800_000_000.0  # [s] Unix time of the Context's time 0.
 BOOT = 1_799_999_000.0  # [s] Unix time when PX4 began.

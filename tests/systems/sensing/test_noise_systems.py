@@ -7,14 +7,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.policies.observation import pool_depth
-from splatpilot.systems.sensing.color_noise import ColorNoise
-from splatpilot.systems.sensing.delayed_pose import DelayedPose
-from splatpilot.systems.sensing.depth_noise import DepthNoise
-from splatpilot.systems.sensing.frame_times import FrameTimes
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.policies.observations import pool_depth
+from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.noise import ColorNoise, DepthNoise, ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 CAMERA = OnboardCamera(width=80, height=60, min_depth=1.0, max_depth=9.0)
 RATE = 15.0  # [Hz]

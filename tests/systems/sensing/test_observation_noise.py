@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from splatpilot.systems.sensing.observation_noise import (
+from splatpilot.systems.sensing.noise import (
     ObservationNoise,
     expose,
     image_generator,

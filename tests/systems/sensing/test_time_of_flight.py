@@ -7,8 +7,11 @@ import pytest
 from pydrake.common.value import Value
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.systems.sensing.time_of_flight import TimeOfFlight, time_of_flight_grid
-from splatpilot.systems.sensing.time_of_flight_grid import TimeOfFlightGrid
+from splatpilot.systems.sensing.time_of_flight import (
+    TimeOfFlight,
+    TimeOfFlightGrid,
+    time_of_flight_grid,
+)
 
 WHOLE = TimeOfFlight(fov=110.0, anchor="center", shift=0)
 """A sensor of whose frame nothing is cropped."""

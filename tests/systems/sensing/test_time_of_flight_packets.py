@@ -5,8 +5,12 @@ import struct
 import numpy as np
 import pytest
 
-from splatpilot.systems.sensing.time_of_flight import TimeOfFlight, time_of_flight_grid
-from splatpilot.systems.sensing.time_of_flight_packets import Stream, after_packet
+from splatpilot.systems.sensing.time_of_flight import (
+    Stream,
+    TimeOfFlight,
+    after_packet,
+    time_of_flight_grid,
+)
 
 SENSOR = TimeOfFlight()
 

@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot import _native
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 LEVELS = _native.simd_levels()
 WIDTH, HEIGHT = 83, 61

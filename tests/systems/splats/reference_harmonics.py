@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from splatpilot.systems.splats.spherical_harmonics import degree_of, sh_basis
+from splatpilot.systems.splats.scene import degree_of, sh_basis
 
 
 def evaluate_sh(sh: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):

@@ -7,10 +7,9 @@ import pytest
 from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.distortion import Distortion
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import PlacedGaussians
+from splatpilot.systems.splats.baked_scene import BakedScene, PlacedGaussians
+from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.scene import GaussianScene
 
 
 @pytest.mark.parametrize("simd", LEVELS)

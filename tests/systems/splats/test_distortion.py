@@ -12,8 +12,8 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import sensor_of
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.distortion import Distortion, pixel_slopes
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 WIDTH, HEIGHT = 160, 120
@@ -137,7 +137,9 @@ def test_onboard_cameras_have_lenses():
     slopes = pixel_slopes(FISHEYE, info.intrinsic_matrix(), WIDTH, HEIGHT)
     half_pixel = abs(slopes[60, 1, 0] - slopes[60, 0, 0])
     assert slopes[60, 0, 0] == pytest.approx(-math.tan(math.radians(75.0)), abs=half_pixel)
-    with pytest.raises(ValueError, match=r"fov_x must be less than the 170\.0 deg that the lens shows, got 170"):
+    with pytest.raises(
+        ValueError, match=r"fov_x must be less than the 170\.0 deg that the lens shows, got 170"
+    ):
         OnboardCamera(fov_x=170.0, distortion=FISHEYE).validate()
     with pytest.raises(ValueError, match="a time-of-flight sensor has none"):
         sensor_of(camera)

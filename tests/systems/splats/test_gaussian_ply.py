@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from splatpilot.systems.splats.gaussian_ply import read_ply, write_ply
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_files import read_ply, write_ply
 
 
 def random_scene(N: int = 7, K: int = 4, seed: int = 0) -> GaussianScene:

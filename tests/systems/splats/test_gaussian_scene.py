@@ -6,8 +6,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from reference_harmonics import evaluate_sh
 
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.spherical_harmonics import C0
+from splatpilot.systems.splats.scene import C0, GaussianScene
 
 
 def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from splatpilot.systems.splats import gsplat_kernels
+from splatpilot.systems.splats import rasterization as gsplat_kernels
 
 C, N, H, W = 2, 5, 4, 6
 IMAGE, ALPHA = torch.rand(C, H, W, 4), torch.rand(C, H, W, 1)

@@ -11,7 +11,7 @@ from reference_rasterizer import single_gaussian
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize, rasterize_surfels
 from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 
 LEVELS = _native.simd_levels()
 SIZE = {"width": 67, "height": 45}

@@ -6,9 +6,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot import _native
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import MovingGaussians
+from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 K = np.array([[40.0, 0, 32.0], [0, 40.0, 24.0], [0, 0, 1]])

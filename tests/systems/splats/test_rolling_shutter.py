@@ -5,14 +5,12 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.pose_between import pose_between
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.distortion import Distortion
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.moving_gaussians import MovingGaussians, PlacedGaussians
-from splatpilot.systems.splats.rolling_shutter import row_bands
-from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians, PlacedGaussians
+from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera, row_bands
+from splatpilot.systems.vehicle.state import pose_between
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
 INFO = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

@@ -6,12 +6,7 @@ from pydrake.math import RollPitchYaw
 from reference_harmonics import evaluate_sh
 from scipy.special import sph_harm_y
 
-from splatpilot.systems.splats.spherical_harmonics import (
-    C0,
-    degree_of,
-    rotation_matrices,
-    sh_basis,
-)
+from splatpilot.systems.splats.scene import C0, degree_of, rotation_matrices, sh_basis
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:

@@ -15,7 +15,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 INFO = CameraInfo(width=32, height=24, fov_y=np.pi / 2)

@@ -10,10 +10,8 @@ import pytest
 from plyfile import PlyData, PlyElement
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.splats.gaussian_ply import write_ply
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.splats.spherical_harmonics import C0
-from splatpilot.systems.splats.splat_files import read_splats
+from splatpilot.systems.splats.scene import C0, GaussianScene
+from splatpilot.systems.splats.splat_files import read_splats, write_ply
 
 N = 600  # more than two chunks of compressed PLY
 

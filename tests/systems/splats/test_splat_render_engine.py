@@ -37,9 +37,9 @@ from pydrake.systems.sensors import (
 
 from splatpilot.systems.splats.background import EnvironmentMap, pixel_rays
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.render_engine import SplatRenderEngine
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
-from splatpilot.systems.splats.splat_render_engine import SplatRenderEngine
 
 pytestmark = pytest.mark.usefixtures("opengl")
 

@@ -17,8 +17,7 @@ from reference_rasterizer import rotation_matrices
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import create_renderer
-from splatpilot.systems.splats.depth_normals import depth_to_normals
-from splatpilot.systems.splats.surfels import rasterize_surfels
+from splatpilot.systems.splats.surfel_rasterization import depth_to_normals, rasterize_surfels
 
 LEVELS = _native.simd_levels()
 WIDTH, HEIGHT = 67, 45

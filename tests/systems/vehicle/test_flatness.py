@@ -14,7 +14,7 @@ from splatpilot.systems.vehicle.flatness import (
     reaching_acceleration,
     thrust_for_acceleration,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, quadrotor_derivatives
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, quadrotor_derivatives
 
 # Vectors of ordinary and of extreme length, with exact zeros.
 elements = st.floats(-20, 20) | st.sampled_from([0.0, 1e-12, -1e6])

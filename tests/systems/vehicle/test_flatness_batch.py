@@ -7,18 +7,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from splatpilot.systems.vehicle.flatness_batch import (
+from splatpilot.systems.vehicle.flatness import (
+    FlatnessController,
+    FlatnessControllerConfig,
     attitudes_from_thrust,
     flatness_commands,
     lengths,
     rotation_matrices,
 )
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessController,
-    FlatnessControllerConfig,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 
 CONTROL = FlatnessControllerConfig()
 KINDS = pytest.mark.parametrize("make", [np.asarray, torch.as_tensor], ids=["numpy", "torch"])

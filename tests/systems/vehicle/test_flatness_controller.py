@@ -11,16 +11,13 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import VectorLogSink
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.vehicle.flatness_controller import (
-    FlatnessController,
-    FlatnessControllerConfig,
-)
-from splatpilot.systems.vehicle.quadrotor_dynamics import (
+from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
+from splatpilot.systems.vehicle.quadrotor import (
     QuadrotorParams,
+    QuadrotorPlant,
     hover_state,
     quadrotor_derivatives,
 )
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
 
 CONFIG = FlatnessControllerConfig()
 

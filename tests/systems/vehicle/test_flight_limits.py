@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import Box, Sphere
-from splatpilot.systems.vehicle.flight_limits import (
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Sphere
+from splatpilot.systems.messaging.flight_limits import (
     RETURN_SPEED,
     FlightLimits,
     limit_ahead,
@@ -15,7 +14,7 @@ from splatpilot.systems.vehicle.flight_limits import (
     limit_to_box,
     stopping_displacement,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.19, 2.0, 6.0])

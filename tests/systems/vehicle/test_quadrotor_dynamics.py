@@ -11,7 +11,7 @@ from pydrake.common.yaml import yaml_load_typed
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.vehicle.quadrotor_dynamics import (
+from splatpilot.systems.vehicle.quadrotor import (
     QuadrotorParams,
     hover_state,
     quadrotor_derivatives,
@@ -193,9 +193,9 @@ def test_bad_params_are_refused_by_name(field, value):
 def test_the_flight_path_does_not_import_torch():
     """Importing every module of the vehicle leaves torch out, which is slow to start."""
     code = (
-        "import sys, splatpilot.systems.vehicle.quadrotor_plant as _;"
-        "import splatpilot.systems.vehicle.flatness_controller, numpy as np;"
-        "from splatpilot.systems.vehicle.quadrotor_dynamics import *;"
+        "import sys, splatpilot.systems.vehicle.quadrotor as _;"
+        "import splatpilot.systems.vehicle.flatness, numpy as np;"
+        "from splatpilot.systems.vehicle.quadrotor import *;"
         "rk4_step(hover_state([0, 0, 0]), np.zeros(4), QuadrotorParams(), 0.02);"
         "sys.exit('torch' in sys.modules)"
     )

@@ -10,8 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import SymbolicVectorSystem, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from splatpilot.systems.vehicle.quadrotor_dynamics import QuadrotorParams, hover_state
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
 
 PERIOD = 0.02  # [s] of the commands and of the integration
 

@@ -7,7 +7,7 @@ from pydrake.autodiffutils import InitializeAutoDiff
 from pydrake.symbolic import MakeVectorContinuousVariable, Variable
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 
 def test_parts_are_where_the_plant_has_them():

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-from splatpilot.systems.vehicle.state_prediction import StatePredictor, predict_state
+from splatpilot.systems.vehicle.state import QuadrotorState, StatePredictor, predict_state
 
 NUMBERS = st.floats(-3, 3)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS).map(np.array)

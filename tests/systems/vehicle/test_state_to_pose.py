@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.state_to_pose import StateToPose
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import StateToPose
 
 
 def pose_of(state):

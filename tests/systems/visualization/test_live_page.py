@@ -8,10 +8,9 @@ from pydrake.geometry import Box, InMemoryMesh, Mesh, Meshcat, Rgba
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.visualization.camera_visualizer import picture_gltf
-from splatpilot.systems.visualization.drawing import draw_gaussians
-from splatpilot.systems.visualization.live_page import live_page
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.visualization.meshcat_drawing import draw_gaussians, picture_gltf
+from splatpilot.systems.visualization.pages import live_page
 
 SKY = EnvironmentMap(np.full((4, 8, 3), [0.2, 0.9, 0.9], np.float32))
 

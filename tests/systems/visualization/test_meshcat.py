@@ -16,22 +16,22 @@ from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.moving_balls import MovingBalls
-from splatpilot.systems.collision.shapes import Sphere
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingBalls, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.visualization.balls_visualizer import BallsVisualizer
-from splatpilot.systems.visualization.camera_visualizer import CameraVisualizer, picture_gltf
-from splatpilot.systems.visualization.drawing import (
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.visualization.meshcat_drawing import (
+    BallsVisualizer,
+    CameraVisualizer,
+    FlightVisualizer,
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
     draw_vehicle,
+    fan_mesh,
+    picture_gltf,
 )
-from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer, fan_mesh
 
 
 @pytest.fixture(scope="module")

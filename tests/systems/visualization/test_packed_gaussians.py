@@ -4,8 +4,8 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.visualization.packed_gaussians import pack_gaussians
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.visualization.pages import pack_gaussians
 
 
 def test_words_hold_centres_shades_and_covariances():

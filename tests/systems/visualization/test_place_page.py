@@ -8,9 +8,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.visualization.drawing import draw_box
-from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace, place_page
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.visualization.meshcat_drawing import draw_box
+from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
 
 WIDTH, HEIGHT = 480, 360
 UPPER = np.array([6.0, 4.0, 2.5])  # [m], of the room, whose lower corner is in the origin

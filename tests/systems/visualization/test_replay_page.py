@@ -11,19 +11,19 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.collision.moving_balls import MovingBalls
+from splatpilot.systems.collision.shapes import MovingBalls
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.drake_images import render_view
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.visualization.drawing import draw_vehicle
-from splatpilot.systems.visualization.packed_gaussians import pack_gaussians
-from splatpilot.systems.visualization.replay_page import (
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import render_view
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
+from splatpilot.systems.visualization.pages import (
     Frames,
     ReplayedFlight,
     ReplayView,
+    pack_gaussians,
     replay_page,
 )
 

@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
 
-from splatpilot.systems.visualization.video_recorder import VideoRecorder, colorize_depth
+from splatpilot.systems.visualization.video import VideoRecorder, colorize_depth
 
 
 class Brightening(LeafSystem):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.cli import main
-from splatpilot.systems import extras
+from splatpilot.analysis.commands.main import main
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.common import extras
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.visualization.place_page import CapturedImages, ShownPlace
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace
 from splatpilot.systems.visualization.viser_place import serve_place
 
 WIDTH, HEIGHT = 160, 120

@@ -4,16 +4,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Box
-from splatpilot.training.captures.camera_path import (
-    look_along,
-    move_left,
-    poses_along,
-    visiting_path,
-)
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
+from splatpilot.training.captures.render import look_along, move_left, poses_along, visiting_path
 
 LOWER_W, UPPER_W = np.array([0.0, 0.0, 0.0]), np.array([12.0, 8.0, 3.0])
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.training.captures.capture_cache import cache_folder, cache_key, prepare_cache
+from splatpilot.training.captures.capture import cache_folder, cache_key, prepare_cache
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 

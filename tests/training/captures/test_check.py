@@ -8,12 +8,12 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.cli import main
-from splatpilot.systems.configuration import load_config
+from splatpilot.analysis.commands.main import main
+from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
 from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.check import check_capture, doubts
-from splatpilot.training.captures.read_capture import read_capture
 
 WIDTH, HEIGHT = 160, 120
 K = np.array([[110.0, 0, 78.0], [0, 110.0, 61.0], [0, 0, 1]])

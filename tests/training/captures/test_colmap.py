@@ -10,9 +10,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
-from splatpilot.training.captures.metric_scale import camera_height
-from splatpilot.training.captures.photographs import read_photographs
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.colmap import read_photographs
+from splatpilot.training.captures.up_and_scale import camera_height
 
 SHRINK = 0.25
 # The world of a registration: any rotation, any unit of length.
@@ -353,7 +353,7 @@ def _made(path):
 def test_images_can_be_written_after_pycolmap_is_loaded(tmp_path):
     """Reading captures does not break OpenCV's PNG files, which libraries of pycolmap could."""
     code = (
-        "import splatpilot.training.captures.read_capture, cv2, numpy as np, sys\n"
+        "import splatpilot.training.captures.capture_registry, cv2, numpy as np, sys\n"
         "image = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)\n"
         "cv2.imwrite(sys.argv[1], image)\n"
         "sys.exit(int((cv2.imread(sys.argv[1]) != image).any()))\n"

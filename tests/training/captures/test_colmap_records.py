@@ -9,8 +9,7 @@ import sys
 import pycolmap
 import pytest
 
-from splatpilot.training.captures.colmap import read_model
-from splatpilot.training.captures.colmap_records import check_records
+from splatpilot.training.captures.colmap import check_records, read_model
 
 KINDS = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
 

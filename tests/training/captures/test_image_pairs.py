@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.colmap import import_pycolmap
-from splatpilot.training.captures.image_pairs import (
+from splatpilot.training.captures.colmap import (
     all_pairs,
+    import_pycolmap,
     likely_pairs,
     similarity,
     vlad_similarity,

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.lens import Lens, common_pinhole, pinhole, polynomial_lens
+from splatpilot.training.captures.capture import Lens, common_pinhole, pinhole, polynomial_lens
 
 K = pinhole(46.0, 46.0, 32.0, 24.0)
 RAYS = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))

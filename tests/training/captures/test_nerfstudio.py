@@ -6,7 +6,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_of_scene import read_capture_of
+from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
 from splatpilot.training.captures.check import check_capture
-from splatpilot.training.captures.origin import move_origin
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.up_and_scale import move_origin
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 

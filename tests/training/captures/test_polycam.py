@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # The room's z is the files' y.

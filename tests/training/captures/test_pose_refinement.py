@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.frame_comparison import ComparedFrame
-from splatpilot.training.captures.pose_refinement import refine_poses
+from splatpilot.training.captures.refine_poses import refine_poses
 
 K = np.array([[300.0, 0, 162.0], [0, 304.0, 118.0], [0, 0, 1]])
 

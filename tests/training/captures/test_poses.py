@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.poses import pose_from_matrix
+from splatpilot.training.captures.frames import pose_from_matrix
 
 MATRIX = np.array(
     [[0.0, 0.0, 1.0, 4.0], [1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]]

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.training.captures import read_capture as module
+from splatpilot.systems.common.config import load_config
+from splatpilot.training.captures import capture_registry as module
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture, register_capture
+from splatpilot.training.captures.capture_registry import read_capture, register_capture
 
 _PACKAGE = '''
 import cv2
@@ -18,7 +18,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.read_capture import CaptureKind
+from splatpilot.training.captures.capture_registry import CaptureKind
 
 
 def read(path, config):
@@ -121,7 +121,7 @@ def test_captures_are_read_without_torch_and_pycolmap(tmp_path):
         (tmp_path / "model" / f"{part}.txt").touch()
     program = (
         "import sys; sys.modules['torch'] = sys.modules['pycolmap'] = None\n"
-        "from splatpilot.training.captures.read_capture import read_capture\n"
+        "from splatpilot.training.captures.capture_registry import read_capture\n"
         "try:\n"
         "    read_capture(sys.argv[1])\n"
         "except ModuleNotFoundError as error:\n"

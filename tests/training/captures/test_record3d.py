@@ -5,7 +5,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.training.captures import refined_capture as module
+from splatpilot.training.captures import refine_poses as module
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.captures.registration import fit_color_camera
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.frame_comparison import fit_color_camera
 
 K = np.array([[300.0, 0, 160.0], [0, 300.0, 120.0], [0, 0, 1]])
 

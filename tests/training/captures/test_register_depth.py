@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures.register_depth import register_depth
+from splatpilot.training.captures.capture import register_depth
 
 K_D = np.array([[58.5, 0, 32], [0, 58.5, 24], [0, 0, 1.0]])
 K_C = np.array([[52.0, 0, 32], [0, 52.0, 24], [0, 0, 1.0]])

@@ -9,25 +9,24 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import benchmark_scenarios
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios
 from splatpilot.diagrams.worlds import splits
-from splatpilot.diagrams.worlds.make_world import make_blueprint
-from splatpilot.diagrams.worlds.room import RoomConfig
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.indoor import RoomConfig
+from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.diagrams.worlds.splits import find_test_source, source_digest
-from splatpilot.systems.configuration import load_config
-from splatpilot.training.captures import render_capture
-from splatpilot.training.captures.read_capture import read_capture
-from splatpilot.training.captures.render_capture import (
+from splatpilot.diagrams.worlds.world_registry import make_blueprint
+from splatpilot.systems.common.config import load_config
+from splatpilot.training.captures import render as render_capture
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.render import (
+    RenderConfig,
     mesh_digests,
     mesh_distance,
     rendered_world,
     run,
     true_camera,
 )
-from splatpilot.training.captures.render_config import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 START = 1_600_000_000.0
 FRAME = "camera_color_optical_frame"

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 K_D = np.array([[24.0, 0, 16], [0, 24.0, 12], [0, 0, 1]])
 

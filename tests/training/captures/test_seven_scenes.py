@@ -8,7 +8,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 P_DC = [0.2, -0.1, 0.0]
 K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])

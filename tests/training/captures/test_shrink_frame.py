@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.captures.shrink_frame import shrink, shrink_factor
+from splatpilot.training.captures.capture import CaptureFrame, shrink, shrink_factor
 
 
 def frame_of(depth: np.ndarray) -> CaptureFrame:

@@ -1,7 +1,7 @@
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures.transform_tree import TransformTree
+from splatpilot.training.captures.ros import TransformTree
 
 
 def turned(angle: float, x: float = 0.0) -> RigidTransform:

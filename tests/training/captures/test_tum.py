@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 FX, CX = 525.0, 320.0
 

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures import image_files, video
+from splatpilot.training.captures import colmap as video
+from splatpilot.training.captures import frames as image_files
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 
 RATE = 30.0  # [Hz]
 

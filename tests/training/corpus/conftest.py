@@ -3,11 +3,10 @@
 import pytest
 
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus import make
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus import collect as make
+from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
+from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
-from splatpilot.training.policies.expert import ExpertConfig
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.sample import EXPERT
+from splatpilot.training.corpus.samples import EXPERT
 
 
 @pytest.fixture

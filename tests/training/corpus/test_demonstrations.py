@@ -11,13 +11,12 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.demonstrations import Demonstration, keep_clear, see_states
-from splatpilot.training.corpus.perturbation import PerturbationConfig
-from splatpilot.training.policies.expert import ExpertConfig, Label, Labeller
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+from splatpilot.training.corpus.collect import Demonstration, keep_clear, see_states
+from splatpilot.training.corpus.corpus import CorpusConfig
+from splatpilot.training.corpus.expert import ExpertConfig, Label, Labeller
+from splatpilot.training.corpus.library import PerturbationConfig
 
 BALL = np.array([5.0, 1.2, 2.6])  # p_W, ahead, to the left and above of the states below
 CONFIG = CorpusConfig(

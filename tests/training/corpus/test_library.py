@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata, write_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import (
+    read_scene_metadata,
+    write_scene_folder,
+    write_scene_metadata,
+)
 from splatpilot.diagrams.worlds.splits import load_test_sources
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.seeds import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.training.corpus.library import LibraryConfig, world_source
-from splatpilot.training.world_kinds import world_of
+from splatpilot.systems.common.seeds import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.training.corpus.library import LibraryConfig, world_of, world_source
 
 
 def write_scene(path, bound, name="attic", split="train", digest=("0123456789abcdef",)):

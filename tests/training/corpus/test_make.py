@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.seeds import TRAINING_SEEDS
-from splatpilot.training.corpus import make
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.seeds import TRAINING_SEEDS
+from splatpilot.training.corpus import collect as make
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.sample import EXPERT, OFF_PATH
+from splatpilot.training.corpus.samples import EXPERT, OFF_PATH
 
 
 def all_bytes(folder: Path) -> dict[str, bytes]:

@@ -7,14 +7,13 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Cylinder, HalfSpace
-from splatpilot.systems.infeasible import InfeasibleFlightError
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.systems.vehicle.quadrotor_state import QuadrotorState
-from splatpilot.training.corpus.off_path import draw_off_path
-from splatpilot.training.policies.expert import ExpertConfig, Labeller
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.training.corpus.collect import draw_off_path
+from splatpilot.training.corpus.expert import ExpertConfig, Labeller
 
 P_WG = np.array([11.0, 4.0, 1.5])
 AXES = np.array([[4.0, 2.5], [7.0, 5.5]])

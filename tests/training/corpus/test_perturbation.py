@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.training.corpus.perturbation import PerturbationConfig, perturbed
+from splatpilot.training.corpus.library import PerturbationConfig, perturbed
 
 X_WB = RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), np.array([1.0, 2.0, 3.0]))
 

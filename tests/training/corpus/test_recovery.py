@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import Box, Cylinder, HalfSpace
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.recovery import (
+from splatpilot.training.corpus.recovery_labels import (
     StudentFlight,
     add_recovery,
     near_misses,
@@ -18,7 +17,7 @@ from splatpilot.training.corpus.recovery import (
     rows_before,
     rows_to_recover,
 )
-from splatpilot.training.corpus.sample import EXPERT, RECOVERY
+from splatpilot.training.corpus.samples import EXPERT, RECOVERY
 
 TIMES = np.arange(0.0, 12.0, 0.02)
 

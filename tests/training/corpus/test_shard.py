@@ -6,8 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from splatpilot.training.corpus.sample import EXPERT, Samples, SampleSize
-from splatpilot.training.corpus.shard import Shard, write_shard
+from splatpilot.training.corpus.samples import EXPERT, Samples, SampleSize, Shard, write_shard
 
 SIZE = SampleSize(height=4, width=6, trajectories=2)
 

@@ -8,19 +8,16 @@ import torch
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Cylinder, HalfSpace, Shape
-from splatpilot.systems.output_folders import claim_folder
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace, Shape
+from splatpilot.systems.common.files import claim_folder
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.corpus import CONFIG
-from splatpilot.training.corpus.gather import shard_folder
-from splatpilot.training.corpus.sample import EXPERT, Samples
-from splatpilot.training.corpus.shard import write_shard
-from splatpilot.training.corpus.world_record import WorldSource, record_world
+from splatpilot.training.corpus.collect import shard_folder
+from splatpilot.training.corpus.corpus import CONFIG, CorpusConfig
+from splatpilot.training.corpus.expert import Labeller
+from splatpilot.training.corpus.library import WorldSource, record_world
+from splatpilot.training.corpus.samples import EXPERT, Samples, write_shard
 from splatpilot.training.policies.evaluation import CAMERA_AHEAD
-from splatpilot.training.policies.expert import Labeller
 from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
 
 P_WG = np.array([11.0, 4.0, 1.5])

@@ -7,19 +7,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from splatpilot.systems.policies.agile_autonomy_inference import FOV_X
-from splatpilot.systems.sensing.delayed_pose import DelayedPose
-from splatpilot.systems.sensing.frame_times import FrameTimes
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.training.policies.agile_autonomy import AgileAutonomyTrainer, AgileAutonomyTraining
-from splatpilot.training.policies.delayed_vehicle import (
-    Frames,
-    delayed,
-    draw_frames,
-    frame_ages,
-    remember,
-    remembered,
-)
-from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.evaluation import (
     CAMERA_AHEAD,
     FlightConditions,
@@ -27,8 +16,21 @@ from splatpilot.training.policies.evaluation import (
     render_depth,
 )
 from splatpilot.training.policies.ray_casting import PixelRays
+from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.train_agile_autonomy import (
+    AgileAutonomyTrainer,
+    AgileAutonomyTraining,
+)
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
-from splatpilot.training.policies.vehicles import BodyRate
+from splatpilot.training.policies.vehicles import (
+    BodyRate,
+    Frames,
+    delayed,
+    draw_frames,
+    frame_ages,
+    remember,
+    remembered,
+)
 
 PERIOD = 1.0 / 15.0  # [s]
 SELECTION = WorldSelection(kinds=["P02"], count=1, voxel_size=0.5)

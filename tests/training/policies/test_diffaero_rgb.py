@@ -7,25 +7,29 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.diffaero_rgb_inference import load_network
-from splatpilot.systems.policies.monocular_depth import MonocularDepth, MonocularSpec, encode_view
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-from splatpilot.training.policies.diffaero_rgb import (
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
+from splatpilot.systems.policies.diffaero_rgb import (
+    MonocularDepth,
+    MonocularSpec,
+    encode_view,
+    load_network,
+)
+from splatpilot.training.policies.train import run
+from splatpilot.training.policies.train_diffaero_rgb import (
     DiffAeroRgbTrainer,
     DiffAeroRgbTraining,
+    MonocularModule,
     mirrored,
 )
-from splatpilot.training.policies.diffaero_rgb_network import MonocularModule
-from splatpilot.training.policies.registry import TRAINERS
-from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 
 def training(corpus: Path, *overrides: str) -> DiffAeroRgbTraining:

@@ -2,8 +2,8 @@
 
 import torch
 
-from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.flight import Outcome
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.flight import Outcome
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.feasibility import draw_start_and_goal
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.diagrams.worlds.start_and_goal import draw_start_and_goal
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS, hover_state
-from splatpilot.training.policies.expert import ExpertConfig, Labeller, fly_policy
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
+from splatpilot.training.corpus.expert import ExpertConfig, Labeller, fly_policy
 
 WORLD = ForestConfig(length=12.0, width=8.0, height=4.0)
 REACTIVE = ExpertConfig(policy="reactive")

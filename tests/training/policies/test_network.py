@@ -6,25 +6,26 @@ import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
-from splatpilot.systems.policies import depthnav_inference as depthnav_policy
-from splatpilot.systems.policies import diffaero_inference as diffaero_policy
-from splatpilot.systems.policies import diffaero_tof_inference as tof_policy
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.diffaero_tof import DiffAeroTofConfig
+from splatpilot.systems.policies import depthnav as depthnav_policy
+from splatpilot.systems.policies import diffaero as diffaero_policy
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, DiffAeroTofConfig
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
-from splatpilot.systems.policies.velocity_tracking import tracking_acceleration
+from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
-from splatpilot.training.policies.agile_autonomy_agent import AgileAutonomyAgent
-from splatpilot.training.policies.depthnav import (
+from splatpilot.training.policies.networks import TrajectoryModule
+from splatpilot.training.policies.torch_observations import Observation
+from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyAgent
+from splatpilot.training.policies.train_depthnav import (
     DepthNavLearner,
     DepthNavLoss,
     quaternion_from_rotation,
 )
-from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from splatpilot.training.policies.diffaero_tof import DiffAeroTofLearner
-from splatpilot.training.policies.network import TrajectoryModule
-from splatpilot.training.policies.observation import Observation
+from splatpilot.training.policies.train_diffaero import (
+    DiffAeroLearner,
+    DiffAeroLoss,
+    DiffAeroTofLearner,
+)
 from splatpilot.training.policies.vehicles import BodyRate
 
 P_WG = np.array([9.0, 2.0, 1.5])
@@ -71,7 +72,7 @@ def test_policy_of_time_of_flight_flies_as_it_was_trained():
         with torch.no_grad():
             a_cmd, _, memory = learner.decide(observed(depth, body), memory)
         grid = time_of_flight_grid(depth, sensor)
-        v_wanted, hidden = tof_policy.decide(
+        v_wanted, hidden = diffaero_policy.decide_velocity(
             network, grid, pose(state), state[3:6], P_WG, 2.0, hidden
         )
         a_WB = tracking_acceleration(state[3:6], v_wanted)
@@ -85,9 +86,9 @@ def test_what_flies_is_what_was_trained(name):
     """For three images in a row the numpy policy decides and remembers what torch does."""
     torch.manual_seed(1)
     if name == "diffaero":
-        learner, policy = DiffAeroLearner(DiffAeroLoss()), diffaero_policy
+        learner, decide = DiffAeroLearner(DiffAeroLoss()), diffaero_policy.decide_acceleration
     else:
-        learner, policy = DepthNavLearner(DepthNavLoss()), depthnav_policy
+        learner, decide = DepthNavLearner(DepthNavLoss()), depthnav_policy.decide
     spec = learner.network.spec
     with torch.no_grad():
         learner.network.head.weight.mul_(10.0)
@@ -104,11 +105,9 @@ def test_what_flies_is_what_was_trained(name):
             a_cmd, heading, memory = learner.decide(observed(depth, body), memory)
         fine = depth.repeat(4, axis=0).repeat(4, axis=1)  # pooled back to the same
         if name == "diffaero":
-            a_WB, hidden = policy.decide(network, fine, pose(state), state[3:6], P_WG, 2.0, hidden)
+            a_WB, hidden = decide(network, fine, pose(state), state[3:6], P_WG, 2.0, hidden)
         else:
-            decision = policy.decide(
-                network, fine, pose(state), state[3:6], P_WG, 2.0, start_yaw, hidden
-            )
+            decision = decide(network, fine, pose(state), state[3:6], P_WG, 2.0, start_yaw, hidden)
             a_WB, hidden = decision.a_WB, decision.memory
             assert heading is not None
             assert float(heading[0]) == pytest.approx(decision.heading, abs=1e-4)

@@ -5,22 +5,20 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.policies import velocity_tracking
-from splatpilot.systems.policies.diffaero_tof import DiffAeroTofConfig
-from splatpilot.systems.sensing import observation_noise
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies import velocity as velocity_tracking
+from splatpilot.systems.policies.diffaero import DiffAeroTofConfig
+from splatpilot.systems.sensing import noise as observation_noise
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import (
     range_of_depth,
     sensor_of,
     time_of_flight_grid,
 )
-from splatpilot.training.policies.agile_autonomy import AgileAutonomyTraining
-from splatpilot.training.policies.diffaero import DiffAeroTraining
-from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTraining
-from splatpilot.training.policies.observation import (
+from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
+from splatpilot.training.policies.torch_observations import (
     blurred,
     disturb_depth,
     noisy_depth,
@@ -28,7 +26,9 @@ from splatpilot.training.policies.observation import (
     tracking_acceleration,
     training_noise,
 )
-from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
+from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyTraining
+from splatpilot.training.policies.train_diffaero import DiffAeroTraining
+from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTraining
 
 
 @pytest.mark.parametrize("noise", [training_noise(), ObservationNoise(1.0, 2.0, 0.3)])

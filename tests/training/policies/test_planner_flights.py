@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.flight import Outcome, fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.flight import Outcome, fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.privileged_planner import PrivilegedPlannerConfig
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies import planner_flights
-from splatpilot.training.policies.expert import ExpertConfig, Labeller
-from splatpilot.training.policies.planner_flights import fly_planner
+from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.training.corpus import expert as planner_flights
+from splatpilot.training.corpus.expert import ExpertConfig, Labeller, fly_planner
 
 WORLD = ForestConfig(length=12.0, width=8.0, height=4.0)
 

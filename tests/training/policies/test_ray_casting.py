@@ -9,11 +9,18 @@ import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot import _native
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
-from splatpilot.systems.policies.observation import pool_depth
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    Shape,
+    Sphere,
+)
+from splatpilot.systems.policies.observations import pool_depth
 from splatpilot.training.policies.ray_casting import EsdfGeometry, Grids, PixelRays, ShapeGeometry
 
 LOWER, UPPER = np.array([0.0, -8.0, 0.0]), np.array([20.0, 8.0, 6.0])

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.policies.policy_checkpoint import policy_of
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.checkpoint import policy_of
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus import make
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.corpus import collect as make
+from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
+from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
-from splatpilot.training.corpus.sample import EXPERT, RECOVERY
-from splatpilot.training.policies import recovery, student_flights
-from splatpilot.training.policies.diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
-from splatpilot.training.policies.expert import ExpertConfig
-from splatpilot.training.policies.student import StudentTrainer
+from splatpilot.training.corpus.samples import EXPERT, RECOVERY
+from splatpilot.training.policies import recover as recovery
+from splatpilot.training.policies import recover as student_flights
 from splatpilot.training.policies.student_config import StudentDepthTraining
 from splatpilot.training.policies.student_data import StudentData
+from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
+from splatpilot.training.policies.train_student import StudentTrainer
 
 TINY = [
     "pretrained=false",

@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from splatpilot.analysis.cli import main
-from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.analysis.commands.main import main
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 PACKAGE = '''
 from dataclasses import dataclass, field

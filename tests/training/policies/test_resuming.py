@@ -5,10 +5,10 @@ import zipfile
 import pytest
 from tiny_trainer import TinyTrainer, TinyTraining
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.progress import CheckpointClock
-from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.progress import CheckpointClock
 from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 
 class Reader(TinyTrainer):

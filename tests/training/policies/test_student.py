@@ -11,22 +11,21 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 from torchvision.models import mobilenet_v2
 
-from splatpilot.diagrams.flight import fly
-from splatpilot.diagrams.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.diagrams.scenario import Scenario
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.policies.mobilenet import mobilenet_blocks
-from splatpilot.systems.policies.student_inference import StudentNetwork, plan
+from splatpilot.systems.policies.student import StudentNetwork, mobilenet_blocks, plan
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.policies.pretrained import imagenet_weights
-from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.student_config import StudentTraining
+from splatpilot.training.policies.student_network import imagenet_weights
 from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 OVERRIDES = [
     "pretrained=false",

@@ -9,9 +9,8 @@ import torch
 
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.systems.configuration import dump_config
-from splatpilot.training.corpus.config import CorpusConfig
-from splatpilot.training.corpus.corpus import CONFIG, Corpus
+from splatpilot.systems.common.config import dump_config
+from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig
 from splatpilot.training.corpus.library import world_source
 from splatpilot.training.policies.student_data import StudentData, is_held_out
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.policies.student_spec import StudentSpec
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
+from splatpilot.systems.policies.student import StudentSpec
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_features import FrozenFeatures

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.policies import student_observation
-from splatpilot.systems.sensing import observation_noise
-from splatpilot.systems.sensing.observation_noise import ObservationNoise
-from splatpilot.training.policies.observation import disturb_color, noisy_color
+from splatpilot.systems.policies import student as student_observation
+from splatpilot.systems.sensing import noise as observation_noise
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.student_images import (
     Appearance,
     clean_images,
@@ -15,6 +14,7 @@ from splatpilot.training.policies.student_images import (
     relit,
     training_images,
 )
+from splatpilot.training.policies.torch_observations import disturb_color, noisy_color
 
 
 def some_pixels(observation: str) -> np.ndarray:

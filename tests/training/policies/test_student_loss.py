@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from splatpilot.training.policies.student_loss import (
+from splatpilot.training.policies.train_student import (
     barrier_along,
     cost_error,
     cost_targets,

@@ -8,13 +8,20 @@ import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 from torchvision.models import mobilenet_v2
 
-from splatpilot.systems.policies.mobilenet import mobilenet_shapes
-from splatpilot.systems.policies.student_inference import StudentNetwork, plan
-from splatpilot.systems.policies.student_observation import STATE_SIZE
-from splatpilot.systems.policies.student_spec import StudentSpec
-from splatpilot.training.policies.pretrained import IN_DATA, imagenet_weights
+from splatpilot.systems.policies.student import (
+    STATE_SIZE,
+    StudentNetwork,
+    StudentSpec,
+    mobilenet_shapes,
+    plan,
+)
 from splatpilot.training.policies.student_images import clean_images
-from splatpilot.training.policies.student_network import StudentModule, encode_state
+from splatpilot.training.policies.student_network import (
+    IN_DATA,
+    StudentModule,
+    encode_state,
+    imagenet_weights,
+)
 
 
 def disturbed(module: StudentModule) -> StudentModule:

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.policies.student_spec import StudentSpec
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.student import StudentSpec
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.student_config import StudentRgbTraining
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import clean_images
 from splatpilot.training.policies.student_network import StudentModule
-from splatpilot.training.policies.student_views import StudentViews
+from splatpilot.training.policies.train_student import StudentViews
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 NUMBERS = 4
 

@@ -7,18 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.student_spec import StudentSpec
-from splatpilot.training.policies.registry import TRAINERS
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.student import StudentSpec
 from splatpilot.training.policies.torchrun import (
     Processes,
     require_one_process,
     torchrun_processes,
 )
 from splatpilot.training.policies.train import run
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
-PROGRAM = "from splatpilot.analysis.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+PROGRAM = (
+    "from splatpilot.analysis.commands.main import main; import sys; sys.exit(main(sys.argv[1:]))"
+)
 
 
 def fields(corpus: Path, *overrides: str) -> list[str]:

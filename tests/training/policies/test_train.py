@@ -16,20 +16,20 @@ import pytest
 import torch
 from tiny_trainer import TinyTrainer, TinyTraining
 
-from splatpilot.analysis.cli import main
-from splatpilot.diagrams.policies import policy_named
-from splatpilot.systems.configuration import load_config
-from splatpilot.systems.output_folders import claim_folder
-from splatpilot.systems.policies import policy_checkpoint
-from splatpilot.systems.policies.diffaero_inference import DIFFAERO_NETWORK
-from splatpilot.systems.policies.policy_checkpoint import PolicyCheckpoint, policy_of
-from splatpilot.systems.seeds import TRAINING_SEEDS
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.files import claim_folder
+from splatpilot.systems.common.seeds import TRAINING_SEEDS
+from splatpilot.systems.policies import checkpoint as policy_checkpoint
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, policy_of
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.training.policies import train, training_worlds
-from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.evaluation import evaluate_agent
-from splatpilot.training.policies.registry import TRAINERS
 from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
 from splatpilot.training.policies.train import run
+from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroTraining
+from splatpilot.training.policies.trainer_registry import TRAINERS
 
 CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
 
@@ -88,7 +88,7 @@ def test_run_leaves_what_it_says(finished):
 
 def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
     """After kill -9 between two checkpoints the same command ends with the same weights."""
-    program = "import sys; from splatpilot.analysis.cli import main; sys.exit(main(sys.argv[1:]))"
+    program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
     command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
     for override in TINY:
         command += ["--set", override]

@@ -7,27 +7,25 @@ import pytest
 import torch
 
 from splatpilot.diagrams.worlds import splits
-from splatpilot.diagrams.worlds.make_world import make_world
-from splatpilot.diagrams.worlds.scene import SceneConfig
-from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig, write_scene_folder
 from splatpilot.diagrams.worlds.splits import part_digests, source_digest
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_from_distance_field import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import Capsule, HalfSpace
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
-from splatpilot.training.policies.diffaero import DiffAeroLearner, DiffAeroLoss
-from splatpilot.training.policies.differentiable_rollout import DifferentiableRollout, RolloutConfig
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, HalfSpace
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.policies.ray_casting import EsdfGeometry, PixelRays
+from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.training_worlds import (
+    WorldCache,
     WorldSelection,
     make_training_world,
     training_worlds,
     validation_worlds,
 )
-from splatpilot.training.policies.world_cache import WorldCache
 
 UPPER = np.array([12.0, 7.0, 4.0])
 

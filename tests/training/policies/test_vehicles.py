@@ -8,14 +8,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from random_scenes import normal_tensor
 
-from splatpilot.systems.vehicle.flatness_batch import rotation_matrices
-from splatpilot.systems.vehicle.flatness_controller import (
+from splatpilot.systems.vehicle.flatness import (
     FlatnessController,
     FlatnessControllerConfig,
+    rotation_matrices,
 )
-from splatpilot.systems.vehicle.quadrotor_dynamics import hover_state
-from splatpilot.systems.vehicle.quadrotor_plant import QuadrotorPlant
-from splatpilot.systems.vehicle.state_to_pose import pose_from_state
+from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant, hover_state
+from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.training.policies.vehicles import BodyRate, PointMass
 
 CONTROL = FlatnessControllerConfig()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from splatpilot.systems.collision.shapes import Capsule, HalfSpace
-from splatpilot.systems.environment import cache_folder
-from splatpilot.training.policies import world_cache
-from splatpilot.training.policies.world_cache import WorldCache
-from splatpilot.training.world_kinds import world_of
+from splatpilot.systems.common.files import cache_folder
+from splatpilot.training.corpus.library import world_of
+from splatpilot.training.policies import training_worlds as world_cache
+from splatpilot.training.policies.training_worlds import WorldCache
 
 GROUND = HalfSpace([0, 0, 1], 0.0)
 VOLUME = np.zeros(3), np.array([6.0, 4.0, 3.0])

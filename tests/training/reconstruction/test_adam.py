@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.training.reconstruction.adam import EPSILON, adam_step
+from splatpilot.training.reconstruction.parameters import EPSILON, adam_step
 
 
 @pytest.mark.parametrize("shape", [(1,), (37, 3), (64,)])

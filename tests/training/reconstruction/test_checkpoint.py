@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -33,7 +33,7 @@ CONFIG = ReconstructConfig(
 _CHILD = """
 import os, signal, sys, torch
 from pathlib import Path
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 from tests_config import CONFIG

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.densification import DefaultStrategy
-from splatpilot.training.reconstruction.splat_parameters import SplatParameters
+from splatpilot.training.reconstruction.optimize import DefaultStrategy
+from splatpilot.training.reconstruction.parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import render
 
 RATES = {

@@ -4,7 +4,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.depth_gaussians import (
+from splatpilot.training.reconstruction.initialize import (
     BlockMeans,
     cell_gaussians,
     frame_gaussians,

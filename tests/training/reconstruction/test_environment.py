@@ -5,8 +5,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.environment import learn_background
 from splatpilot.training.reconstruction.photometry import Photometry
+from splatpilot.training.reconstruction.views import learn_background
 
 HEIGHT, WIDTH = 48, 64
 K = np.array([[32.0, 0, 32], [0, 32.0, 24], [0, 0, 1]])

@@ -5,7 +5,7 @@ import pytest
 
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.initialization import (
+from splatpilot.training.reconstruction.initialize import (
     Detail,
     gaussians_from_depth,
     gaussians_from_points,
@@ -13,8 +13,7 @@ from splatpilot.training.reconstruction.initialization import (
     random_points,
     resolve_config,
 )
-from splatpilot.training.reconstruction.overlap import ThinnedFrame
-from splatpilot.training.reconstruction.photometry import estimate_photometry
+from splatpilot.training.reconstruction.photometry import ThinnedFrame, estimate_photometry
 
 COARSE = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
 

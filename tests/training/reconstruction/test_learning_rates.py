@@ -1,7 +1,7 @@
 import pytest
 
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.learning_rates import learning_rates
+from splatpilot.training.reconstruction.parameters import learning_rates
 
 
 def test_rates_are_those_published_where_gaussians_start_anywhere():

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.mcmc import McmcStrategy, share_out
-from splatpilot.training.reconstruction.scale_limits import ScaleLimits
-from splatpilot.training.reconstruction.splat_parameters import SplatParameters
+from splatpilot.training.reconstruction.parameters import ScaleLimits, SplatParameters
 
 RATES = {
     "means": 1e-3,

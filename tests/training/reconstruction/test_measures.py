@@ -6,9 +6,9 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.baked_scene import RenderedView
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.measures import (
+from splatpilot.training.reconstruction.metrics import (
     SceneRenderer,
     depth_mae_m,
     depth_relative,
@@ -21,7 +21,7 @@ from splatpilot.training.reconstruction.measures import (
     psnr_db,
     ssim,
 )
-from splatpilot.training.reconstruction.vignette import vignette
+from splatpilot.training.reconstruction.photometry import vignette
 
 HEIGHT, WIDTH = 24, 32
 K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])

@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.losses import photometric_loss
-from splatpilot.training.reconstruction.objective import Objective
+from splatpilot.training.reconstruction.optimize import Objective
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.splat_rendering import Rendering
 from splatpilot.training.reconstruction.views import ReconstructionViews

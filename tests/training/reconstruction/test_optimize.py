@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.worlds.scene_folder import read_scene
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
-from splatpilot.systems.splats.gaussian_ply import read_ply
+from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
+from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import CaptureFrame, SfmPoints, no_depth
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.initialization import (
+from splatpilot.training.reconstruction.initialize import (
     Detail,
     gaussians_from_depth,
     gaussians_from_points,

@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.tartanair import read_tartanair_v1
-from splatpilot.training.reconstruction.overlap import (
+from splatpilot.training.reconstruction.photometry import (
     STRIDE,
     ThinnedFrame,
     find_new_pixels,

@@ -2,8 +2,11 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.tartanair import read_tartanair_v1
-from splatpilot.training.reconstruction.overlap import ThinnedFrame
-from splatpilot.training.reconstruction.photometry import Photometry, estimate_photometry
+from splatpilot.training.reconstruction.photometry import (
+    Photometry,
+    ThinnedFrame,
+    estimate_photometry,
+)
 
 
 def test_recovers_gains_and_vignetting(tmp_path, write_room):

@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from splatpilot.diagrams.worlds import splits
-from splatpilot.diagrams.worlds.scene_folder import read_scene
-from splatpilot.diagrams.worlds.scene_metadata import read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
 from splatpilot.diagrams.worlds.splits import part_digests, source_digest
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.splats.gaussian_ply import read_ply
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.splats.splat_files import read_ply
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.read_capture import read_capture
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.photometry import Photometry

@@ -4,9 +4,8 @@ import torch
 from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.reconstruction.parameters import ScaleLimits, SplatParameters, scale_limits
 from splatpilot.training.reconstruction.photometry import Photometry
-from splatpilot.training.reconstruction.scale_limits import ScaleLimits, scale_limits
-from splatpilot.training.reconstruction.splat_parameters import SplatParameters
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
 F = 50.0

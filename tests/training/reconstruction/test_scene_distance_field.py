@@ -4,10 +4,10 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.splats.gaussian_scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.scene_distance_field import (
+from splatpilot.training.reconstruction.distance_field import (
     DepthSource,
     FieldGrid,
     add_sky,

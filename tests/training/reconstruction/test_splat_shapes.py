@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from splatpilot.training.reconstruction.splat_shapes import splat_shapes
+from splatpilot.training.reconstruction.parameters import splat_shapes
 
 N = 45  # not a multiple of any register
 

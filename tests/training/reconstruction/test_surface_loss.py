@@ -3,7 +3,7 @@ import pytest
 import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.training.reconstruction.surface_loss import outline_loss, surface_loss
+from splatpilot.training.reconstruction.losses import outline_loss, surface_loss
 
 HEIGHT, WIDTH, F = 40, 60, 20.0
 K = torch.tensor([[F, 0, WIDTH / 2], [0, F, HEIGHT / 2], [0, 0, 1]])

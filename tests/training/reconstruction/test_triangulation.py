@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.reconstruction.triangulation import triangulate
+from splatpilot.training.reconstruction.initialize import triangulate
 
 WIDTH, HEIGHT, DEPTH = 320, 240, 2.0
 K = np.array([[280.0, 0, 160], [0, 280.0, 120], [0, 0, 1]])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.training.reconstruction.vignette import radius_squared, vignette
+from splatpilot.training.reconstruction.photometry import radius_squared, vignette
 
 
 def test_corners_have_the_radius_one():

@@ -4,15 +4,19 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.flight_start import sample_initial_state
-from splatpilot.diagrams.scenario import Scenario
-from splatpilot.diagrams.scenario_files import scenario_file
-from splatpilot.diagrams.sensors import make_camera
-from splatpilot.diagrams.worlds.dodgedrone.dodgedrone import DodgeDroneConfig, dodgedrone_world
-from splatpilot.diagrams.worlds.dodgedrone.obstacles import LEVELS, SEED, draw_obstacles
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.flight.flight import sample_initial_state
+from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.worlds.dodgedrone import (
+    LEVELS,
+    SEED,
+    DodgeDroneConfig,
+    dodgedrone_world,
+    draw_obstacles,
+)
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.configuration import load_config
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 EASY = DodgeDroneConfig(level="easy", voxel_size=0.5)

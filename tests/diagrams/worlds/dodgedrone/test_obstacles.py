@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.dodgedrone.obstacles import LEVELS, Group, draw_obstacles
+from splatpilot.diagrams.worlds.dodgedrone import LEVELS, Group, draw_obstacles
 
 # Rows of obstacle lists that are stored with the challenge's simulator (uzh-rpg/flightmare) and
 # forks of it: number of the obstacle, diameter [m], first centre [m] (1000: it is kept away).

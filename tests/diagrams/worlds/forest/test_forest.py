@@ -9,16 +9,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.ndimage import label
 from scipy.spatial.distance import pdist
 
-from splatpilot.diagrams.worlds.fittings import CLEARING, INSET, PASSAGE
-from splatpilot.diagrams.worlds.forest.config import ForestConfig
-from splatpilot.diagrams.worlds.forest.layout import lay_out
-from splatpilot.diagrams.worlds.make_world import make_world
+from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET, PASSAGE
+from splatpilot.diagrams.worlds.forest.layout import ForestConfig, lay_out
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.analytic_distance_field import AnalyticDistanceField
-from splatpilot.systems.collision.shapes import Capsule, Sphere
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, Sphere
 from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.vehicle.quadrotor_dynamics import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 SMALL = ForestConfig(length=9.0, width=7.0, height=4.0, voxel_size=0.25)
 KINDS = {

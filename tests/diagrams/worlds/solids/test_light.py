@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.solids.light import HAZE_RANGE, Daylight, fade
+from splatpilot.diagrams.worlds.solids.shading import HAZE_RANGE, Daylight, fade
 
 
 @pytest.fixture

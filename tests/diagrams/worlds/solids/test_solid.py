@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.diagrams.worlds.solids.materials import MATERIALS
-from splatpilot.diagrams.worlds.solids.solid import Solid, faces_of
+from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Solid, faces_of
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
 
 BOX = Box(RigidTransform(RollPitchYaw(0.2, -0.4, 1.0), [1.0, 0, 2]), [1.0, 2.0, 0.5])

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from splatpilot.diagrams.worlds.solids.blueprint import Blueprint
-from splatpilot.diagrams.worlds.solids.solid import Solid
+from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from splatpilot.systems.splats.baked_scene import BakedScene

@@ -1,0 +1,102 @@
+"""`splatpilot faults`: flights in which something goes wrong, many, drawn at random."""
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatpilot.analysis.faults.trial import KINDS, Trial, fly_trial
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.messaging.flight_limits import FlightLimits
+
+
+def _scenario() -> Scenario:
+    return Scenario(world=ForestConfig(length=14.0, width=8.0, rocks=2, logs=1))
+
+
+@dataclass
+class FaultsConfig:
+    """A campaign."""
+
+    # [-] Flights; the kinds of faults, what the vehicle is told, and the policies take turns.
+    trials: int = 600
+    # Seed of everything random.
+    seed: int = 0
+    # [-] Worlds that the trials take turns in.
+    worlds: int = 10
+    # [m/s] Of the policies, of which `straight` flies into things.
+    speed: float = 2.0
+    # What is kept, by which a trial is judged.
+    limits: FlightLimits = field(default_factory=lambda: FlightLimits(max_speed=2.5))
+    # What is flown, but for its policy.
+    scenario: Scenario = field(default_factory=_scenario)
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        for name in ("trials", "worlds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        self.limits.validate()
+        self.scenario.validate()
+
+
+@holds_folder("out")
+def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
+    """
+    Flies the trials, from where an interrupted campaign of the same configuration stopped.
+
+    Leaves in `out`: `trials.jsonl`, what `fly_trial` says of each; `config.yaml`; `summary.json`,
+    of each kind of fault how many trials were safe and how they ended.
+
+    Returns:
+        What `summary.json` says.
+
+    Raises:
+        ValueError: for a configuration out of range, or another than `out` has.
+        OSError: if `out` cannot be written.
+    """
+    config.validate()
+    claim_folder(out / "config.yaml", config)
+    lines = out / "trials.jsonl"
+    rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+    worlds: dict[int, Any] = {}
+    for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
+        world_seed = config.seed + number % config.worlds
+        if world_seed not in worlds:
+            worlds[world_seed] = make_world(config.scenario.world, world_seed)
+        trial = Trial.draw(number, np.random.default_rng([config.seed, number]))
+        seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
+        scenario = replace(config.scenario, seed=seed, policy=policy)
+        rows.append(fly_trial(scenario, worlds[world_seed], trial, config.limits, seed))
+        with written_atomically(lines) as path:
+            path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    summary = summarize(rows)
+    with written_atomically(out / "summary.json") as path:
+        path.write_text(json.dumps(summary, indent=2) + "\n")
+    print(f"{'fault':<16} {'safe':>9}  ended")
+    for kind, row in summary["kinds"].items():
+        ends = ", ".join(f"{name} {count}" for name, count in row["outcomes"].items())
+        print(f"{kind:<16} {row['safe']:>4}/{row['trials']:<4}  {ends}")
+    print(f"{summary['safe']} of {summary['trials']} trials were safe")
+    return summary
+
+
+def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many trials were safe, and how those with each kind of fault ended."""
+    kinds = {}
+    for kind in KINDS:
+        of_kind = [row for row in rows if kind in {fault["kind"] for fault in row["faults"]}]
+        ends = [row["outcome"] for row in of_kind]
+        kinds[kind] = {
+            "trials": len(of_kind),
+            "safe": sum(row["safe"] for row in of_kind),
+            "outcomes": {end: ends.count(end) for end in sorted(set(ends))},
+        }
+    return {"trials": len(rows), "safe": sum(row["safe"] for row in rows), "kinds": kinds}

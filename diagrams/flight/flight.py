@@ -1,0 +1,353 @@
+"""One flight: from a scenario to a trajectory and how it ended."""
+
+import enum
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import Context, Diagram, EventStatus
+from pydrake.systems.primitives import VectorLogSink
+
+from splatpilot.diagrams.flight.blocks import goal_of, images_of
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.messaging.flight_limits import LEVEL
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.state import QuadrotorState
+
+
+def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
+    """
+    The state (13,) a flight starts in: level, at rest, facing the goal.
+
+    The position is drawn from the scenario's seed, uniformly from the ball of `start_radius` about
+    the start.
+
+    Raises:
+        InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
+            surface than the vehicle's radius; or if the flight would start at its goal.
+    """
+    p_WG = goal_of(scenario, world)
+    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+    _check_free(world, "start", p_WS)
+    _check_free(world, "goal", p_WG)
+    apart = float(np.linalg.norm(p_WG - p_WS))
+    if apart <= scenario.goal_radius:
+        raise InfeasibleFlightError(
+            f"{world.name} cannot be flown: start and goal are {apart:.2f} m apart, no farther "
+            f"than goal_radius, {scenario.goal_radius} m; name others with start and goal"
+        )
+
+    generator = np.random.default_rng(scenario.seed)
+    p_WB = None
+    # The start itself is free, and so is a neighbourhood of it: the search ends.
+    while p_WB is None or not _is_free(world, p_WB):
+        direction = generator.normal(size=3)
+        distance = scenario.start_radius * generator.uniform() ** (1 / 3)
+        p_WB = p_WS + distance * direction / np.linalg.norm(direction)
+    heading = p_WG - p_WB
+    return hover_state(p_WB, yaw=np.arctan2(heading[1], heading[0]))
+
+
+def _is_free(world: World, p_WQ: np.ndarray) -> bool:
+    sample = world.field_at(0.0).query(p_WQ)
+    return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
+
+
+def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
+    """Raises InfeasibleFlightError unless the vehicle fits at p_WQ (3,) [m]."""
+    field = world.field_at(0.0)
+    sample = field.query(p_WQ)
+    where = f"{what} {np.round(p_WQ, 3).tolist()}"
+    if sample.state >= FieldState.UNKNOWN:
+        known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
+        raise InfeasibleFlightError(
+            f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
+            f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
+        )
+    if sample.distance <= VEHICLE_RADIUS:
+        raise InfeasibleFlightError(
+            f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
+            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more room"
+        )
+
+
+_TOUCH = 0.03  # [m], of clearance, from which on the vehicle stands,
+_TOUCHDOWN_SPEED = 0.8  # [m/s], if it is slower than that.
+
+
+class Outcome(enum.StrEnum):
+    """How a flight ended."""
+
+    GOAL = "goal"
+    COLLISION = "collision"
+    LEFT_VOLUME = "left_volume"
+    TIMEOUT = "timeout"
+    LANDED = "landed"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """What a flight leaves behind; N samples at `LOG_PERIOD` and one at the end."""
+
+    outcome: Outcome
+    times: np.ndarray  # (N,) [s]
+    states: np.ndarray  # (N, 13): p_WB, v_WB, q_WB, w_WB_B
+    commands: np.ndarray  # (N, 4): thrust [m/s^2], body rates [rad/s]
+    # (N,) [m] Distance to the nearest surface less the vehicle's radius; NaN outside the world.
+    clearances: np.ndarray
+    # (M, size) One row a plan, its time first; see splatpilot.systems.policies.hypotheses. (0, 0)
+    # of policies that return none.
+    hypotheses: np.ndarray
+    wall_time: float  # [s] that the simulation took after its initialisation
+    reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
+
+    def summary(self) -> dict[str, float | str]:
+        """The flight in numbers; distances along the samples, speed as path length over time."""
+        p_WB = QuadrotorState.of(self.states).p_WB
+        path_length = float(np.linalg.norm(np.diff(p_WB, axis=0), axis=1).sum())
+        duration = float(self.times[-1])
+        return {
+            "outcome": str(self.outcome),
+            "flight_time_s": duration,
+            "path_length_m": path_length,
+            "mean_speed_m_s": path_length / duration if duration > 0 else 0.0,
+            "min_clearance_m": float(np.nanmin(self.clearances)),
+            "real_time_factor": duration / self.wall_time,
+        } | ({"reason": self.reason} if self.reason else {})
+
+    def save(self, path: Path) -> None:
+        """Writes the arrays of this flight as a compressed .npz file, the same bytes every time."""
+        np.savez_compressed(
+            path,
+            times=self.times,
+            states=self.states,
+            commands=self.commands,
+            clearances=self.clearances,
+            hypotheses=self.hypotheses,
+        )
+
+
+class FlightError(ValueError):
+    """A system of the flight raised; `flight` is what was flown until then."""
+
+    def __init__(self, flight: Flight) -> None:
+        super().__init__(f"the flight ended {flight.reason}")
+        self.flight = flight
+
+
+def fly(
+    diagram: Diagram,
+    scenario: Scenario,
+    world: World,
+    progress: Callable[[float], object] | None = None,
+    realtime_rate: float = 0.0,
+) -> Flight:
+    """
+    Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
+
+    Args:
+        diagram, scenario, world: as built.
+        progress: called with the simulated time [s] now and then.
+        realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
+
+    Returns:
+        The flight. Its outcome is `ERROR` if a system raised `InfeasibleFlightError` after time 0.
+
+    Raises:
+        FlightError: from any other exception after time 0.
+    """
+    simulator = flight_simulator(diagram, scenario, world, progress)
+    simulator.set_target_realtime_rate(realtime_rate)
+    root = simulator.get_mutable_context()
+    # Where a plant that the caller gave starts by default is its own affair.
+    plant_context = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
+    plant_context.SetContinuousState(sample_initial_state(scenario, world))
+    simulator.Initialize()
+    started = time.perf_counter()
+    try:
+        simulator.AdvanceTo(scenario.timeout)
+    except Exception as error:
+        if root.get_time() == 0.0 or isinstance(error, MemoryError):
+            raise
+        wall_time = time.perf_counter() - started
+        flight = record_flight(diagram, root, world, Outcome.ERROR, wall_time)
+        flight = replace(flight, reason=_reason(error, root.get_time(), flight.states[-1]))
+        if isinstance(error, InfeasibleFlightError):
+            return flight
+        raise FlightError(flight) from error
+    wall_time = time.perf_counter() - started
+
+    p_WG = goal_of(scenario, world)
+    ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
+    return record_flight(diagram, root, world, ended, wall_time)
+
+
+def flight_simulator(
+    diagram: Diagram,
+    scenario: Scenario,
+    world: World,
+    progress: Callable[[float], object] | None = None,
+) -> Simulator:
+    """
+    A simulator of a diagram made by `BuildFlightDiagram`, as the scenario has it, that ends when
+    the flight does.
+
+    Args:
+        diagram, scenario, world: as built.
+        progress: called with the simulated time [s] now and then.
+    """
+    scenario.validate()
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scenario.simulator, simulator)
+    p_WG = goal_of(scenario, world)
+
+    def monitor(context: Context) -> EventStatus:
+        if progress is not None:
+            progress(context.get_time())
+        outcome = flight_outcome(diagram, context, p_WG, scenario.goal_radius)
+        if outcome is None:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(diagram, outcome)
+
+    simulator.set_monitor(monitor)
+    return simulator
+
+
+def decision_times(
+    diagram: Diagram, scenario: Scenario, flight: Flight, count: int = 10
+) -> tuple[float, float]:
+    """
+    Mean wall time [s] of a render for the policy, 0 if it does not see, and of its decision
+    without it, at `count` states evenly spaced along a flight.
+    """
+    root = Simulator(diagram).get_mutable_context()
+    plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
+    policy = diagram.GetSubsystemByName("policy")
+    context = policy.GetMyContextFromRoot(root)
+    images = images_of(policy)
+    rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
+    spent = np.zeros((count + 1, 2))  # [s]
+    # The first time through, what is kept for the whole flight is made: it does not count.
+    for k, row in enumerate([0, *rows]):
+        root.SetTime(flight.times[row])
+        plant.SetContinuousState(flight.states[row])
+        started = time.perf_counter()
+        for name in images:
+            policy.GetInputPort(name).Eval(context)
+        rendered = time.perf_counter()
+        if policy.GetUniquePeriodicDiscreteUpdateAttribute() is not None:
+            policy.EvalUniquePeriodicDiscreteUpdate(context)
+        for index in range(policy.num_output_ports()):
+            policy.get_output_port(index).Eval(context)
+        spent[k] = rendered - started, time.perf_counter() - rendered
+    render, decide = spent[1:].mean(axis=0)
+    return float(render), float(decide)
+
+
+def flight_outcome(
+    diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
+) -> Outcome | None:
+    """How the flight ends at this instant; None while it goes on."""
+    if _evaluated(diagram, "in_collision", context)[0]:
+        return Outcome.COLLISION
+    if _evaluated(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
+        return Outcome.LEFT_VOLUME
+    p_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).p_WB
+    if np.linalg.norm(p_WG - p_WB) <= goal_radius:
+        return Outcome.GOAL
+    return None
+
+
+def has_landed(diagram: Diagram, context: Context) -> bool:
+    """Whether the vehicle touches something level, slowly."""
+    v_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).v_WB
+    return bool(
+        _evaluated(diagram, "clearance", context)[0] < _TOUCH
+        and _evaluated(diagram, "gradient", context)[2] > LEVEL
+        and np.linalg.norm(v_WB) < _TOUCHDOWN_SPEED
+    )
+
+
+def record_flight(
+    diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
+) -> Flight:
+    """What a flight left in the loggers of its diagram, which took `wall_time` [s]. After an error
+    no port is evaluated: that could raise it again."""
+    logs = {
+        name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
+        for name in ("state", "command")
+    }
+    times = logs["state"].sample_times().copy()
+    # Copies: what a log returns is a view of memory that the diagram owns.
+    states, commands = (log.data().T.copy() for log in logs.values())
+    if root.get_time() > times[-1] and outcome is not Outcome.ERROR:
+        times = np.append(times, root.get_time())
+        states = np.vstack([states, _evaluated(diagram, "state", root)])
+        commands = np.vstack([commands, _evaluated(diagram, "command", root)])
+    return Flight(
+        outcome=outcome,
+        times=times,
+        states=states,
+        commands=commands,
+        clearances=world.distances(times, QuadrotorState.of(states).p_WB) - VEHICLE_RADIUS,
+        hypotheses=_recorded_plans(diagram, root, outcome is not Outcome.ERROR),
+        wall_time=wall_time,
+    )
+
+
+def _recorded_plans(diagram: Diagram, root: Context, with_last: bool) -> np.ndarray:
+    """All plans that were made (M, size), or (0, 0) of a policy that makes none."""
+    if not diagram.HasOutputPort("hypotheses"):
+        return np.empty((0, 0))
+    sink = cast(VectorLogSink, diagram.GetSubsystemByName("hypotheses_log"))
+    plans = sink.FindLog(root).data().T.copy()
+    # A log samples before the policy updates at the same instant: it lacks the last plan.
+    if with_last:
+        last = _evaluated(diagram, "hypotheses", root)
+        if last[0] != plans[-1, 0]:
+            plans = np.vstack([plans, last])
+    return plans[np.isfinite(plans[:, 0])]
+
+
+def _reason(error: Exception, time: float, state: np.ndarray) -> str:
+    """When and in which state (13,) which exception was raised."""
+    p_WB, v_WB, _, _ = (part.round(2).tolist() for part in QuadrotorState.of(state))
+    kind = "" if isinstance(error, InfeasibleFlightError) else f"{type(error).__name__}: "
+    return f"at t = {time:.2f} s, p_WB = {p_WB} m, v_WB = {v_WB} m/s: {kind}{error}"
+
+
+def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:
+    return np.asarray(diagram.GetOutputPort(port).Eval(context))
+
+
+FLIGHT_FILES = "trajectory.npz", "scenario.yaml", "summary.json"
+
+
+def write_flight(out: Path, scenario: Scenario, flight: Flight) -> None:
+    """
+    Writes into the folder `out`, before anything else is made of the flight:
+
+    - `trajectory.npz`: the arrays of `Flight`;
+    - `scenario.yaml`: the scenario with every field, which gives the same flight again.
+    """
+    with written_atomically(out / "trajectory.npz") as path:
+        flight.save(path)
+    with written_atomically(out / "scenario.yaml") as path:
+        path.write_text(dump_config(scenario))
+
+
+def write_summary(out: Path, summary: dict[str, float | str]) -> None:
+    """Writes `summary.json` into the folder `out`: the flight in numbers."""
+    with written_atomically(out / "summary.json") as path:
+        path.write_text(json.dumps(summary, indent=2) + "\n")

@@ -1,0 +1,253 @@
+"""The closed loop: a vehicle that flies through what its camera sees."""
+
+from typing import cast
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import LogVectorOutput
+from pydrake.systems.sensors import CameraConfig, CameraInfo
+
+from splatpilot.diagrams.flight.blocks import (
+    AddObservation,
+    AddPilot,
+    AddSensors,
+    ConnectObservation,
+    decision_period,
+    goal_of,
+    require_ports,
+    sensors_of,
+)
+from splatpilot.diagrams.flight.flight import sample_initial_state
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.splats.background import Background, mean_color
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
+from splatpilot.systems.visualization.meshcat_drawing import (
+    BallsVisualizer,
+    CameraVisualizer,
+    FlightVisualizer,
+    draw_distance_slice,
+    draw_gaussians,
+    draw_goal,
+    draw_vehicle,
+)
+from splatpilot.systems.visualization.video import VideoRecorder
+
+
+def empty_meshcat(background: Background) -> Meshcat:
+    """A Meshcat in which nothing stands before the background."""
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    for end in ("top_color", "bottom_color"):
+        meshcat.SetProperty("/Background/<object>", end, list(mean_color(background)))
+    return meshcat
+
+
+def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
+    """
+    A Meshcat that shows what stands still: goal, distance field and background.
+
+    Its camera sees the start and the goal from behind and above the start.
+    """
+    meshcat = empty_meshcat(world.background)
+    p_WG = goal_of(scenario, world)
+    draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
+    draw_distance_slice(meshcat, "/splatpilot/distance_slice", world.distance_field, float(p_WG[2]))
+    meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
+
+    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+    p_SG_W = p_WG - p_WS
+    distance = max(float(np.linalg.norm(p_SG_W)), 1e-6)
+    eye = p_WS - 0.2 * p_SG_W + [0.0, 0.0, 3.0 + 0.35 * distance]
+    meshcat.SetCameraPose(eye, p_WS + 0.4 * p_SG_W)
+    return meshcat
+
+
+def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshcat: Meshcat) -> None:
+    """
+    Draws the world's Gaussians and the vehicle, and adds the systems that draw what moves.
+
+    Args:
+        builder: of a flight with `plant`, `policy` and `camera`.
+        scenario, world: what is flown.
+        meshcat: where, as `open_meshcat` has made it.
+    """
+    field = world.distance_field
+    margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings that are drawn too.
+    draw_gaussians(
+        meshcat,
+        "/splatpilot/scene",
+        world.gaussians,
+        field.lower_W - margin,
+        field.upper_W + margin,
+    )
+    draw_vehicle(meshcat, "/splatpilot/vehicle", VEHICLE_RADIUS)
+
+    plant, policy = (builder.GetSubsystemByName(name) for name in ("plant", "policy"))
+    plans = policy.HasOutputPort("hypotheses")
+    FlightVisualizer.AddToBuilder(
+        builder,
+        plant.GetOutputPort("state"),
+        meshcat,
+        policy.GetOutputPort("hypotheses") if plans else None,
+    )
+    if world.moving:
+        BallsVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
+    camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
+    CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
+
+
+LOG_PERIOD = 0.02  # [s]
+
+
+def BuildFlightDiagram(
+    scenario: Scenario,
+    world: World,
+    meshcat: Meshcat | None = None,
+    video: bool = False,
+    camera: bool = True,
+    *,
+    policy: System | None = None,
+    plant: System | None = None,
+    controller: System | None = None,
+) -> Diagram:
+    """
+    Builds the diagram of one flight. Its default Context is the scenario's start, see
+    `sample_initial_state`, which is also what SetRandomContext makes of it: Drake lets no system
+    written in Python draw its state there. Random flights are those of `random_flights`.
+
+    Systems, by name: `plant`, `pose`, `collision`, `goal`, `policy`, `controller`, and the loggers
+    `state_log`, `command_log`; with a camera `camera`; with a policy that sees `policy_camera`,
+    with one that returns hypotheses `selector` and `hypotheses_log`, with one that returns
+    velocities `velocity_tracker`; the sensors under their names;
+    with Meshcat also `flight_visualizer` and `camera_visualizer`, with video `video`.
+
+    .. pydrake_system::
+
+        name: flight
+        output_ports:
+        - state
+        - command
+        - hypotheses
+        - color_image
+        - depth_image_32f
+        - depth_image_16u
+        - clearance
+        - gradient
+        - in_collision
+        - field_state
+
+    The port `hypotheses` is there if the policy has it, the images if there is a camera. Each
+    output `p` of a sensor `s` is there as `s_p`.
+
+    Args:
+        scenario: who flies, how, from where to where.
+        world: what is flown in.
+        meshcat: draws the flight there when given; see `open_meshcat`.
+        video: records the camera's images at its rate, for `VideoRecorder.save` to write.
+        camera: whether the scenario's camera is there; Meshcat and videos need it, flights do not.
+        policy: flies instead of the scenario's. Any system with one of the outputs `hypotheses`
+            (see `splatpilot.systems.policies.hypotheses`), `acceleration`, `velocity` and
+            `waypoint` (3 each), and perhaps `heading` (1), where to look. Its inputs are any of
+            `state` (13), `goal` (3), `depth_image_32f`, `color_image` and `depth_grid` of a camera
+            of its own (its attribute `camera`, an `OnboardCamera`), and the outputs of sensors.
+        plant: flies instead of `QuadrotorPlant`: any system with the input `command` (4), the
+            output `state` (13), and that state as its continuous state; where it is in the default
+            Context is its own affair, but `fly` has it start at the scenario's start.
+        controller: flies instead of `FlatnessController`: any system with the input `state`, that
+            for the policy's output, and the output `command`.
+
+    Raises:
+        InfeasibleFlightError: see `sample_initial_state`.
+        ValueError: for a configuration that no policy or sensor has, a system without the ports it
+            needs, and Meshcat or video without the camera.
+    """
+    if not camera and (video or meshcat is not None):
+        raise ValueError(
+            f"camera is False, but {'video' if video else 'meshcat'} shows its images; leave "
+            "camera out"
+        )
+    scenario.validate()
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    builder = DiagramBuilder()
+    sensors = sensors_of(scenario, policy)
+    if plant is None:
+        plant = cast(
+            System, QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, world))
+        )
+    builder.AddNamedSystem("plant", plant)
+    require_ports("plant", plant, inputs=["command"], outputs=["state"])
+    state = plant.GetOutputPort("state")
+    pilot = AddPilot(builder, scenario, world, state, policy, controller)
+    policy, controller = pilot.policy, pilot.controller
+    builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
+
+    images = AddObservation(builder, scenario, world, state, pilot.pose, policy)
+    measured = AddSensors(builder, sensors, world, state, pilot.pose)
+    ConnectObservation(builder, {"state": state} | images | measured, policy)
+
+    builder.ExportOutput(state, "state")
+    if camera:
+        onboard = builder.AddNamedSystem("camera", MakeCamera(scenario, world))
+        builder.Connect(pilot.pose, onboard.GetInputPort("body_pose"))
+        for name in ("color_image", "depth_image_32f", "depth_image_16u"):
+            builder.ExportOutput(onboard.GetOutputPort(name), name)
+    for name, port in measured.items():
+        builder.ExportOutput(port, name)
+
+    for system, name in ((plant, "state"), (controller, "command")):
+        LogVectorOutput(system.GetOutputPort(name), builder, LOG_PERIOD).set_name(f"{name}_log")
+    if policy.HasOutputPort("hypotheses"):
+        period = decision_period(scenario, policy)
+        log = LogVectorOutput(policy.GetOutputPort("hypotheses"), builder, period)
+        log.set_name("hypotheses_log")
+
+    if meshcat is not None:
+        AddMeshcat(builder, scenario, world, meshcat)
+
+    if video:
+        onboard = cast(SplatCamera, builder.GetSubsystemByName("camera"))
+        VideoRecorder.AddToBuilder(builder, onboard, scenario.camera.fps)
+
+    diagram = builder.Build()
+    diagram.set_name("flight")
+    return diagram
+
+
+def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
+    """The scenario's camera, looking at the world's Gaussians."""
+    config = scenario.camera
+    return SplatCamera(
+        world.baked,
+        camera_info(config),
+        camera_mount(config),
+        min_depth=config.z_near,
+        max_depth=config.z_far,
+        near=config.clipping_near,
+        far=config.clipping_far,
+        background=world.background,
+        moving=world.moving.gaussians if world.moving else None,
+    )
+
+
+def camera_info(config: CameraConfig) -> CameraInfo:
+    """The intrinsics of a camera."""
+    center_x, center_y = config.principal_point()
+    return CameraInfo(
+        width=config.width,
+        height=config.height,
+        focal_x=config.focal_x(),
+        focal_y=config.focal_y(),
+        center_x=center_x,
+        center_y=center_y,
+    )
+
+
+def camera_mount(config: CameraConfig) -> RigidTransform:
+    """X_BC, the pose of a camera in the vehicle's body frame."""
+    return config.X_PB.GetDeterministicValue() @ config.X_BC.GetDeterministicValue()

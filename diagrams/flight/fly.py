@@ -1,0 +1,261 @@
+"""`splatpilot fly`: one flight, with everything a person wants to see of it afterwards."""
+
+import contextlib
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram
+
+from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.flight import (
+    FLIGHT_FILES,
+    Flight,
+    FlightError,
+    fly,
+    sample_initial_state,
+    write_flight,
+    write_summary,
+)
+from splatpilot.diagrams.flight.flight_diagram import (
+    BuildFlightDiagram,
+    camera_info,
+    camera_mount,
+    open_meshcat,
+)
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.files import (
+    holds_folder,
+    require_unused,
+    require_writable_folder,
+    written_atomically,
+)
+from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
+from splatpilot.systems.visualization.pages import (
+    Frames,
+    ReplayedFlight,
+    ReplayView,
+    live_page,
+    replay_page,
+)
+from splatpilot.systems.visualization.video import VideoRecorder
+
+
+def replayed_flight(name: str, flight: Flight, frames: Frames | None) -> ReplayedFlight:
+    """A flight as a page shows it, with what its camera saw."""
+    return ReplayedFlight(
+        name,
+        str(flight.outcome),
+        flight.times,
+        flight.states,
+        flight.clearances,
+        flight.hypotheses,
+        frames,
+    )
+
+
+def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
+    """The pictures of the scenario's camera."""
+    color, depth = zip(*recorder.frames(scenario.camera.z_far), strict=True)
+    return Frames(1 / scenario.camera.fps, color, depth)
+
+
+def write_flight_page(
+    path: Path, scenario: Scenario, world: World, flights: Sequence[ReplayedFlight]
+) -> None:
+    """
+    Writes a page that shows flights from one start to one goal, see `replay_page`.
+
+    Args:
+        path: the file, ending in .html.
+        scenario, world: what was flown.
+        flights: one or more.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    lower, upper = _heights(world)
+    view = ReplayView(
+        X_BC=camera_mount(scenario.camera),
+        fov_y=camera_info(scenario.camera).fov_y(),
+        radius=VEHICLE_RADIUS,
+        lower=lower,
+        upper=upper,
+    )
+    meshcat = open_meshcat(scenario, world)
+    for k in range(len(flights)):
+        draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
+    balls = world.moving.balls if world.moving else None
+    page = replay_page(
+        meshcat.StaticHtml(), world.gaussians, world.background, view, flights, balls
+    )
+    with written_atomically(path) as partial:
+        partial.write_text(page)
+
+
+def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: World) -> None:
+    """
+    Writes a page that shows a flight while it goes on, see `live_page`, at first from above.
+
+    Args:
+        path: the file, ending in .html.
+        meshcat: draws the flight, see `open_meshcat`.
+        scenario, world: what is flown.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    lower, upper = _heights(world)
+    start = world.p_WS if scenario.start is None else scenario.start
+    highest = max(start[2], goal_of(scenario, world)[2])
+    cut = min(highest + 2 * VEHICLE_RADIUS, upper)
+    page = live_page(meshcat, world.gaussians, world.background, (lower, upper), cut)
+    with written_atomically(path) as partial:
+        partial.write_text(page)
+
+
+def _heights(world: World) -> tuple[float, float]:
+    """[m], of a place's floor and ceiling."""
+    field = world.distance_field
+    return float(np.asarray(field.lower_W)[2]), float(np.asarray(field.upper_W)[2])
+
+
+_TRACEBACK = "traceback.txt"
+
+
+@holds_folder("out")
+def run(
+    *,
+    scenario: Scenario,
+    out: Path,
+    live: bool = False,
+    video: bool = True,
+    graphviz: Path | None = None,
+    overwrite: bool = False,
+) -> dict[str, float | str]:
+    """
+    Flies a scenario and leaves in `out`:
+
+    - `flight.html`: a page to watch it in, see `replay_page`;
+    - `flight.mp4`: what the onboard camera saw, colour beside depth;
+    - `traceback.txt`, if an exception other than `InfeasibleFlightError` ended the flight;
+    - what `write_flight` and `write_summary` write, the former before any picture is made.
+
+    Args:
+        live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
+            `live.html` in `out` shows it with the world's Gaussians.
+        video: whether to write `flight.mp4`.
+        graphviz: where to write the diagram as Graphviz source.
+        overwrite: what is there. An earlier flight stays whole until this one has been flown.
+
+    Returns:
+        `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
+
+    Raises:
+        ValueError: for a scenario that cannot be flown.
+        OSError: if `out` holds anything and is not to be overwritten, or cannot be written; nothing
+            is flown then.
+    """
+    scenario.validate()
+    for path in (out, graphviz):
+        if path is not None:
+            require_unused(path, overwrite)
+    if graphviz is not None:
+        require_writable_folder(graphviz.parent)
+    print(f"Building the world, seed {scenario.seed}...", flush=True)
+    world = make_world(scenario.world, scenario.seed)
+    sample_initial_state(scenario, world)  # Refuses a start or goal without room before the rest.
+
+    meshcat = open_meshcat(scenario, world) if live else None
+    if meshcat is not None:
+        page = out / "live.html"
+        write_live_page(page, meshcat, scenario, world)
+        print(
+            f"Watch the flight: open {page}, or {meshcat.web_url()} without Gaussians", flush=True
+        )
+    diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
+    if graphviz is not None:
+        with written_atomically(graphviz) as path:
+            path.write_text(diagram.GetGraphvizString())
+    failure = None
+    try:
+        flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
+    except FlightError as error:
+        flight, failure = error.flight, error
+    for name in ("flight.html", "flight.mp4", _TRACEBACK, *FLIGHT_FILES):
+        (out / name).unlink(missing_ok=True)
+    write_flight(out, scenario, flight)
+    if failure is not None:
+        with written_atomically(out / _TRACEBACK) as path:
+            path.write_text("".join(traceback.format_exception(failure)))
+    camera = cast(SplatCamera, diagram.GetSubsystemByName("camera"))
+    summary = flight.summary() | {"render_ms": _render_ms(camera, flight)}
+    write_summary(out, summary)
+    recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
+    frames = recorded_frames(recorder, scenario)
+    name = f"{world.name}, seed {scenario.seed}"
+    shown = replayed_flight(name, flight, frames)
+    write_flight_page(out / "flight.html", scenario, world, [shown])
+    written = ["flight.html", *FLIGHT_FILES, *([_TRACEBACK] if failure is not None else [])]
+    if video:
+        recorder.save(out / "flight.mp4", scenario.camera.z_far)
+        written.insert(1, "flight.mp4")
+
+    print(format_summary(summary))
+    print(f"Wrote {', '.join(written)} in {out}")
+    if live:
+        with contextlib.suppress(EOFError):
+            input("Press Enter to stop serving Meshcat. ")
+    return summary
+
+
+def fly_with_bar(
+    diagram: Diagram, scenario: Scenario, world: World, realtime_rate: float = 0.0
+) -> Flight:
+    """`fly`, with a progress bar of simulated time."""
+    layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
+    with Progress(total=scenario.timeout, desc="flying", bar_format=layout, leave=False) as bar:
+        return fly(
+            diagram,
+            scenario,
+            world,
+            progress=lambda now: bar.update(now - bar.n),
+            realtime_rate=realtime_rate,
+        )
+
+
+def format_summary(summary: dict[str, float | str]) -> str:
+    """The summary as a table of two columns."""
+    rows = (
+        ("outcome", "outcome", "{}"),
+        ("flight time", "flight_time_s", "{:.2f} s"),
+        ("path length", "path_length_m", "{:.2f} m"),
+        ("mean speed", "mean_speed_m_s", "{:.2f} m/s"),
+        ("minimum clearance", "min_clearance_m", "{:+.3f} m"),
+        ("real-time factor", "real_time_factor", "{:.1f}"),
+        ("render", "render_ms", "{:.1f} ms"),
+    )
+    return "\n".join(f"{title:<18} {form.format(summary[key])}" for title, key, form in rows)
+
+
+def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:
+    """Mean time of a render at poses evenly spaced along a flight [ms]."""
+    rows = np.linspace(0, len(flight.states) - 1, num_views).astype(int)
+    poses = [pose_from_state(state) for state in flight.states[rows]]
+    started = time.perf_counter()
+    for X_WB in poses:
+        camera.render(X_WB)
+    return (time.perf_counter() - started) / num_views * 1e3

@@ -1,0 +1,214 @@
+"""All policies: their configurations, their names, and how each becomes a system."""
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from pydrake.systems.framework import System
+
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.config import require_configuration
+from splatpilot.systems.common.messages import require
+from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from splatpilot.systems.policies.checkpoint import policy_of, shipped_weights
+from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
+from splatpilot.systems.policies.diffaero import (
+    DiffAero,
+    DiffAeroConfig,
+    DiffAeroTof,
+    DiffAeroTofConfig,
+)
+from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgb, DiffAeroRgbConfig
+from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig
+from splatpilot.systems.policies.reactive import Reactive, ReactiveConfig
+from splatpilot.systems.policies.straight import Straight, StraightConfig
+from splatpilot.systems.policies.student import (
+    PilotRgbConfig,
+    Student,
+    StudentDepthConfig,
+    StudentRgbConfig,
+)
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
+
+
+class PolicyConfig(Protocol):
+    """
+    The configuration of a policy: a dataclass that imports without torch.
+
+    Beside what follows it may have `camera`, an `OnboardCamera` through which the policy sees;
+    `sensors`, a dictionary of the configurations of others (`diagrams/flight/sensors.py`); and
+    `weights`,
+    a file of weights.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def rate(self) -> float:
+        """[Hz], of decisions."""
+        ...
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        ...
+
+
+@dataclass(frozen=True)
+class PolicyKind:
+    """How a policy is configured and built."""
+
+    config: type
+    """The type of its configurations."""
+    build: Callable[[Any, World, QuadrotorParams], System]
+    """From a configuration, the world (for privileged policies) and what is known of the vehicle
+    to a system with the ports that `BuildFlightDiagram` connects."""
+    speed_field: str
+    """Where in the configuration the nominal speed [m/s] stands, as `speed` or `lattice.speed`;
+    empty if nobody can ask it for one."""
+
+
+POLICIES = Registry("policy", "splatpilot.policies", PolicyKind)
+"""All policies by name."""
+
+
+def register_policy(
+    config: type,
+    build: Callable[[Any, World, QuadrotorParams], System],
+    *,
+    name: str = "",
+    speed_field: str = "speed",
+) -> None:
+    """
+    Makes a policy known, so that scenarios, studies and the command line can name it.
+
+    Args:
+        config: the type of its configurations, see `PolicyConfig`; its name is their YAML tag.
+        build: see `PolicyKind.build`.
+        name: of the policy; that of the type without "Config", in small letters, if empty.
+        speed_field: see `PolicyKind.speed_field`; a configuration that has no `speed` cannot be
+            asked for one.
+
+    Raises:
+        ValueError: if another policy has the name, or the type is none of configurations.
+    """
+    require_configuration(config)
+    if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
+        speed_field = ""
+    kind = PolicyKind(config, build, speed_field)
+    POLICIES.add(name or config.__name__.removesuffix("Config").lower(), kind)
+
+
+register_policy(
+    PrivilegedPlannerConfig,
+    lambda config, world, vehicle: PrivilegedPlanner(
+        world.esdf, config, vehicle, world.moving.balls if world.moving else None
+    ),
+    name="planner",
+    speed_field="lattice.speed",
+)
+register_policy(StraightConfig, lambda config, world, vehicle: Straight(config))
+register_policy(ReactiveConfig, lambda config, world, vehicle: Reactive(config))
+register_policy(DiffAeroConfig, lambda config, world, vehicle: DiffAero(config))
+register_policy(DepthNavConfig, lambda config, world, vehicle: DepthNav(config))
+register_policy(
+    AgileAutonomyConfig,
+    lambda config, world, vehicle: AgileAutonomy(config),
+    name="agile_autonomy",
+)
+
+DEFAULT_SPEED, MAX_SPEED = 2.0, 20.0
+"""[m/s], the nominal speed if none is given, and the largest that a policy can be given."""
+
+BENCHMARK_POLICIES = tuple(POLICIES.registered())
+"""Those that a study flies when nobody says which: our own, whatever else is installed, but for
+those that see by a sensor of their own."""
+
+
+register_policy(
+    DiffAeroTofConfig, lambda config, world, vehicle: DiffAeroTof(config), name="diffaero_tof"
+)
+
+register_policy(
+    DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
+)
+
+for _config, _name in (
+    (StudentRgbConfig, "student_rgb"),
+    (StudentDepthConfig, "student_depth"),
+    (PilotRgbConfig, "pilot_rgb"),
+):
+    register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
+
+
+def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
+    """
+    The configuration of a policy for a nominal speed.
+
+    Args:
+        name: of the policy, `module:attribute` of one that is not installed, or a file of weights
+            (.npz) that one was trained to.
+        speed: [m/s].
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if there is no such policy, the file holds none, or it does not fly at this
+            speed.
+    """
+    weights = name if name.endswith(".npz") else ""
+    kind = POLICIES.find(policy_of(weights) if weights else name)
+    config = kind.config()
+    if kind.speed_field:
+        config = at_speed(config, speed)
+    if weights:
+        config = replace(config, weights=weights)
+    config.validate()
+    return config
+
+
+def at_speed(config: Any, speed: float) -> Any:
+    """
+    The configuration of a policy, for another nominal speed [m/s].
+
+    Raises:
+        ValueError: for a policy that cannot be asked for one.
+    """
+    field = POLICIES.kind_of(config).speed_field
+    if not field:
+        raise ValueError(
+            f"the policy {name_of(config)} flies as fast as it has learned, not at {speed:g} m/s; "
+            "leave the speed out"
+        )
+    require(0.0 < speed <= MAX_SPEED, "the speed", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
+    return _with_field(config, field, speed)
+
+
+def speed_of(config: Any) -> float | None:
+    """The nominal speed [m/s] of a policy; None of one that cannot be asked for one."""
+    field = POLICIES.kind_of(config).speed_field
+    return operator.attrgetter(field)(config) if field else None
+
+
+def name_of(config: Any) -> str:
+    """The name of the policy that a configuration is of.
+
+    Raises:
+        ValueError: if it is of none.
+    """
+    return POLICIES.name_of(POLICIES.kind_of(config))
+
+
+def weights_file(config: Any) -> Path | None:
+    """Returns the file of weights that a policy flies by; None if it has none."""
+    given = getattr(config, "weights", None)
+    file = Path(given) if given else shipped_weights(name_of(config))
+    return file if given is not None and file.is_file() else None
+
+
+def _with_field(config: Any, field: str, value: float) -> Any:
+    name, _, rest = field.partition(".")
+    return replace(
+        config, **{name: _with_field(getattr(config, name), rest, value) if rest else value}
+    )

@@ -1,0 +1,190 @@
+"""Courses of the DodgeDrone challenge (ICRA 2022): balls in the air, some of which move."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatpilot.diagrams.worlds.building_blocks import daylight, ground
+from splatpilot.diagrams.worlds.forest.scenery import trees_around
+from splatpilot.diagrams.worlds.solids.shading import Illumination
+from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
+from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.surfels import build, draw
+from splatpilot.diagrams.worlds.world import MovingBodies, World
+from splatpilot.systems.collision.shapes import MovingBalls, Sphere
+from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.scene import GaussianScene
+
+Array = NDArray[np.float64]
+type Triple = tuple[float, float, float]
+
+SEED = 20220301
+"""Of the generator, as it was published."""
+
+PERIOD = 0.02
+"""[s] between the rows of a path."""
+
+_ROWS = 1500
+"""Rows of a path that never leaves its region: 30 s."""
+
+_KEPT_FREE = ((-3.0, -3.0, 0.0), (3.0, 3.0, 5.0)), ((57.0, -3.0, 0.0), (61.0, 3.0, 5.0))
+"""[m] Corners of the boxes about start and target; an obstacle is nowhere while its centre is in
+one of them."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Obstacles that are drawn alike."""
+
+    count: int
+    lower: Triple  # [m], corners of the region of their centres
+    upper: Triple
+    diameters: tuple[float, float]  # [m], least and largest
+    speed: Triple = (0.0, 0.0, 0.0)  # [m/s], largest along each axis at first; zero: they stand
+    acceleration: float = 0.0  # [m/s^2], largest along each axis, another one every row
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A ball, and where it goes."""
+
+    radius: float  # [m]
+    path: Array  # (rows, 3) [m], one row if it stands; infinite where it is nowhere
+
+
+_ALL = (0.0, -10.0, 0.0), (60.0, 10.0, 10.0)
+_FROM_20 = (20.0, -10.0, 0.0), (60.0, 10.0, 10.0)
+_FROM_40 = (40.0, -10.0, 0.0), (60.0, 10.0, 10.0)
+_ANY, _MIDDLE, _SMALL = (0.1, 3.0), (0.5, 2.0), (0.5, 1.5)
+
+LEVELS: dict[str, tuple[Group, ...]] = {
+    "easy": (
+        Group(76, *_ALL, _ANY),
+        Group(9, *_FROM_20, _MIDDLE, (5.0, 5.0, 2.0)),
+    ),
+    "medium": (
+        Group(384, *_ALL, _ANY),
+        Group(88, *_FROM_20, _MIDDLE, (1.0, 1.0, 1.0)),
+        Group(84, *_FROM_40, _ANY),
+        Group(44, *_FROM_40, _SMALL, (1.0, 1.0, 1.0), 5.0),
+    ),
+    "hard": (
+        Group(246, (0.0, -10.0, 0.0), (30.0, 10.0, 10.0), _ANY),
+        Group(132, *_ALL, _ANY),
+        Group(328, *_FROM_20, _MIDDLE, (3.0, 3.0, 2.0)),
+        Group(50, (40.0, -4.0, 0.0), (60.0, 4.0, 10.0), _SMALL, (1.0, 1.0, 1.0), 10.0),
+    ),
+}
+"""The challenge's levels: medium as in its published configuration, easy and hard as in the lists
+of obstacles that came with it."""
+
+
+def draw_obstacles(groups: tuple[Group, ...], seed: int) -> list[Obstacle]:
+    """Draws the obstacles of all groups in order; the same seed, the same bits."""
+    rng = np.random.RandomState(seed)
+    return [_draw(group, rng) for group in groups for _ in range(group.count)]
+
+
+def _draw(group: Group, rng: np.random.RandomState) -> Obstacle:
+    moves, accelerates = any(group.speed), group.acceleration > 0
+    rows, speed = _ROWS if moves else 1, np.array(group.speed)
+    lower, upper = np.array(group.lower), np.array(group.upper)
+    diameter = rng.uniform(*group.diameters)
+    acceleration = np.zeros((rows, 3))
+    if accelerates:
+        acceleration = rng.rand(rows, 3) * 2 * group.acceleration - group.acceleration
+        rng.rand(3)  # body rates
+    velocity = np.zeros(3)
+    if moves:
+        velocity = rng.rand(3) * 2 * speed - speed
+    rng.rand(3)  # attitude
+    place = rng.rand(3) * (upper - lower) + lower
+    velocities = velocity + np.cumsum(acceleration, axis=0) * PERIOD
+    path = place + np.cumsum(velocities, axis=0) * PERIOD
+    # It ends where it leaves the region.
+    outside = ((path > upper) | (path < lower)).any(axis=1)
+    if outside.any():
+        path = path[: max(1, int(np.argmax(outside)))]
+    for low, high in _KEPT_FREE:
+        path[((path > low) & (path < high)).all(axis=1)] = np.inf
+    return Obstacle(diameter / 2, path)
+
+
+_PLOT = Plot(np.array([-5.0, -10.0, 0.0]), np.array([65.0, 10.0, 10.0]))
+"""The volume that must not be left."""
+
+# The vehicle takes off to 1 m, and must fly 60 m along x. The goal lies 3 m behind, in the middle
+# of the height that is kept free: who comes within 3 m of it has arrived.
+_P_WS = np.array([0.0, 0.0, 1.0])
+_P_WG = np.array([63.0, 0.0, 2.5])
+
+_STANDING, _MOVING = ("stone", "concrete", "metal"), "hazard"
+
+
+@dataclass
+class DodgeDroneConfig:
+    """A course of the challenge, on an open field."""
+
+    # easy, medium or hard.
+    level: str = "medium"
+    # Of the challenge's generator for the course of seed 0; the next one for that of seed 1.
+    first_seed: int = SEED
+    voxel_size: float = 0.2  # [m] of the distance grid
+
+    def validate(self) -> None:
+        """Raises ValueError for the first value with which no course can be made."""
+        if self.level not in LEVELS:
+            raise ValueError(f"level = {self.level!r} must be one of {', '.join(LEVELS)}")
+        if not 0 <= self.first_seed < 2**31:
+            raise ValueError(f"first_seed = {self.first_seed} must be 0 to {2**31 - 1}")
+        if not 0.05 <= self.voxel_size <= 1.0:
+            raise ValueError(f"voxel_size = {self.voxel_size} m must be 0.05 to 1 m")
+
+
+def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
+    """The course of `config` and `seed`: whatever was drawn, also where no way is wide enough.
+
+    Raises:
+        ValueError: for values with which no course can be made.
+    """
+    config.validate()
+    rng = np.random.default_rng([seed, 0])
+    obstacles = draw_obstacles(LEVELS[config.level], config.first_seed + seed)
+    standing = [o for o in obstacles if len(o.path) == 1 and np.isfinite(o.path).all()]
+    moving = [o for o in obstacles if len(o.path) > 1]
+    hour, light = daylight(rng)
+    blueprint = Blueprint(
+        name=f"dodgedrone_{config.level}",
+        lower_W=_PLOT.lower,
+        upper_W=_PLOT.upper,
+        solids=[ground("concrete")]
+        + [
+            Solid(Sphere(o.path[0], o.radius), _STANDING[rng.integers(3)], int(rng.integers(1000)))
+            for o in standing
+        ],
+        p_WS=_P_WS,
+        p_WG=_P_WG,
+        light=light,
+        surroundings=trees_around(_PLOT, hour, seed),
+        seed=seed,
+        voxel_size=config.voxel_size,
+    )
+    world = build(blueprint)
+    balls = MovingBalls([o.radius for o in moving], [o.path for o in moving], PERIOD)
+    sun = light(world.esdf)
+    bodies = [_draw_body(o, blueprint, sun) for o in moving]
+    return replace(world, moving=MovingBodies(balls, MovingGaussians(bodies, balls.centers)))
+
+
+def _draw_body(obstacle: Obstacle, course: Blueprint, light: Illumination) -> GaussianScene:
+    """The Gaussians of a ball that moves, about its centre, lit as where it first is."""
+    present = obstacle.path[np.isfinite(obstacle.path).all(axis=1)]
+    center = present[0] if len(present) else course.p_WS
+    solid = Solid(Sphere(center, obstacle.radius), _MOVING)
+    # It is seen from all sides sooner or later, and nothing hides it for ever.
+    alone = replace(
+        course, solids=[solid], lower_W=course.lower_W - 100.0, upper_W=course.upper_W + 100.0
+    )
+    body = draw(alone, [solid], light)
+    return replace(body, means=body.means - center.astype(np.float32))

@@ -1,0 +1,144 @@
+"""All worlds: their configurations, and how each becomes a world."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from splatpilot.diagrams.worlds.dodgedrone import DodgeDroneConfig, dodgedrone_world
+from splatpilot.diagrams.worlds.forest.forest import forest_blueprint
+from splatpilot.diagrams.worlds.forest.layout import ForestConfig
+from splatpilot.diagrams.worlds.indoor import (
+    OfficeConfig,
+    RoomConfig,
+    office_blueprint,
+    room_blueprint,
+)
+from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
+from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
+from splatpilot.diagrams.worlds.outdoor import (
+    BranchesConfig,
+    ClutterConfig,
+    OverUnderConfig,
+    WallsConfig,
+    branches_blueprint,
+    clutter_blueprint,
+    over_under_blueprint,
+    walls_blueprint,
+)
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_world
+from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.surfels import build
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.config import require_configuration
+from splatpilot.systems.common.registry import Registry
+
+
+class WorldConfig(Protocol):
+    """The configuration of a world: a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def validate(self) -> None:
+        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        ...
+
+
+@dataclass(frozen=True)
+class WorldKind:
+    """How a world is configured and made."""
+
+    config: type  # the type of its configurations
+    # From a configuration and a seed to a world: the same arguments, the same bits.
+    make: Callable[[Any, int], World]
+    # The same world as solids, start and goal, if it is generated: cheap.
+    make_blueprint: Callable[[Any, int], Blueprint] | None = None
+
+
+WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
+"""All worlds, by the names of their configurations' types."""
+
+
+def register_world(
+    config: type,
+    make: Callable[[Any, int], World] | None = None,
+    make_blueprint: Callable[[Any, int], Blueprint] | None = None,
+) -> None:
+    """
+    Makes a kind of world known, so that scenarios can name it by its configuration's type.
+
+    Args:
+        config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
+        make: see `WorldKind.make`; draws and samples the blueprint if None.
+        make_blueprint: see `WorldKind.make_blueprint`; needed to train and render captures in it.
+
+    Raises:
+        ValueError: if another world has the name, the type is none of configurations, or neither
+            function is given.
+    """
+    if make is None:
+        if make_blueprint is None:
+            raise ValueError(f"{config.__name__}: give make or make_blueprint")
+        plan = make_blueprint
+        make = lambda config, seed: build(plan(config, seed))  # noqa: E731
+    require_configuration(config)
+    WORLDS.add(config.__name__, WorldKind(config, make, make_blueprint))
+
+
+def make_world(config: WorldConfig, seed: int) -> World:
+    """
+    Generates or reads the world that `config` describes.
+
+    Args:
+        config: which kind of world, and its parameters.
+        seed: of what is random: generated worlds, what is put into scenes, and start and goal where
+            they are drawn.
+
+    Raises:
+        ValueError: for a configuration that no kind of world has, parameters no world can be made
+            of, and damaged scenes.
+        FileNotFoundError: for a scene that is not there.
+    """
+    world = WORLDS.kind_of(config).make(config, seed)
+    if not isinstance(world, World):
+        made = type(world).__name__
+        raise ValueError(f"what makes {type(config).__name__} gave {made}; it must return a World")
+    return world
+
+
+def place_config(path: Path) -> SceneConfig | OctomapConfig:
+    """The world of a place on disk: an OctoMap by its suffix, or else a scene."""
+    kind = OctomapConfig if path.suffix.lower() == OCTOMAP else SceneConfig
+    return kind(path=str(path))
+
+
+def is_procedural(config: WorldConfig) -> bool:
+    """Whether the world is generated, so that `make_blueprint` makes it too."""
+    return WORLDS.kind_of(config).make_blueprint is not None
+
+
+def make_blueprint(config: WorldConfig, seed: int) -> Blueprint:
+    """
+    Generates a procedural world as solids, start and goal, without Gaussians and grids: cheap.
+    `write_gltf` exports it as a mesh, `make_world` of the same arguments gives the same world.
+
+    Raises:
+        ValueError: for a world that is not generated, and parameters no world can be made of.
+    """
+    plan = WORLDS.kind_of(config).make_blueprint
+    if plan is None:
+        raise ValueError(f"{type(config).__name__} is no generated world: it has no blueprint")
+    return plan(config, seed)
+
+
+register_world(ForestConfig, make_blueprint=forest_blueprint)
+register_world(BranchesConfig, make_blueprint=branches_blueprint)
+register_world(ClutterConfig, make_blueprint=clutter_blueprint)
+register_world(WallsConfig, make_blueprint=walls_blueprint)
+register_world(RoomConfig, make_blueprint=room_blueprint)
+register_world(OfficeConfig, make_blueprint=office_blueprint)
+register_world(OverUnderConfig, make_blueprint=over_under_blueprint)
+register_world(SceneConfig, read_scene_world)
+register_world(InsertedConfig, inserted_world)
+register_world(OctomapConfig, octomap_world)
+register_world(DodgeDroneConfig, dodgedrone_world)

@@ -1,0 +1,61 @@
+"""Seeds of worlds and flights: each range serves one purpose, and no two ranges overlap.
+
+| seeds | purpose |
+|---|---|
+| 0 to 99 | development: studies by which policies, worlds and defaults are chosen |
+| 1,000 to 999,999 | test: studies that are reported, of what is no longer changed |
+| from 1,000,000 | training, `SEEDS_PER_RUN` a run |
+| from 2,000,000 | validation: choose among checkpoints |
+| from 3,000,000 | Monte Carlo simulations |
+"""
+
+from splatpilot.systems.common.messages import require
+
+MAX_SEED = 2**31 - 1
+TRAINING_SEEDS = 1_000_000
+VALIDATION_SEEDS = 2_000_000
+SEEDS_PER_RUN = 1000
+
+STUDY_SEEDS = {"dev": range(100), "test": range(1000, TRAINING_SEEDS)}
+"""The seeds of a study, by its split."""
+
+SPLIT_NAMES = {"dev": "development", "test": "test"}
+
+MONTE_CARLO_SEEDS = range(3_000_000, 4_000_000)
+
+
+def study_seeds(split: str, count: int) -> range:
+    """
+    Returns the first `count` seeds of a study's split.
+
+    Raises:
+        ValueError: for an unknown split, or if the split has fewer seeds.
+    """
+    if split not in STUDY_SEEDS:
+        raise ValueError(f"split must be one of {', '.join(STUDY_SEEDS)}, got {split!r}")
+    seeds = STUDY_SEEDS[split]
+    if not 1 <= count <= len(seeds):
+        raise ValueError(f"seeds of split {split} must be in [1, {len(seeds)}], got {count}")
+    return seeds[:count]
+
+
+def describe_seeds(split: str, count: int) -> str:
+    """Describes the seeds of a study, as "development seeds 0 to 19"."""
+    seeds = study_seeds(split, count)
+    return f"{SPLIT_NAMES[split]} seeds {seeds[0]} to {seeds[-1]}"
+
+
+def check_seed(seed: int) -> None:
+    """Raises ValueError unless a seed is in [0, `MAX_SEED`]."""
+    require(0 <= seed <= MAX_SEED, "seed", f"in [0, {MAX_SEED}]", seed)
+
+
+def first_training_seed(run: int) -> int:
+    """Returns the first of the `SEEDS_PER_RUN` seeds of a training run, named by its own seed.
+
+    Raises:
+        ValueError: for a run whose seeds would reach into those of validation.
+    """
+    runs = (VALIDATION_SEEDS - TRAINING_SEEDS) // SEEDS_PER_RUN
+    require(0 <= run < runs, "seed", f"in [0, {runs - 1}]", run)
+    return TRAINING_SEEDS + run * SEEDS_PER_RUN

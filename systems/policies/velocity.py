@@ -1,0 +1,138 @@
+"""From velocities that are wanted to accelerations that a vehicle can fly."""
+
+import math
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from splatpilot.systems.common.drake import input_port, optional_input, output_port
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, heading_along_motion
+from splatpilot.systems.vehicle.state import QuadrotorState
+
+RESPONSE_TIME = 0.4
+"""[s], time constant with which a wanted velocity is approached; the attitude's own is 0.1 s."""
+
+MAX_ACCELERATION = 6.0
+"""[m/s^2], of what is asked for: a tilt of 31 degrees."""
+
+_SLOWING_TIME = 0.75  # [s], of flight at full speed before the goal in which the speed falls.
+
+
+def approach_velocity(p_WB: np.ndarray, p_WG: np.ndarray, speed: float) -> np.ndarray:
+    """The velocity v_WB (3,) [m/s] straight to the goal at `speed`, falling linearly near it."""
+    to_goal = p_WG - p_WB
+    distance = float(np.sqrt(to_goal.dot(to_goal)))
+    return to_goal * (speed / max(distance, _SLOWING_TIME * speed))
+
+
+def tracking_acceleration(v_WB: np.ndarray, v_wanted: np.ndarray) -> np.ndarray:
+    """The acceleration (3,) [m/s^2] that lets v_WB approach `v_wanted` (3,) [m/s] exponentially.
+
+    a = (v_wanted - v_WB) / 0.4 s, shortened to 6 m/s^2.
+    """
+    acceleration = (v_wanted - v_WB) / RESPONSE_TIME
+    size = float(np.sqrt(acceleration.dot(acceleration)))
+    return acceleration * min(1.0, MAX_ACCELERATION / size) if size > 0.0 else acceleration
+
+
+class VelocityTracker(LeafSystem):
+    """Does what an autopilot does that is told velocities.
+
+    .. pydrake_system::
+
+        name: VelocityTracker
+        input_ports:
+        - state
+        - velocity
+        output_ports:
+        - acceleration
+
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``velocity`` (3): wanted v_WB [m/s], W frame.
+    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
+
+    Stateless; the law is
+    :func:`~splatpilot.systems.policies.velocity.tracking_acceleration`.
+    """
+
+    state_input_port = input_port("state")
+    velocity_input_port = input_port("velocity")
+    acceleration_output_port = output_port("acceleration")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorInputPort("velocity", 3)
+        self.DeclareVectorOutputPort("acceleration", 3, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
+        wanted = np.asarray(self.GetInputPort("velocity").Eval(context))
+        output.SetFromVector(tracking_acceleration(state.v_WB, wanted))
+
+
+class VelocitySetpoint(LeafSystem):
+    """Says at which velocity a policy's decision would be flown.
+
+    .. pydrake_system::
+
+        name: VelocitySetpoint
+        input_ports:
+        - state
+        - waypoint
+        - acceleration
+        - velocity
+        - heading
+        output_ports:
+        - velocity_setpoint
+
+    - ``state`` (13), ``waypoint`` (3), ``acceleration`` (3), ``heading`` (1): those of
+      :class:`~splatpilot.systems.vehicle.flatness.FlatnessController`.
+    - ``velocity`` (3): v [m/s], W frame. Connect exactly one of ``waypoint``, ``acceleration`` and
+      ``velocity``.
+    - ``velocity_setpoint`` (4): v [m/s], W frame, and the heading [rad].
+
+    Stateless. Of the others, with T the time in which an autopilot takes a velocity up, and that to
+    the waypoint::
+
+        v = v_WB + T a_WB,  T = RESPONSE_TIME
+        v = (p_WR - p_WB) / lookahead
+
+    An autopilot keeps its heading where it is given none. Therefore a heading that is not connected
+    or NaN becomes that along the motion, as the controller has it: toward the waypoint, else along
+    v_WB, from the present heading as far as ``heading_along_motion`` says.
+    """
+
+    state_input_port = input_port("state")
+    velocity_input_port = input_port("velocity")
+    waypoint_input_port = input_port("waypoint")
+    acceleration_input_port = input_port("acceleration")
+    heading_input_port = input_port("heading")
+    velocity_setpoint_output_port = output_port("velocity_setpoint")
+
+    def __init__(self, controller: FlatnessControllerConfig):
+        """Constructs the system; of the controller it has `lookahead` and `yaw_speed`."""
+        super().__init__()
+        self._lookahead, self._yaw_speed = controller.lookahead, controller.yaw_speed
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorInputPort("waypoint", 3)
+        self.DeclareVectorInputPort("acceleration", 3)
+        self.DeclareVectorInputPort("velocity", 3)
+        self.DeclareVectorInputPort("heading", 1)
+        self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
+        velocity, waypoint, heading = (
+            optional_input(self, name, context) for name in ("velocity", "waypoint", "heading")
+        )
+        motion_W = state.v_WB
+        if velocity is None and waypoint is not None:
+            velocity = motion_W = (waypoint - state.p_WB) / self._lookahead
+        elif velocity is None:
+            a_WB = np.asarray(self.GetInputPort("acceleration").Eval(context))
+            velocity = state.v_WB + RESPONSE_TIME * a_WB
+        if heading is None or math.isnan(heading[0]):
+            along, fraction = heading_along_motion(motion_W, self._yaw_speed)
+            heading = state.heading + fraction * math.remainder(along - state.heading, math.tau)
+        output.SetFromVector(np.append(velocity, heading))

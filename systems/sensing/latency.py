@@ -1,0 +1,139 @@
+"""When a camera takes its frames, and which of them has come."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.vehicle.state import pose_from_state
+
+CYCLE = 64
+"""Frames whose delays differ; those of the frames that follow are the same again."""
+
+_SPARE = 8  # Frames that may be lost one after another; if more are, the last of them is seen.
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTimes:
+    """Frame k is taken at (k + phase) / rate, and comes `delays[k % CYCLE]` later.
+
+    Without a rate, one is taken whenever somebody looks, and comes `delays[0]` later.
+    """
+
+    delays: np.ndarray  # (CYCLE,) or (1,) [s], infinite of frames that never come
+    rate: float | None = None  # [Hz]
+    phase: float = 0.0  # [-]
+    lookback: int = 0  # [-] Frames that are looked through.
+    before: float = 0.0  # [s] By how much something else happened before a frame was taken.
+
+    @classmethod
+    def late(cls, latency: float) -> "FrameTimes":
+        """Frames of whenever somebody looks, `latency` [s] late."""
+        return cls(np.array([latency]))
+
+    @classmethod
+    def draw(cls, noise: ObservationNoise, seed: int) -> "FrameTimes":
+        """Those of one flight."""
+        if not noise.frame_rate:
+            return cls.late(noise.latency)
+        lower, upper = noise.frame_rate
+        random = np.random.default_rng([seed, CYCLE])
+        rate, phase = random.uniform(lower, upper), random.random()
+        delays = frame_delays(noise, *random.random((2, CYCLE)))
+        return cls(delays, rate, phase, lookback(noise))
+
+    def age(self, time: float) -> float:
+        """[s], at a time [s], of the last frame that has come, or of what happened `before`."""
+        if self.rate is None:
+            return float(self.delays[0]) + self.before
+        newest = math.floor(time * self.rate - self.phase)
+        age = 0.0
+        for number in range(newest, newest - self.lookback, -1):
+            age = time - (number + self.phase) / self.rate
+            if self.delays[number % CYCLE] <= age:
+                break
+        return age + self.before
+
+    @property
+    def oldest(self) -> float:
+        """[s], that no age exceeds."""
+        oldest = float(self.delays[0]) if self.rate is None else self.lookback / self.rate
+        return oldest + self.before
+
+
+def frame_delays(noise: ObservationNoise, late: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """How late frames come [s], infinite if never: of numbers drawn from U(0, 1), of any shape."""
+    return np.where(lost < noise.frame_dropout, np.inf, noise.latency + noise.jitter * late)
+
+
+def lookback(noise: ObservationNoise) -> int:
+    """How many frames there may be between the newest that was taken and the newest that came."""
+    return math.ceil((noise.latency + noise.jitter) * max(noise.frame_rate)) + _SPARE
+
+
+class DelayedPose(LeafSystem):
+    """The pose within a quadrotor's state when the last frame was taken that has come.
+
+    .. pydrake_system::
+
+        name: DelayedPose
+        input_ports:
+        - state
+        output_ports:
+        - pose
+
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``pose`` (abstract, RigidTransform): X_WB at ``now - age``, the age that of the last frame;
+      before there is anything that old, the earliest known.
+
+    The discrete state holds samples of time and state every ``period`` (0.02 s); between them
+    the state is interpolated linearly, and its quaternion normalised.
+    """
+
+    state_input_port = input_port("state")
+    pose_output_port = output_port("pose")
+
+    def __init__(self, frames: FrameTimes, period: float = 0.02) -> None:
+        """Constructs the system.
+
+        Args:
+            frames: when they are taken, and when they come.
+            period: time between samples [s].
+
+        Raises:
+            ValueError: if a delay of frames is negative, or `period` not positive.
+        """
+        super().__init__()
+        if not (frames.delays.min() >= 0.0 and math.isfinite(frames.oldest) and period > 0.0):
+            raise ValueError(
+                f"DelayedPose: frames come {frames.delays.min()} s late and the period is "
+                f"{period} s; they must be at least 0 and finite, and more than 0"
+            )
+        self._frames = frames
+        samples = math.ceil(frames.oldest / period) + 1
+        self._state_port = self.DeclareVectorInputPort("state", 13)
+        self.DeclareDiscreteState(np.full(samples * 14, np.nan))
+        calc = weakly(self._calc_pose)
+        self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), calc)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+
+    def _samples(self, context: Context) -> np.ndarray:
+        """Rows of time and state (n, 14) up to now, oldest first; NaN before the first."""
+        now = np.append(context.get_time(), np.asarray(self._state_port.Eval(context)))
+        held = np.asarray(context.get_discrete_state_vector().value()).reshape(-1, 14)
+        return np.vstack([held, now])
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(self._samples(context)[1:].ravel())
+
+    def _calc_pose(self, context, output) -> None:
+        rows = self._samples(context)
+        rows = rows[np.isfinite(rows[:, 0])]
+        then = context.get_time() - self._frames.age(context.get_time())
+        state = np.array([np.interp(then, rows[:, 0], column) for column in rows[:, 1:].T])
+        output.set_value(pose_from_state(state))

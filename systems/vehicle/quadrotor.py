@@ -1,0 +1,222 @@
+"""Quadrotor dynamics with commanded thrust and body rates, as pure functions.
+
+State (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+Command (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, with c the thrust over mass along body +z.
+
+The same formula serves single floats, numpy batches, arrays of Drake's AutoDiffXd or symbolic
+Expression, and torch batches, so that the simulated plant and the training loop share one model.
+"""
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import (
+    BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+)
+from pydrake.systems.scalar_conversion import TemplateSystem
+
+from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.vehicle.state import QuadrotorState
+
+VEHICLE_RADIUS = 0.354
+"""Propeller-tip radius of the vehicle [m]: closer than this to a surface is a collision."""
+
+GRAVITY = 9.81
+"""Standard gravity [m/s^2], along -z of the world."""
+
+_NORM_GAIN = 5.0  # [1/s] pull of the quaternion towards unit length; errors decay as exp(-10 t).
+
+
+@dataclass
+class QuadrotorParams:
+    """Parameters of the quadrotor; the defaults describe a small camera drone."""
+
+    # [1/s] Linear drag coefficient over mass. Identified racing quadrotors have 0.39-0.54
+    # (Faessler, Franchi, Scaramuzza, RA-L 2018).
+    drag: float = 0.375
+    # [s] First-order lag of the body rates behind their command.
+    rate_time_constant: float = 0.05
+    # [m/s^2] Gravitational acceleration, along -z of the world.
+    gravity: float = GRAVITY
+
+    def validate(self) -> None:
+        """Raises ValueError unless drag >= 0, rate_time_constant > 0, gravity >= 0, all finite."""
+        for name, unit in (("drag", "1/s"), ("rate_time_constant", "s"), ("gravity", "m/s^2")):
+            value = getattr(self, name)
+            positive = name == "rate_time_constant"
+            if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
+                limit = "positive" if positive else "at least 0"
+                raise ValueError(
+                    f"QuadrotorParams.{name} is {value} {unit} but must be finite and {limit}; "
+                    f"the default is {getattr(QuadrotorParams, name)}"
+                )
+
+
+def hover_state(p_WB: Sequence[float] | np.ndarray, yaw: float = 0.0) -> np.ndarray:
+    """The state (13,) at rest and level at ``p_WB`` (3,) [m], facing ``yaw`` [rad] from world x."""
+    q_WB = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    return QuadrotorState(p_WB, np.zeros(3), q_WB, np.zeros(3)).to_vector()
+
+
+def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> Any:
+    """Time derivative (..., 13) of ``state`` (..., 13) under ``command`` (..., 4).
+
+    Both are numpy arrays (of float, AutoDiffXd or Expression) or both torch tensors; their
+    leading shapes broadcast. The equations, with z_B the body z axis and ⊗ the Hamilton product::
+
+        d/dt p_WB   = v_WB
+        d/dt v_WB   = c z_B - g e_z - drag v_WB
+        d/dt q_WB   = 1/2 q_WB ⊗ (0, w_WB_B) + 5 (1 - |q_WB|²) q_WB
+        d/dt w_WB_B = (w_cmd_B - w_WB_B) / rate_time_constant
+
+    The last term of the quaternion rate holds its length at one against integration error. The
+    attitude is that of the normalised quaternion, which must not be zero.
+    """
+    torch = sys.modules.get("torch")  # A tensor can only come from a torch already imported.
+    if torch is not None and isinstance(state, torch.Tensor):
+        rates = component_derivatives(
+            state.unbind(-1),
+            command.unbind(-1),
+            params.drag,
+            params.rate_time_constant,
+            params.gravity,
+        )
+        return torch.stack(torch.broadcast_tensors(*rates), dim=-1)
+    state, command = np.asarray(state), np.asarray(command)
+    rates = component_derivatives(
+        [state[..., i] for i in range(13)],
+        [command[..., i] for i in range(4)],
+        params.drag,
+        params.rate_time_constant,
+        params.gravity,
+    )
+    shape = np.broadcast_shapes(state.shape[:-1], command.shape[:-1])
+    derivatives = np.empty((*shape, 13), np.result_type(state, command))
+    for i, rate in enumerate(rates):
+        derivatives[..., i] = rate
+    return derivatives
+
+
+def component_derivatives(
+    state: Any, command: Any, drag: Any, rate_time_constant: Any, gravity: Any
+) -> tuple[Any, ...]:
+    """The 13 components of :func:`quadrotor_derivatives`, each from the 13 + 4 components given.
+
+    Components may be anything with arithmetic; plain Python floats are by far the fastest for a
+    single vehicle.
+    """
+    _, _, _, vx, vy, vz, qw, qx, qy, qz, wx, wy, wz = state
+    c, wx_cmd, wy_cmd, wz_cmd = command
+
+    norm2 = qw * qw + qx * qx + qy * qy + qz * qz
+    thrust = c / norm2
+    pull = _NORM_GAIN * (1.0 - norm2)
+    return (
+        vx,
+        vy,
+        vz,
+        thrust * (2.0 * (qx * qz + qw * qy)) - drag * vx,
+        thrust * (2.0 * (qy * qz - qw * qx)) - drag * vy,
+        thrust * (qw * qw - qx * qx - qy * qy + qz * qz) - drag * vz - gravity,
+        0.5 * (-qx * wx - qy * wy - qz * wz) + pull * qw,
+        0.5 * (qw * wx + qy * wz - qz * wy) + pull * qx,
+        0.5 * (qw * wy + qz * wx - qx * wz) + pull * qy,
+        0.5 * (qw * wz + qx * wy - qy * wx) + pull * qz,
+        (wx_cmd - wx) / rate_time_constant,
+        (wy_cmd - wy) / rate_time_constant,
+        (wz_cmd - wz) / rate_time_constant,
+    )
+
+
+def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
+    """The state (..., 13) after ``dt`` [s] of constant ``command`` (..., 4).
+
+    One step of the classical fourth-order Runge-Kutta method, for the array types of
+    :func:`quadrotor_derivatives` and differentiable as they are.
+    """
+    k1 = quadrotor_derivatives(state, command, params)
+    k2 = quadrotor_derivatives(state + 0.5 * dt * k1, command, params)
+    k3 = quadrotor_derivatives(state + 0.5 * dt * k2, command, params)
+    k4 = quadrotor_derivatives(state + dt * k3, command, params)
+    return state + (dt / 6.0) * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+@TemplateSystem.define("QuadrotorPlant_")
+def QuadrotorPlant_(T):
+    class Impl(LeafSystem_[T]):
+        """A quadrotor that follows commanded thrust exactly and body rates with a short lag.
+
+        .. pydrake_system::
+
+            name: QuadrotorPlant
+            input_ports:
+            - command
+            output_ports:
+            - state
+
+        - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, c the thrust over mass along
+          body +z.
+        - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``,
+          continuous; at the default Context ``initial_state``, a level hover at the world's
+          origin where none is given.
+        - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
+
+        The equations are those of
+        :func:`~splatpilot.systems.vehicle.quadrotor.quadrotor_derivatives`. Supports the
+        scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s without error
+        control: after 5 s of new random commands every 0.02 s, ``runge_kutta3`` is within 2 cm of
+        the solution and ``runge_kutta5``, at twice the cost, within 0.2 mm.
+
+        Raises:
+            ValueError: if a parameter is out of range, see :class:`QuadrotorParams`, or the initial
+                state has another shape.
+        """
+
+        command_input_port = input_port("command")
+        state_output_port = output_port("state")
+
+        def _construct(
+            self,
+            params: QuadrotorParams | None = None,
+            initial_state: np.ndarray | None = None,
+            converter=None,
+        ):
+            super().__init__(converter=converter)
+            params = params or QuadrotorParams()
+            params.validate()
+            self._defaults = astuple(params)
+            self.DeclareNumericParameter(BasicVector_[T](list(self._defaults)))
+            self.DeclareVectorInputPort("command", 4)
+            start = hover_state([0.0, 0.0, 0.0]) if initial_state is None else initial_state
+            self._start = QuadrotorState.of(np.asarray(start, dtype=float)).to_vector()
+            index = self.DeclareContinuousState(BasicVector_[T](self._start))
+            self.DeclareStateOutputPort("state", index)
+
+        def _construct_copy(self, other, converter=None):
+            params = QuadrotorParams(*other._defaults)
+            Impl._construct(self, params, other._start, converter=converter)
+
+        def DoCalcTimeDerivatives(self, context, derivatives):
+            # Lists, because arithmetic on Python floats is several times faster than on numpy's.
+            state = context.get_continuous_state_vector().CopyToVector().tolist()
+            command = self.get_input_port(0).Eval(context).tolist()
+            drag, tau, gravity = context.get_numeric_parameter(0).CopyToVector().tolist()
+            try:
+                rates = component_derivatives(state, command, drag, tau, gravity)
+            except ZeroDivisionError:
+                raise ValueError(
+                    f"QuadrotorPlant: at t = {context.get_time()} s q_WB is {state[6:10]} and "
+                    f"rate_time_constant is {tau} s but neither may be zero; set a unit "
+                    "quaternion (w, x, y, z) and a positive time constant in the Context"
+                ) from None
+            derivatives.get_mutable_vector().SetFromVector(np.array(rates))
+
+    return Impl
+
+
+QuadrotorPlant: Any = QuadrotorPlant_[None]

@@ -1,0 +1,446 @@
+"""What stands still on a Meshcat scene: world, goal, vehicle, distance field."""
+
+import json
+from typing import cast
+
+import cv2
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.common.value import Value
+from pydrake.geometry import Box, Cylinder, InMemoryMesh, Mesh, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.perception import BaseField, Fields, PointCloud
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+
+from splatpilot.systems.collision.distance_field import DistanceField, FieldState
+from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
+from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.common.drake import input_port
+from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+
+
+def draw_gaussians(
+    meshcat: Meshcat,
+    path: str,
+    scene: GaussianScene,
+    lower_W: np.ndarray,
+    upper_W: np.ndarray,
+    max_points: int = 120_000,
+) -> None:
+    """
+    Draws the centres of the Gaussians inside a box as coloured points, evenly thinned.
+
+    The points are as large as the median Gaussian, so that surfaces look closed.
+
+    Args:
+        path: Meshcat path of the point cloud.
+        lower_W, upper_W: corners of the box (3,) [m]; what lies outside (sky, far hills) is left
+            out.
+        max_points: most points drawn.
+    """
+    inside = np.flatnonzero(np.all((scene.means >= lower_W) & (scene.means <= upper_W), axis=1))
+    if len(inside) > max_points:
+        inside = inside[np.linspace(0, len(inside) - 1, max_points).astype(int)]
+    cloud = PointCloud(len(inside), Fields(BaseField.kXYZs | BaseField.kRGBs))
+    cloud.mutable_xyzs()[:] = scene.means[inside].T
+    # Meshcat takes the colours of points for linear light and encodes them for the screen itself.
+    cloud.mutable_rgbs()[:] = (scene.base_colors[inside].T ** 2.2 * 255).astype(np.uint8)
+    extent = np.median(scene.scales[inside].max(axis=1)) if len(inside) else 0.05
+    meshcat.SetObject(path, cloud, point_size=2.0 * float(extent))
+
+
+GOAL_COLOR, START_COLOR = Rgba(0.1, 0.9, 0.3, 0.4), Rgba(0.1, 0.5, 1.0, 0.4)
+BALL = 0.25  # [m], radius of what marks start and goal where nobody flies
+
+
+def draw_goal(
+    meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float, color: Rgba = GOAL_COLOR
+) -> None:
+    """Draws the goal region, a translucent ball of `radius` [m] about p_WG (3,) [m], below a pole
+    of 3 m that is seen from afar."""
+    meshcat.SetObject(path, Sphere(radius), color)
+    meshcat.SetObject(f"{path}/pole", Cylinder(0.04, 3.0), color)
+    meshcat.SetTransform(f"{path}/pole", RigidTransform(np.array([0.0, 0.0, 1.5])))
+    meshcat.SetTransform(path, RigidTransform(p_WG))
+
+
+def box_edges(lower_W: np.ndarray, upper_W: np.ndarray) -> np.ndarray:
+    """The ends (12, 2, 3) [m] of the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    starts, ends = np.nonzero(np.abs(corners[:, None] - corners).sum(axis=-1) == 1)
+    once = starts < ends
+    p_WQ = np.where(corners == 0, lower_W, upper_W)
+    return np.stack([p_WQ[starts[once]], p_WQ[ends[once]]], axis=1)
+
+
+def draw_box(meshcat: Meshcat, path: str, lower_W: np.ndarray, upper_W: np.ndarray) -> None:
+    """Draws the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
+    edges = box_edges(lower_W, upper_W)
+    meshcat.SetLineSegments(path, edges[:, 0].T, edges[:, 1].T, 1.0, Rgba(1.0, 1.0, 1.0))
+
+
+def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
+    """Draws a quadrotor whose propeller tips reach `radius` [m]; frame B: x forward, z up."""
+    propeller = 0.36 * radius
+    arm = radius - propeller
+    dark, front, rear = Rgba(0.1, 0.1, 0.12), Rgba(0.9, 0.2, 0.1, 0.6), Rgba(0.3, 0.3, 0.35, 0.6)
+    meshcat.SetObject(f"{path}/body", Box(0.5 * radius, 0.35 * radius, 0.2 * radius), dark)
+    for name, angle, color in (
+        ("front_left", np.pi / 4, front),
+        ("rear_left", 3 * np.pi / 4, rear),
+        ("rear_right", -3 * np.pi / 4, rear),
+        ("front_right", -np.pi / 4, front),
+    ):
+        R_BA = RotationMatrix.MakeZRotation(angle)
+        meshcat.SetObject(f"{path}/{name}_arm", Box(arm, 0.02, 0.02), dark)
+        meshcat.SetTransform(f"{path}/{name}_arm", RigidTransform(R_BA, R_BA @ [arm / 2, 0, 0]))
+        meshcat.SetObject(f"{path}/{name}_propeller", Cylinder(propeller, 0.01), color)
+        meshcat.SetTransform(
+            f"{path}/{name}_propeller", RigidTransform(R_BA @ np.array([arm, 0, 0.03]))
+        )
+
+
+UNKNOWN_GREY = 0.4
+"""Shade of space that nobody saw."""
+
+
+def distance_colors(distances: np.ndarray) -> np.ndarray:
+    """Colours (N, 3), 0 to 1, of distances (N,) in units of that from which on all are alike: red
+    at or inside a surface, fading through yellow at one half to blue."""
+    ramp = np.clip(distances, 0.0, 1.0)
+    return np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2], -1)
+
+
+def distance_slice(
+    field: DistanceField, height: float, spacing: float, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    The horizontal slice of a distance field at z = `height` [m], as a coloured mesh.
+
+    Red is at or inside a surface, fading through yellow to blue at `reach` [m] and more; unknown
+    space is grey.
+
+    Args:
+        spacing: distance between the samples [m].
+
+    Returns:
+        Its vertices p_WQ (N, 3) [m], faces (M, 3), which are seen from above, and the colours of
+        the vertices (N, 3), 0 to 1.
+    """
+    lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
+    counts = np.maximum(2, np.ceil((upper_W[:2] - lower_W[:2]) / spacing).astype(int))
+    # A little inside, where every field has an answer.
+    margin = 1e-3 * (upper_W[:2] - lower_W[:2])
+    xs, ys = (
+        np.linspace(lower_W[i] + margin[i], upper_W[i] - margin[i], counts[i]) for i in range(2)
+    )
+    p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
+    sample = field.query(p_WQ)
+    colors = distance_colors(np.nan_to_num(sample.distance) / reach)
+    colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GREY
+
+    i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
+    corner = (i * counts[1] + j).ravel()
+    faces = np.concatenate(
+        [
+            np.stack([corner, corner + counts[1], corner + 1], axis=-1),
+            np.stack([corner + 1, corner + counts[1], corner + counts[1] + 1], axis=-1),
+        ]
+    )
+    return p_WQ, faces.astype(np.int32), colors
+
+
+def draw_distance_slice(
+    meshcat: Meshcat, path: str, field: DistanceField, height: float, spacing: float = 0.2
+) -> None:
+    """
+    Draws the `distance_slice` of a field, blue from 2 m on.
+
+    Args:
+        path: Meshcat path of the coloured mesh.
+        height: of the slice, z [m].
+        spacing: distance between the samples [m].
+    """
+    p_WQ, faces, colors = distance_slice(field, height, spacing, reach=2.0)
+    meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)
+
+
+_TRAIL = 120
+"""How many pictures the trail reaches back."""
+
+
+class FlightVisualizer(LeafSystem):
+    """
+    Draws the vehicle, the trail it leaves and the fan of trajectory hypotheses in Meshcat.
+
+    .. pydrake_system::
+
+        name: FlightVisualizer
+        input_ports:
+        - state
+        - hypotheses
+
+    Publishes every `period` seconds, for who watches live: a Meshcat recording keeps the vehicle's
+    pose alone, where `replay_page` has the rest. The vehicle's shape is expected at
+    `<path>/vehicle` (see `draw_vehicle`). The trail is one line, and the fan one mesh: hypotheses
+    run from green (cheapest) to red (dearest).
+    """
+
+    state_input_port = input_port("state")
+    hypotheses_input_port = input_port("hypotheses")
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        num_hypotheses: int,
+        period: float = 1 / 15,
+        path: str = "/splatpilot",
+    ):
+        """
+        Args:
+            meshcat: where to draw.
+            num_hypotheses: how many trajectories the `hypotheses` port carries; without any there
+                is no such port, and no fan.
+            period: time between two pictures [s].
+            path: Meshcat path under which everything is drawn.
+        """
+        super().__init__()
+        self._meshcat = meshcat
+        self._num_hypotheses = num_hypotheses
+        self._period = period
+        self._path = path
+        self.DeclareVectorInputPort("state", 13)
+        if num_hypotheses:
+            self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
+        # Positions of the last pictures, the latest last; NaN where there were fewer.
+        self.DeclareDiscreteState(np.full(3 * _TRAIL, np.nan))
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._extend_trail)
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder,
+        state_port: OutputPort,
+        meshcat: Meshcat,
+        hypotheses_port: OutputPort | None = None,
+    ) -> "FlightVisualizer":
+        """Adds a visualizer, named `flight_visualizer`, of a state and perhaps of hypotheses."""
+        count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
+        visualizer = FlightVisualizer(meshcat, count)
+        builder.AddNamedSystem("flight_visualizer", visualizer)
+        builder.Connect(state_port, visualizer.state_input_port())
+        if hypotheses_port is not None:
+            builder.Connect(hypotheses_port, visualizer.hypotheses_input_port())
+        return visualizer
+
+    def _eval(self, port: str, context: Context) -> np.ndarray:
+        return np.asarray(self.GetInputPort(port).Eval(context))
+
+    def _trail(self, context: Context) -> np.ndarray:
+        """(n, 3) [m] The positions of the last pictures and of this one."""
+        before = context.get_discrete_state_vector().value().reshape(-1, 3)
+        p_WB = QuadrotorState.of(self._eval("state", context)).p_WB
+        return np.vstack([before[~np.isnan(before[:, 0])], p_WB])
+
+    def _extend_trail(self, context: Context, discrete_state) -> EventStatus:
+        trail = self._trail(context)[-_TRAIL:]
+        missing = np.full((_TRAIL - len(trail), 3), np.nan)
+        discrete_state.set_value(np.vstack([missing, trail]).ravel())
+        return EventStatus.Succeeded()
+
+    def _publish(self, context: Context) -> EventStatus:
+        X_WB = pose_from_state(self._eval("state", context))
+        self._meshcat.SetTransform(f"{self._path}/vehicle", X_WB, context.get_time())
+        red = Rgba(0.9, 0.1, 0.1)
+        self._meshcat.SetLine(f"{self._path}/trail", self._trail(context).T, 4.0, red)
+        if self._num_hypotheses:
+            vector = self._eval("hypotheses", context)
+            plan = Hypotheses.from_vector(vector, self._num_hypotheses)
+            if plan is not None:
+                self._meshcat.SetTriangleColorMesh(f"{self._path}/hypotheses", *fan_mesh(plan))
+        return EventStatus.Succeeded()
+
+
+def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Level ribbons along K hypotheses, from green (cheapest) to red (dearest).
+
+    Args:
+        width: of a ribbon [m].
+
+    Returns:
+        Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colours (3, V) in 0 to 1.
+    """
+    K = len(plan.costs)
+    start = np.broadcast_to(plan.X_WB.translation(), (K, 1, 3))
+    path = np.concatenate([start, plan.waypoints_W], axis=1)  # (K, T + 1, 3)
+    along = np.gradient(path, axis=1)
+    across = np.stack([-along[..., 1], along[..., 0], np.zeros(along.shape[:2])], axis=-1)
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    sides = np.stack([path - 0.5 * width * across, path + 0.5 * width * across], axis=2)
+    dearness = (plan.costs - plan.costs.min()) / max(np.ptp(plan.costs), 1e-9)
+    color = np.column_stack(
+        [np.minimum(1, 2 * dearness), np.minimum(1, 2 * (1 - dearness)), np.full(K, 0.1)]
+    )
+    T = path.shape[1]
+    first = (2 * (np.arange(K)[:, None] * T + np.arange(T - 1))).ravel()
+    a, b, c, d = first, first + 1, first + 2, first + 3
+    faces = np.concatenate([[a, b, c], [c, b, d], [a, c, b], [c, d, b]], axis=1)
+    return sides.reshape(-1, 3).T, faces.astype(np.int32), np.repeat(color, 2 * T, axis=0).T
+
+
+class CameraVisualizer(LeafSystem):
+    """
+    Hangs what the camera sees in front of it in Meshcat, as a picture across the view frustum.
+
+    .. pydrake_system::
+
+        name: CameraVisualizer
+        input_ports:
+        - color_image
+
+    Takes an image every `period` seconds and shows every `stride`-th. The picture is a child of the
+    vehicle's Meshcat path, so it moves with the vehicle at X_BC and needs no pose of its own.
+    """
+
+    color_image_input_port = input_port("color_image")
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        camera_info: CameraInfo,
+        X_BC: RigidTransform,
+        period: float = 1 / 15,
+        stride: int = 3,
+        depth: float = 0.6,
+        path: str = "/splatpilot/vehicle/camera",
+    ):
+        """
+        Args:
+            meshcat: where to draw.
+            camera_info, X_BC: intrinsics, and pose of the camera in the vehicle's body frame.
+            period: time between two images [s]; as other readers of the camera have it, or it
+                renders for each.
+            stride: how many images there are to a picture that is shown.
+            depth: distance from the camera to the picture [m].
+            path: Meshcat path of the camera.
+        """
+        super().__init__()
+        self._meshcat = meshcat
+        self._period = period
+        self._stride = stride
+        self._path = path
+        width, height = camera_info.width(), camera_info.height()
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
+        center = [camera_info.center_x(), camera_info.center_y()]
+        focal = [camera_info.focal_x(), camera_info.focal_y()]
+        # (4, 3) [m], frame C: top left, top right, bottom right, bottom left.
+        self._p_CCorners = depth * np.column_stack([(corners - center) / focal, np.ones(4)])
+        self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+        meshcat.SetTransform(path, X_BC)
+        edges = np.stack([np.zeros((4, 3)), self._p_CCorners], axis=1).reshape(8, 3)
+        meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder, camera: SplatCamera, meshcat: Meshcat, period: float = 1 / 15
+    ) -> "CameraVisualizer":
+        """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
+        visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
+        builder.AddNamedSystem("camera_visualizer", visualizer)
+        builder.Connect(camera.color_image_output_port(), visualizer.color_image_input_port())
+        return visualizer
+
+    def _publish(self, context: Context) -> EventStatus:
+        time = context.get_time()
+        if round(time / self._period) % self._stride:
+            return EventStatus.DidNothing()
+        image = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
+        rgb = np.asarray(image.data)[..., :3]
+        gltf = MemoryFile(picture_gltf(rgb, self._p_CCorners), ".gltf", "onboard picture")
+        self._meshcat.SetObject(f"{self._path}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
+        return EventStatus.Succeeded()
+
+
+def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
+    """
+    A glTF 2.0 document of one rectangle textured with a picture, unlit and seen from both sides.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        corners: (4, 3) [m], the picture's top left, top right, bottom right and bottom left corner.
+    """
+    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+                "extensions": {"KHR_materials_unlit": {}},
+                "doubleSided": True,
+            }
+        ],
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "textures": [{"source": 0}],
+        "images": [{"uri": data_uri("image/jpeg", jpeg.tobytes())}],
+    }
+    uv, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]])
+    primitive = add_primitive(document, corners, uv, triangles)
+    document["meshes"] = [{"primitives": [{**primitive, "material": 0}]}]
+    return json.dumps(document)
+
+
+_FAR_BELOW = np.array([0.0, 0.0, -1000.0])  # [m], where balls are shown that are nowhere
+
+
+class BallsVisualizer(LeafSystem):
+    """
+    Draws balls in Meshcat where they are at the Context's time; it has no ports.
+
+    Publishes every `period` seconds, live and into a Meshcat recording alike, ball k at
+    `<path>/k`.
+    """
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        balls: MovingBalls,
+        period: float = 1 / 15,
+        path: str = "/splatpilot/balls",
+    ):
+        """
+        Args:
+            meshcat: where to draw.
+            balls: what is drawn.
+            period: time between two pictures [s].
+            path: Meshcat path under which everything is drawn.
+        """
+        super().__init__()
+        self._meshcat, self._balls, self._path = meshcat, balls, path
+        for k, radius in enumerate(balls.radii):
+            meshcat.SetObject(f"{path}/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder, balls: MovingBalls, meshcat: Meshcat
+    ) -> "BallsVisualizer":
+        """Adds a visualizer of balls, named `balls_visualizer`."""
+        visualizer = BallsVisualizer(meshcat, balls)
+        builder.AddNamedSystem("balls_visualizer", visualizer)
+        return visualizer
+
+    def _publish(self, context: Context) -> EventStatus:
+        time = context.get_time()
+        for k, center in enumerate(self._balls.centers(time)):
+            p_WO = center if np.isfinite(center).all() else _FAR_BELOW
+            self._meshcat.SetTransform(f"{self._path}/{k}", RigidTransform(p_WO), time)
+        return EventStatus.Succeeded()

@@ -1,0 +1,399 @@
+"""A page to look at a place in: its Gaussians, distances, where it was captured from, a ruler."""
+
+import base64
+import gzip
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
+from splatpilot.systems.splats.background import Background, EnvironmentMap
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.visualization.meshcat_drawing import UNKNOWN_GREY, distance_colors
+
+_COVARIANCE_SCALE = 256.0
+"""Keeps the covariances of 1 mm to 16 m within what a half holds."""
+
+
+def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
+    """
+    N Gaussians as the page's shader reads them, (N, 8) words each of 32 bits.
+
+    The centre as three floats [m]; red, green, blue (without their dependence on direction) and
+    opacity as bytes, lowest first; the covariance's xx, xy, xz, yy, yz, zz as halves
+    [m^2 / 256], lowest first; and nothing.
+    """
+    words = np.zeros((len(scene.means), 8), np.uint32)
+    words[:, :3] = scene.means.view(np.uint32)
+    shades = np.column_stack([scene.base_colors, scene.opacities])
+    words[:, 3] = np.round(255 * shades).astype(np.uint8).view(np.uint32)[:, 0]
+    covariances = _COVARIANCE_SCALE * scene.covariances
+    # What is larger than a half holds shrinks as a whole, and stays an ellipsoid.
+    largest = np.abs(covariances).max(axis=(1, 2), keepdims=True)
+    covariances *= np.minimum(1, np.finfo(np.float16).max / np.maximum(largest, 1e-30))
+    halves = covariances[(slice(None), *np.triu_indices(3))]
+    words[:, 4:7] = np.ascontiguousarray(halves, np.float16).view(np.uint32)
+    return words
+
+
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+
+
+def splat_page(
+    meshcat_page: str,
+    gaussians: GaussianScene,
+    background: Background,
+    data: dict[str, Any],
+    scripts: Sequence[str],
+    start: str,
+) -> str:
+    """
+    The HTML of a page that needs nothing else, not even a network.
+
+    Args:
+        meshcat_page: `Meshcat.StaticHtml()`.
+        gaussians, background: what cameras see.
+        data: what else the page shows, of numbers, text, lists and dictionaries.
+        scripts: names of the files in `page` that show it, each after those that it needs.
+        start: what they run in the end: JavaScript in which `splats` and `data` are known.
+    """
+    sky = ""
+    if isinstance(background, EnvironmentMap):
+        # The page's columns run against the azimuth.
+        mirrored = EnvironmentMap(background.texels[:, ::-1])
+        sky = base64.b64encode(mirrored.png()).decode()
+    sources = [_source(name) for name in ("splats.js", *scripts, "page.js")]
+    sources.append(f"openPage().then(({{splats, data}}) => {{ {start} }});")
+    added = (
+        f"<style>{_source('page.css')}</style>"
+        f'<script type="text/plain" id="gaussians">'
+        f"{compressed(pack_gaussians(gaussians).tobytes())}</script>"
+        f'<script type="text/plain" id="sky">{sky}</script>'
+        f'<script type="text/plain" id="data">{compressed(json.dumps(data).encode())}</script>'
+    ) + "".join(f"<script>{source}</script>" for source in sources)
+    head, body, tail = meshcat_page.rpartition("</body>")
+    return head + added + body + tail
+
+
+def compressed(data: bytes) -> str:
+    """Bytes as text, which `unpack` of `page/page.js` reads; the same every time."""
+    return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
+
+
+def rounded(values: NDArray[np.floating]) -> list:
+    """Numbers for a page: as nested lists, to a tenth of a millimetre."""
+    return np.round(values, 4).tolist()
+
+
+def jpeg(image: NDArray[np.uint8]) -> str:
+    """An image (H, W, 3), blue first, for a page."""
+    return base64.b64encode(cv2.imencode(".jpg", image, _JPEG)[1].tobytes()).decode()
+
+
+def _source(name: str) -> str:
+    return (resources.files(__package__) / "page" / name).read_text()
+
+
+_MAX_VOXELS = 3e6
+_SCRIPTS = "pick.js", "ruler.js", "distance_slice.js", "capture_cameras.js", "place_view.js"
+_REACH = 2.0  # [m], distance from which on all have one colour
+_REACH_UNKNOWN = 40  # [-] the same in voxels, where the unit of length is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedImages:
+    """Some of the images of a capture."""
+
+    X_WCs: Sequence[RigidTransform]
+    names: Sequence[str]
+    images: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, blue first
+    K: NDArray[np.float64]  # (3, 3) [px], of the camera before its images were made small
+    width: int  # [px]
+    height: int  # [px]
+
+    @property
+    def p_WCs(self) -> NDArray[np.float64]:
+        """(N, 3) [m], where the cameras were."""
+        return np.array([X_WC.translation() for X_WC in self.X_WCs])
+
+
+@dataclass(frozen=True, eq=False)
+class ShownPlace:
+    """A place and what is known of it; its lengths are metres unless `metric` is false."""
+
+    name: str
+    gaussians: GaussianScene
+    background: Background
+    lower_W: NDArray[np.float64]  # (3,) [m], corners of the box that is of interest
+    upper_W: NDArray[np.float64]  # (3,) [m]
+    height: float  # [m], above which nothing is shown at first
+    field: Esdf | None = None
+    ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # (3,) [m], start and goal
+    images: CapturedImages | None = None
+    num_unknown: int = 0  # of the Gaussians, at their end: where nobody looked any further
+    beyond: bool = True  # whether Gaussians beyond the bounds are shown at first
+    metric: bool = True
+    legend: Sequence[tuple[str, str]] = ()  # colours, as in CSS, of what is drawn, and its names
+    notes: Sequence[str] = ()  # sentences about the place
+    scale_command: str = ""  # to which two points and the length between them need be added
+
+    @property
+    def reach(self) -> float:
+        """[m], the distance to surfaces from which on all have one colour."""
+        if self.metric or self.field is None:
+            return _REACH
+        return _REACH_UNKNOWN * self.field.voxel_size
+
+
+def place_page(meshcat_page: str, place: ShownPlace) -> str:
+    """
+    The HTML of a page that needs nothing else, not even a network.
+
+    Args:
+        meshcat_page: `Meshcat.StaticHtml()` with what else is to be seen.
+        place: what is shown.
+    """
+    size = place.upper_W - place.lower_W
+    unit = "m" if place.metric else "units"
+    data: dict[str, Any] = {
+        "name": place.name,
+        "size": " x ".join(f"{length:.3g}" for length in size)
+        + (" m" if place.metric else " in units of unknown length")
+        + f", {len(place.gaussians):,} Gaussians",
+        "unit": unit,
+        "notes": list(place.notes),
+        "legend": [*place.legend, *([("#ff9020", "captured from")] if place.images else [])],
+        "lower": rounded(place.lower_W),
+        "upper": rounded(place.upper_W),
+        "height": place.height,
+        # Seen from above across the shorter side.
+        "toward": [0.0, -0.8, 1.0] if size[0] >= size[1] else [-0.8, 0.0, 1.0],
+        "beyond": place.beyond,
+        "unknown": place.num_unknown,
+        "scale_command": place.scale_command,
+        "grid": place.field and _grid(place.field, place.reach),
+        "cameras": place.images and _cameras(place.images, float(np.linalg.norm(size))),
+    }
+    return splat_page(
+        meshcat_page,
+        place.gaussians,
+        place.background,
+        data,
+        _SCRIPTS,
+        "PlaceView.open(viewer, splats, data).then((view) => { window.view = view; });",
+    )
+
+
+def _grid(field: Esdf, reach: float) -> dict[str, Any]:
+    """The distances as bytes, of every so many-th voxel along each axis: 0 at a surface, 254 at
+    `reach`, 255 where nobody looked."""
+    stride = int(np.ceil(np.cbrt(field.distances.size / _MAX_VOXELS)))
+    thin = (slice(stride // 2, None, stride),) * 3
+    values = np.round(254 * np.clip(field.distances[thin] / reach, 0, 1)).astype(np.uint8)
+    values[field.states[thin] == FieldState.UNKNOWN] = 255
+    colors = np.append(distance_colors(np.arange(255) / 254), np.full((1, 3), UNKNOWN_GREY), 0)
+    return {
+        "shape": list(values.shape),
+        "lower": rounded(field.lower_W),
+        "voxel_size": stride * field.voxel_size,
+        "reach": reach,
+        "palette": np.round(255 * colors).astype(int).tolist(),
+        "values": compressed(values.tobytes(order="F")),
+    }
+
+
+def _cameras(images: CapturedImages, extent: float) -> dict[str, Any]:
+    slope_x = 0.5 * images.width / images.K[0, 0]
+    slope_y = 0.5 * images.height / images.K[1, 1]
+    return {
+        "size": 0.012 * extent,
+        "slope_x": slope_x,
+        "slope_y": slope_y,
+        "fov_y": np.degrees(2 * np.arctan(slope_y)),
+        "poses": [X_WC.GetAsMatrix4().ravel().tolist() for X_WC in images.X_WCs],
+        "names": list(images.names),
+        "images": [jpeg(image) for image in images.images],
+    }
+
+
+_COLORS = ("#e8432e", "#2f8fe8", "#e8b52e", "#a05ce0", "#30b870", "#e060b0", "#50c8d0", "#b0b0b0")
+_RATE = 30.0  # [Hz], samples of a flight in the page
+_BALLS_PERIOD = 0.1  # [s], between which balls go straight
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What the onboard camera saw, `period` seconds apart from the start on."""
+
+    period: float  # [s]
+    color: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, blue first, as OpenCV has it
+    depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, in colours
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedFlight:
+    """One flight of a page; N samples."""
+
+    name: str
+    outcome: str
+    times: NDArray[np.float64]  # (N,) [s]
+    states: NDArray[np.float64]  # (N, 13), see `QuadrotorState`
+    clearances: NDArray[np.float64]  # (N,) [m], NaN where unknown
+    hypotheses: NDArray[np.float64]  # (M, size), see `Hypotheses.to_vector`; (0, 0) without
+    frames: Frames | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayView:
+    """What a page knows of the vehicle and the place."""
+
+    X_BC: RigidTransform  # pose of the onboard camera in the vehicle's body frame
+    fov_y: float  # [rad], of the onboard camera
+    radius: float  # [m], of the vehicle
+    lower: float  # [m], height of the place's floor
+    upper: float  # [m], and of its ceiling
+    margin: float = 0.2  # [m], clearance below which the vehicle is marked red
+
+
+def replay_page(
+    meshcat_page: str,
+    gaussians: GaussianScene,
+    background: Background,
+    view: ReplayView,
+    flights: Sequence[ReplayedFlight],
+    balls: MovingBalls | None = None,
+) -> str:
+    """
+    The HTML of a page that needs nothing else, not even a network.
+
+    Args:
+        meshcat_page: `Meshcat.StaticHtml()` with what stands still, and the vehicle of flight k at
+            `/splatpilot/vehicles/k`.
+        gaussians, background: what cameras see.
+        view: the vehicle and the place.
+        flights: one or more, the first of which is shown at first.
+        balls: what moves beside them.
+
+    Raises:
+        ValueError: if there is no flight.
+    """
+    if not flights:
+        raise ValueError("flights is empty; a replay shows at least one flight")
+    data = {
+        "X_BC": view.X_BC.GetAsMatrix4().ravel().tolist(),
+        "fov_y": np.degrees(view.fov_y),
+        "radius": view.radius,
+        "margin": view.margin,
+        "lower": view.lower,
+        "upper": view.upper,
+        "cut": min(view.upper, _highest(flights) + 2 * view.radius),
+        "balls": balls and _balls_data(balls, max(flight.times[-1] for flight in flights)),
+        "flights": [
+            _flight_data(flight, _COLORS[k % len(_COLORS)]) for k, flight in enumerate(flights)
+        ],
+    }
+    return splat_page(
+        meshcat_page,
+        gaussians,
+        background,
+        data,
+        ("replay_flight.js", "replay.js"),
+        "window.replay = new Replay(viewer, splats, data);",
+    )
+
+
+def _highest(flights: Sequence[ReplayedFlight]) -> float:
+    return max(float(QuadrotorState.of(flight.states).p_WB[:, 2].max()) for flight in flights)
+
+
+def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
+    # The samples nearest to the page's rate, and the last, at which a flight ends.
+    wanted = np.arange(flight.times[0], flight.times[-1], 1 / _RATE)
+    rows = np.unique(np.append(np.searchsorted(flight.times, wanted), len(flight.times) - 1))
+    state = QuadrotorState.of(flight.states[rows])
+    return {
+        "name": flight.name,
+        "outcome": flight.outcome,
+        "color": color,
+        "times": rounded(flight.times[rows]),
+        "p_WB": rounded(state.p_WB),
+        "q_WB": rounded(state.q_WB),
+        "speeds": rounded(np.linalg.norm(state.v_WB, axis=1)),
+        "clearances": [None if np.isnan(c) else round(c, 3) for c in flight.clearances[rows]],
+        "plans": _plans(flight.hypotheses),
+        "frames": flight.frames
+        and {
+            "period": flight.frames.period,
+            "color": [jpeg(image) for image in flight.frames.color],
+            "depth": [jpeg(image) for image in flight.frames.depth],
+        },
+    }
+
+
+def _balls_data(balls: MovingBalls, duration: float) -> dict[str, Any]:
+    times = np.arange(0.0, duration + 2 * _BALLS_PERIOD, _BALLS_PERIOD)
+    centers = [np.round(balls.centers(time), 3).tolist() for time in times]
+    return {
+        "period": _BALLS_PERIOD,
+        "radii": rounded(balls.radii),
+        "centers": [
+            [center if np.isfinite(center).all() else [None] * 3 for center in row]
+            for row in centers
+        ],
+    }
+
+
+def _plans(vectors: NDArray[np.float64]) -> list[dict[str, Any]]:
+    """The plans in W, in the order of their times, each once."""
+    plans: dict[float, dict[str, Any]] = {}
+    for vector in vectors:
+        plan = Hypotheses.from_vector(vector, num_hypotheses_in(len(vector)))
+        if plan is not None:
+            plans[plan.plan_time] = {
+                "time": plan.plan_time,
+                "p_WB": rounded(plan.X_WB.translation()),
+                "waypoints_W": rounded(plan.waypoints_W),
+                "costs": rounded(plan.costs),
+            }
+    return list(plans.values())
+
+
+def live_page(
+    meshcat: Meshcat,
+    gaussians: GaussianScene,
+    background: Background,
+    heights: tuple[float, float],
+    cut: float,
+) -> str:
+    """
+    The HTML of a page that holds the Gaussians and hears the rest from `meshcat`, on this machine.
+
+    Gaussians that Meshcat draws as points at `/splatpilot/scene` are hidden in it, and what Meshcat
+    would give out as files, as the onboard camera's picture, is left out.
+
+    Args:
+        meshcat: as it is now, which the page shows until it hears more.
+        gaussians, background: what cameras see.
+        heights: from floor to ceiling [m], between which `cut` may be moved.
+        cut: height above which Gaussians are left out at first [m].
+    """
+    return splat_page(
+        meshcat.StaticHtml(),
+        gaussians,
+        background,
+        {"url": meshcat.ws_url(), "lower": heights[0], "upper": heights[1], "cut": cut},
+        ("live.js",),
+        "showLive(splats, data); window.live = splats;",
+    )

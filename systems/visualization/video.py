@@ -1,0 +1,149 @@
+"""A video of what the camera saw: colour beside depth."""
+
+import tempfile
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import cast
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
+from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
+
+from splatpilot.systems.common.drake import input_port
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.splats.splat_camera import SplatCamera
+
+
+class VideoRecorder(LeafSystem):
+    """
+    Collects colour and depth images at a fixed rate; afterwards `frames` has them as pictures and
+    `save` writes them as a video.
+
+    .. pydrake_system::
+
+        name: VideoRecorder
+        input_ports:
+        - color_image
+        - depth_image_16u
+
+    The images wait in a temporary file (0.4 MB each at 320x240) and are encoded after the flight.
+    Like every recorder it writes outside the Context: one recorder is for one simulation at a
+    time.
+    """
+
+    color_image_input_port = input_port("color_image")
+    depth_image_16u_input_port = input_port("depth_image_16u")
+
+    def __init__(self, width: int, height: int, fps: float):
+        """
+        Args:
+            width, height: size of the images [pixels].
+            fps: images a second of simulated time, and of the video.
+        """
+        super().__init__()
+        self._fps = fps
+        self._frame = np.dtype(
+            [("rgb", np.uint8, (height, width, 3)), ("depth", np.uint16, (height, width))]
+        )
+        self._file = tempfile.TemporaryFile(buffering=0)
+        self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
+        self.DeclareAbstractInputPort("depth_image_16u", Value(ImageDepth16U(width, height)))
+        self.DeclareInitializationPublishEvent(self._clear)
+        self.DeclarePeriodicPublishEvent(1 / fps, 0.0, self._record)
+
+    @staticmethod
+    def AddToBuilder(builder: DiagramBuilder, camera: SplatCamera, fps: float) -> "VideoRecorder":
+        """Adds a recorder, named `video`, of the images of a camera."""
+        info = camera.camera_info()
+        recorder = VideoRecorder(info.width(), info.height(), fps)
+        builder.AddNamedSystem("video", recorder)
+        builder.Connect(camera.color_image_output_port(), recorder.color_image_input_port())
+        builder.Connect(camera.depth_image_16u_output_port(), recorder.depth_image_16u_input_port())
+        return recorder
+
+    def _clear(self, context: Context) -> EventStatus:
+        self._file.seek(0)
+        self._file.truncate()
+        return EventStatus.Succeeded()
+
+    def _record(self, context: Context) -> EventStatus:
+        color = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
+        depth = cast(ImageDepth16U, self.GetInputPort("depth_image_16u").Eval(context))
+        frame = np.empty((), self._frame)
+        frame["rgb"] = np.asarray(color.data)[..., :3]
+        frame["depth"] = np.asarray(depth.data)[..., 0]
+        try:
+            self._file.write(frame.tobytes())
+        except OSError as error:
+            raise OSError(
+                f"the pictures of the flight cannot wait in {tempfile.gettempdir()} "
+                f"({error.strerror}); make room there, name another folder by TMPDIR, or film "
+                "fewer and smaller ones (camera.fps, camera.width)"
+            ) from None
+        return EventStatus.Succeeded()
+
+    def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+        """
+        Yields the pictures of colour and of depth, (H, W, 3) each in OpenCV's channel order.
+
+        Args:
+            max_depth: depth at which the depth picture's colours end [m].
+        """
+        frames = self._file.tell() // self._frame.itemsize
+        self._file.seek(0)
+        for _ in range(frames):
+            frame = np.frombuffer(self._file.read(self._frame.itemsize), self._frame)[0]
+            yield frame["rgb"][..., ::-1], colorize_depth(frame["depth"] * 1e-3, max_depth)
+
+    def save(self, path: Path, max_depth: float) -> None:
+        """
+        Writes the video (H.264 in MP4, which every browser and player plays) atomically.
+
+        Args:
+            path: the file, ending in .mp4.
+            max_depth: as for `frames`.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        with written_atomically(path, self._check) as partial:
+            self._encode(partial, max_depth)
+
+    def _check(self, path: Path) -> None:
+        """Raises OSError unless all pictures can be found in a video: its writer does not say when
+        the disk is full."""
+        recorded = self._file.tell() // self._frame.itemsize
+        with av.open(str(path)) as container:
+            found = sum(packet.size > 0 for packet in container.demux(video=0))
+        if found != recorded:
+            raise OSError(f"{found} of {recorded} pictures are there")
+
+    def _encode(self, path: Path, max_depth: float) -> None:
+        height, width = self._frame["depth"].shape
+        odd = height % 2  # Players want even numbers of rows and columns.
+        with av.open(str(path), "w") as container:
+            rate = Fraction(self._fps).limit_denominator(1000)
+            stream = container.add_stream("libx264", rate, {"preset": "ultrafast", "crf": "20"})
+            stream.width, stream.height, stream.pix_fmt = 2 * width, height + odd, "yuv420p"
+            for pictures in self.frames(max_depth):
+                picture = np.pad(np.hstack(pictures), ((0, odd), (0, 0), (0, 0)))
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "bgr24")))
+            container.mux(stream.encode())
+
+
+def colorize_depth(depth: np.ndarray, max_depth: float) -> np.ndarray:
+    """
+    Depth (H, W) [m] as a picture (H, W, 3) uint8 in OpenCV's channel order.
+
+    Near is bright and far dark, in inverse depth from 0.5 m to `max_depth`; out of range is black.
+    """
+    inverse = 1.0 / np.clip(depth, 0.5, max_depth)
+    shade = (inverse - 1.0 / max_depth) / (2.0 - 1.0 / max_depth)
+    picture = cv2.applyColorMap((np.sqrt(shade) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)
+    picture[(depth <= 0) | (depth > max_depth)] = 0
+    return picture

@@ -1,0 +1,310 @@
+"""Which way is up in a capture whose files do not say."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import PurePath
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.systems.splats.scene import choose_origin
+from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints, back_project
+from splatpilot.training.captures.capture_config import ScaleConfig
+
+# How much cameras that look level count against images that are level.
+_LEVEL_GAZE = 0.01
+
+_TRIALS = 2000
+_GROUND_SHARE = 0.02
+_MAX_TILT = np.deg2rad(35)
+
+
+def up_of_cameras(X_WCs: list[RigidTransform]) -> NDArray[np.float64]:
+    """Returns the direction (3,) that people who hold their cameras level would call up.
+
+    Level images have horizontal x axes, so up is the direction most nearly at right angles to all
+    of them. Where all cameras look the same way that leaves a choice, and among what is left it is
+    the one nearest to the mean of the cameras' own up: the eigenvector of the smallest eigenvalue
+    of sum x x^T + 0.01 sum (I - m m^T), with m that mean's direction.
+    """
+    R = np.array([X_WC.rotation().matrix() for X_WC in X_WCs])
+    mean = -R[:, :, 1].mean(axis=0)
+    if np.linalg.norm(mean) < 0.1:
+        raise ValueError(
+            "the cameras have no direction in common that could be up; set capture.up to ground "
+            "or to an axis of the files' world"
+        )
+    mean /= np.linalg.norm(mean)
+    cost = np.einsum("ni,nj->ij", R[:, :, 0], R[:, :, 0])
+    cost += _LEVEL_GAZE * len(R) * (np.eye(3) - np.outer(mean, mean))
+    up = np.linalg.eigh(cost)[1][:, 0]
+    return up if up @ mean > 0 else -up
+
+
+def fit_ground(
+    p_WQ: NDArray[np.float64], p_WCs: NDArray[np.float64], up: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Fits the plane n.p = d that is the ground.
+
+    Of planes through three random points whose normal is within 35 degrees of `up` and which lie
+    below the median camera, the one with the most points near it wins, where a point lower than it
+    counts against it: under the ground there is nothing. Near is 2 % of the cameras' median
+    distance from the points. The winner is refined by least squares.
+
+    Args:
+        p_WQ: (N, 3), points of the place.
+        p_WCs: (M, 3), cameras.
+        up: (3,), roughly.
+
+    Returns:
+        n (3,), upward unit normal, and d.
+
+    Raises:
+        ValueError: if no plane holds a fiftieth of the points.
+    """
+    rng = np.random.default_rng(0)
+    camera = np.median(p_WCs, axis=0)
+    reach = np.linalg.norm(p_WQ - camera, axis=1)
+    near = 0.02 * float(np.median(reach))
+    # Far points are few and inaccurate.
+    p_WQ = p_WQ[reach < 3 * np.median(reach)]
+    if len(p_WQ) > 20_000:
+        p_WQ = p_WQ[rng.choice(len(p_WQ), 20_000, replace=False)]
+    best, best_count = None, 0.0
+    sample = rng.choice(len(p_WQ), (_TRIALS, 3)) if len(p_WQ) >= 3 else np.empty((0, 3), int)
+    for a, b, c in p_WQ[sample]:
+        n = np.cross(b - a, c - a)
+        if (length := np.linalg.norm(n)) == 0:
+            continue
+        n *= np.sign(n @ up) / length
+        height = p_WQ @ n - n @ a
+        if n @ up < np.cos(_MAX_TILT) or n @ camera <= n @ a:
+            continue
+        count = float((np.abs(height) < near).sum() - (height < -2 * near).sum())
+        if count > best_count:
+            best, best_count = (n, n @ a), count
+    if best is None or best_count < _GROUND_SHARE * len(p_WQ):
+        raise ValueError(
+            "no ground was found: no plane below the cameras holds a fiftieth of the points; give "
+            "the scale or the up direction in another way"
+        )
+    n, d = best
+    for width in near * np.array([1, 0.5, 0.25, 0.125]):
+        # Narrower each time, so that the feet of walls count less.
+        inliers = p_WQ[np.abs(p_WQ @ n - d) < width]
+        if len(inliers) < 10:
+            break
+        center = inliers.mean(axis=0)
+        n = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
+        n = n if n @ up > 0 else -n
+        d = n @ center
+    return n, float(d)
+
+
+def turn_upright(capture: Capture, up: str) -> Capture:
+    """Turns the world of a capture so that z is up.
+
+    Args:
+        up: x, y, z, -x, -y or -z of the present world, `cameras` or `ground`; see
+            `up_of_cameras` and `fit_ground`, which takes points or, without them, depth.
+
+    Raises:
+        ValueError: if no up direction can be found.
+    """
+    if up == "z":
+        return capture
+    if up in ("cameras", "ground"):
+        direction = up_of_cameras(list(capture.X_WCs))
+        if up == "ground":
+            cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
+            direction, _ = fit_ground(known_points(capture), cameras, direction)
+    else:
+        direction = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+    return turn_and_scale(capture, _turn_to_z(direction))
+
+
+def turn_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -> Capture:
+    """Returns the capture in a world N, turned and with lengths times `scale`; not its depth."""
+    points, axes = capture.points, capture.axes
+    return dataclasses.replace(
+        capture,
+        X_WCs=[
+            RigidTransform(R_NW @ X.rotation(), scale * R_NW.multiply(X.translation()))
+            for X in capture.X_WCs
+        ],
+        points=points and SfmPoints(scale * points.p_WQ @ R_NW.matrix().T, points.colors),
+        axes=axes and FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
+    )
+
+
+def known_points(capture: Capture) -> NDArray[np.float64]:
+    """Returns points (N, 3) of the place: those known or, without them, of up to 20 depth images.
+
+    Raises:
+        ValueError: if there are neither.
+    """
+    if capture.points is not None:
+        return capture.points.p_WQ
+    parts = []
+    for i in np.unique(np.linspace(0, len(capture) - 1, 20).astype(int)).tolist():
+        depth = capture.registered_depth(i)[::16, ::16]
+        rows, columns = np.nonzero((depth > 0) & np.isfinite(depth))
+        p_CQ = back_project(capture.K, 16 * columns + 0.5, 16 * rows + 0.5, depth[rows, columns])
+        parts.append(capture.X_WCs[i].multiply(p_CQ.T).T)
+    if not sum(len(part) for part in parts):
+        raise ValueError(
+            f"{capture.source}: neither points nor depth are known, so no ground can be found; set "
+            "capture.up or capture.scale in another way"
+        )
+    return np.concatenate(parts)
+
+
+def _turn_to_z(up: NDArray[np.float64]) -> RotationMatrix:
+    """Returns the smallest rotation that takes the unit vector `up` to z."""
+    z = np.array([0.0, 0.0, 1.0])
+    if up @ z < -1 + 1e-12:
+        return RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+    v = np.cross(up, z)
+    V = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return RotationMatrix.ProjectToRotationMatrix(np.eye(3) + V + V @ V / (1 + up @ z))
+
+
+_FEWEST = 20
+"""Points whose depth must be known for a scale."""
+_MAX_SCALE_TILT = 10.0
+"""[deg] of a ground against what level cameras call level."""
+_MAX_SPREAD = 0.25
+"""Of the cameras' heights over a ground, 10 to 90 %, relative to their median."""
+
+
+def make_metric(
+    capture: Capture,
+    scale: ScaleConfig,
+    locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
+) -> Capture:
+    """Gives a capture in unknown units its scale, or marks it as not metric if `scale` has none.
+
+    Args:
+        capture: its depth, if any, is in metres already; its poses and points are not.
+        scale: where metres come from.
+        locate: returns the point (3,) that is seen in the image of a name at a pixel (2,), or
+            raises ValueError; None if pixels cannot be located.
+
+    Raises:
+        ValueError: if the scale cannot be had in the way that is asked for.
+    """
+    given = scale.given()
+    if not given:
+        return dataclasses.replace(capture, metric=False)
+    if scale.factor:
+        factor = scale.factor
+    elif scale.distance:
+        a, b = (_locate(capture, each, locate) for each in scale.between)
+        if (length := float(np.linalg.norm(a - b))) < 1e-9:
+            raise ValueError(f"scale.between: {' and '.join(scale.between)} are the same place")
+        factor = scale.distance / length
+    elif scale.camera_height:
+        factor = scale.camera_height / camera_height(capture)
+    else:
+        factor = _factor_from_depth(capture)
+    source = f"{capture.source}, scale {factor:.6g} from {given[0]}"
+    return dataclasses.replace(turn_and_scale(capture, RotationMatrix(), factor), source=source)
+
+
+def _locate(
+    capture: Capture,
+    what: str,
+    locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None,
+) -> NDArray[np.float64]:
+    """Returns the camera ("a.jpg") or the point ("a.jpg@812,344") that is meant, (3,)."""
+    name, at, pixel = what.partition("@")
+    names, parts = list(capture.frame_names), PurePath(name).parts
+    found = [i for i, each in enumerate(names) if PurePath(each).parts == parts] or [
+        i for i, each in enumerate(names) if PurePath(each).parts[-len(parts) :] == parts
+    ]
+    if len(found) != 1:
+        known = ", ".join(names[i] for i in found[:5]) or f"{', '.join(names[:5])}, ..."
+        how = "several registered images are" if found else "no registered image is"
+        raise ValueError(f"scale.between: {how} called {name!r}; choose one of {known}")
+    if not at:
+        return capture.X_WCs[found[0]].translation()
+    if locate is None:
+        raise ValueError(f"scale.between: {what!r}: this kind of capture knows only cameras")
+    try:
+        u, v = (float(x) for x in pixel.split(","))
+    except ValueError:
+        raise ValueError(f"scale.between: {what!r} does not end in a pixel: @u,v") from None
+    return locate(names[found[0]], np.array([u, v]))
+
+
+def camera_height(capture: Capture) -> float:
+    """Returns the median height of the cameras above the ground, in the capture's units.
+
+    Raises:
+        ValueError: if no ground can be found, see `fit_ground` and `known_points`; or if it is
+            none that the cameras were carried over at one height, each about level.
+    """
+    cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
+    up = up_of_cameras(list(capture.X_WCs))
+    n, d = fit_ground(known_points(capture), cameras, up)
+    tilt = float(np.rad2deg(np.arccos(min(n @ up, 1.0))))
+    low, median, high = np.quantile(cameras @ n - d, [0.1, 0.5, 0.9])
+    if tilt > _MAX_SCALE_TILT or not high - low < _MAX_SPREAD * median:
+        raise ValueError(
+            f"{capture.source}: what looks most like ground tilts by {tilt:.0f} degrees against "
+            f"the cameras (at most {_MAX_SCALE_TILT:g} are believed), which are {low:.3g} to "
+            f"{high:.3g} units above it, {median:.3g} in the middle (at most {_MAX_SPREAD:.0%} of "
+            "it apart); "
+            "a height gives no scale; measure a length: scale.between and scale.distance"
+        )
+    return float(median)
+
+
+def _factor_from_depth(capture: Capture) -> float:
+    """Returns the median ratio of measured depth to that of the points, over all images with depth.
+
+    A point that is hidden in an image has a ratio too small; the median bears that while fewer
+    than half are.
+    """
+    ratios = []
+    points = capture.points
+    for i in range(len(capture) if points is not None and capture.has_depth else 0):
+        depth = capture.registered_depth(i)
+        x, y, z = capture.X_WCs[i].inverse().multiply(points.p_WQ.T)  # pyright: ignore
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = capture.K[0, 0] * x / z + capture.K[0, 2]
+            v = capture.K[1, 1] * y / z + capture.K[1, 2]
+        seen = (z > 0) & (u >= 0) & (u < capture.width) & (v >= 0) & (v < capture.height)
+        measured = depth[v[seen].astype(int), u[seen].astype(int)]
+        known = (measured > 0) & np.isfinite(measured)
+        ratios.append(measured[known] / z[seen][known])
+    ratio = np.concatenate(ratios) if ratios else np.zeros(0)
+    if len(ratio) < _FEWEST:
+        raise ValueError(
+            f"scale.depth_folder: {len(ratio)} points have a measured depth, at least {_FEWEST} "
+            "are needed; is there a depth file for each of some images, of its name and in its "
+            "subfolder?"
+        )
+    return float(np.median(ratio))
+
+
+def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
+    """Returns the capture in a world whose origin is at `origin` (3,) of that which it has.
+
+    Gaussians are in single precision, in which a step is 0.06 m at 800 km. Empty, `origin` is where
+    the cameras are if they are far away, and 0 otherwise.
+    """
+    p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
+    p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)
+    if not p.any():
+        return capture
+    points = capture.points
+    note = f"positions are relative to {', '.join(f'{x:.10g}' for x in p)} of the files"
+    return dataclasses.replace(
+        capture,
+        X_WCs=[RigidTransform(X.rotation(), X.translation() - p) for X in capture.X_WCs],
+        points=points and SfmPoints(points.p_WQ - p, points.colors),
+        notes=[*capture.notes, note],
+        origin=capture.origin + p,
+    )

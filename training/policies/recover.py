@@ -1,0 +1,272 @@
+"""The student's two stages: from what its expert shows, and then also from what the expert would
+have done where the student came too near to something.
+
+After the paper, Sec. III-B. The student of the first stage flies, without any guard, the ways that
+the expert flew in the worlds that it was trained in; the second is trained from nothing on all. For
+`diffaero_rgb`, which learns from the same corpora what it sees, the images alone matter. Another
+policy's flights may take the place of the first stage, as those of the round before.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from hashlib import blake2b
+from itertools import chain
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.messages import require
+from splatpilot.systems.common.processes import map_processes
+from splatpilot.systems.common.progress import Progress, resumable, say
+from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
+from splatpilot.systems.common.readers import read_archive
+from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
+from splatpilot.systems.policies.student import StudentConfig
+from splatpilot.training.corpus.corpus import (
+    Corpus,
+    CorpusConfig,
+    distinct_shards,
+    distinct_worlds,
+    link_corpus,
+)
+from splatpilot.training.corpus.library import WorldRecord
+from splatpilot.training.corpus.recovery_labels import StudentFlight, add_recovery
+from splatpilot.training.corpus.samples import EXPERT, RECOVERY, Shard
+from splatpilot.training.policies import train
+from splatpilot.training.policies.student_data import is_held_out
+from splatpilot.training.policies.trainer import Trainer, TrainingConfig
+
+_PATIENCE = 2.0
+"""How many times as long as the expert took a student may fly."""
+
+
+_ARRAYS = "p_WG", "times", "states", "clearances"
+"""Of each flight in a file of flights, see `StudentFlight`."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A way that the expert flew."""
+
+    start: list[float]  # [m]
+    goal: list[float]  # [m]
+    timeout: float  # [s]
+
+
+def tasks_of(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
+    """By world the ways of the expert's first `flights`, of those that shards are from."""
+    tasks: dict[str, list[Task]] = {}
+    for shard in shards:
+        if shard.source == EXPERT:
+            tasks.setdefault(shard.world, []).extend(
+                Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
+                for flight in shard.flights
+                if flight["states"]
+            )
+    return {world: ways[:flights] for world, ways in tasks.items() if ways}
+
+
+def fly_worlds(
+    corpus: Corpus, tasks: dict[str, list[Task]], pilot: str, folder: Path, jobs: int
+) -> tuple[list[StudentFlight], Counter[str]]:
+    """The flights of a policy, or a file of weights, in worlds of a corpus, and how they ended."""
+    folder.mkdir(parents=True, exist_ok=True)
+    work = [
+        (record, tasks[record.name], folder / f"{record.name}.npz")
+        for record in corpus.worlds
+        if record.name in tasks
+    ]
+    missing = [piece for piece in work if not _is_whole(piece[2])]
+    fly_world = partial(_fly_world, pilot, corpus.config)
+    bar = Progress(total=len(work), initial=len(work) - len(missing), desc="flying", unit="world")
+
+    def kept() -> str:
+        return f"flights in {bar.n} of {len(work)} worlds are in {folder}; the same command resumes"
+
+    with bar, resumable(kept):
+        for _ in map_processes(fly_world, missing, min(jobs, max(len(missing), 1))):
+            bar.update()
+    flown, outcomes = [], Counter()
+    for record, _, file in work:
+        with np.load(file) as arrays:
+            outcomes.update(str(outcome) for outcome in arrays["outcomes"])
+            for n in range(len(arrays["outcomes"])):
+                parts = {name: arrays[f"{name}_{n}"] for name in _ARRAYS}
+                flown.append(StudentFlight(record.name, **parts))
+    return flown, outcomes
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether a file of flights is there; one that is damaged goes, to be flown again."""
+    if not file.exists():
+        return False
+    try:
+        read_archive(file)
+    except ValueError as error:
+        say(f"{error}: it is flown again")
+        file.unlink()
+        return False
+    return True
+
+
+def _fly_world(
+    pilot: str, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]
+) -> None:
+    """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
+    record, tasks, file = work
+    policy, world = policy_named(pilot, config.expert.speed), record.make()
+    learns_from_corpora = isinstance(policy, StudentConfig | DiffAeroRgbConfig)
+    policy = replace(policy, **({"camera": config.camera} if learns_from_corpora else {}))
+    arrays: dict[str, Any] = {}
+    outcomes = []
+    for task in tasks:
+        scenario = Scenario(
+            seed=record.source.seed,
+            world=record.source.world,
+            start=task.start,
+            goal=task.goal,
+            start_radius=0.0,
+            timeout=task.timeout,
+            policy=policy,
+        )
+        try:
+            flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+        except InfeasibleFlightError:
+            continue
+        parts = np.array(task.goal), flight.times, flight.states, flight.clearances
+        for name, array in zip(_ARRAYS, parts, strict=True):
+            arrays[f"{name}_{len(outcomes)}"] = array
+        outcomes.append(str(flight.outcome))
+    with written_atomically(file) as path:
+        np.savez(path, outcomes=np.array(outcomes, dtype="U16"), **arrays)
+
+
+class CorpusTraining(TrainingConfig, Protocol):
+    """What the configuration of a trainer has that learns from corpora, a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    corpora: list[str]
+    """Their folders."""
+    held_out: float
+    """Part of their worlds, by name, that is not trained with."""
+
+
+@dataclass
+class RecoveryFlights:
+    """The content of `recovery.yaml`: what decides a run beside the configuration of training."""
+
+    # [-] Of the student, at most, in each world.
+    flights: int = 6
+    # Policy, or file of weights, that flies; the first stage's where left empty.
+    flown_by: str = ""
+    # What tells the content of that file from what it may have later.
+    flown_by_digest: str = ""
+    # Folders of the corpora, and the part of their worlds that is not trained with.
+    corpora: list[str] = field(default_factory=list)
+    held_out: float = 0.0
+
+
+@holds_folder("out")
+def run[Config: CorpusTraining](
+    *,
+    config: Config,
+    make: Callable[[Config], Trainer],
+    out: Path,
+    flights: int,
+    jobs: int,
+    flown_by: str = "",
+) -> dict[str, Any]:
+    """
+    Trains a student, has it fly, gathers what it was to have done, and trains another on all.
+
+    Interrupted anywhere, even by `kill -9`, the same call goes on and leaves the same. The corpora
+    that `config` names stay as they are.
+
+    Leaves in `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
+    `corpora`, links to those of `config` with the recovery samples beside them; `flights`, what the
+    student flew, a file a world; `recovery.yaml`, how many they may be, whose and where;
+    `recovery.json`, how many of what there are.
+
+    Args:
+        config: of both stages.
+        make: the trainer of that configuration.
+        flights: of the student, at most, in each world.
+        jobs: processes that fly.
+        flown_by: a policy or a file of weights that flies instead of a first stage. Students see
+            through the corpora's camera, others through their own.
+
+    Returns:
+        What `recovery.json` says.
+
+    Raises:
+        FileNotFoundError, ValueError: see `train.run`, `add_recovery` and `policy_named`; or if
+            `out` holds something else.
+        OSError: if `out` cannot be written, or a process was killed.
+    """
+    for name, value in (("flights", flights), ("jobs", jobs)):
+        require(value >= 1, f"--{name}", "at least 1", value)
+    # What is not there is refused before anything is written.
+    if flown_by:
+        policy_named(flown_by)
+    worlds = distinct_worlds([Corpus(Path(source)) for source in config.corpora])
+    digest = _digest(Path(flown_by)) if flown_by.endswith(".npz") else ""
+    decisive = RecoveryFlights(flights, flown_by, digest, list(config.corpora), config.held_out)
+    claim_folder(out / "recovery.yaml", decisive)
+    pilot, first = flown_by, {}
+    if not flown_by:
+        say(f"first stage, in {out / 'stage_1'}")
+        first = train.run(config=config, out=out / "stage_1", make=make)
+        pilot = str(out / "stage_1" / f"{first['policy']}.npz")
+    folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
+    for source, folder in zip(config.corpora, folders, strict=True):
+        link_corpus(Path(source), folder)
+    corpora = [Corpus(folder) for folder in folders]
+    others = {s.revision for corpus in corpora for s in corpus.shards} - {revision()}
+    if others:
+        say(
+            f"what the corpora hold was labelled by revision {', '.join(sorted(others))} of the "
+            f"program, recovery by {revision()}; ledger.csv tells which"
+        )
+    held_out = {name for name in worlds if is_held_out(name, config.held_out)}
+    outcomes: Counter[str] = Counter()
+    for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
+        tasks = tasks_of([shard for shard in shards if shard.world not in held_out], flights)
+        flown, ended = fly_worlds(corpus, tasks, pilot, out / "flights" / folder.name, jobs)
+        outcomes += ended
+        add_recovery(folder, flown, jobs)
+    both = replace(config, corpora=[str(folder) for folder in folders])
+    say(f"second stage, in {out / 'stage_2'}")
+    second = train.run(config=both, out=out / "stage_2", make=make)
+    ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
+    ledger |= {"flown_by": flown_by} if flown_by else {"stage_1": first}
+    ledger["stage_2"] = second
+    with written_atomically(out / "recovery.json") as path:
+        path.write_text(json.dumps(ledger, indent=2) + "\n")
+    return ledger
+
+
+def _digest(file: Path) -> str:
+    return blake2b(file.read_bytes(), digest_size=16).hexdigest()
+
+
+def _ledger(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]:
+    """How many flights ended how, near-misses that they had, and samples by where they are from."""
+    shards = list(chain.from_iterable(distinct_shards(corpora)))
+    recovered = [shard for shard in shards if shard.source == RECOVERY]
+    return {
+        "flights": dict(sorted(outcomes.items())),
+        "revisions": sorted({shard.revision for shard in shards}),
+        "near_misses": sum(f["near_misses"] for shard in recovered for f in shard.flights),
+        "expert_samples": sum(len(shard) for shard in shards if shard.source == EXPERT),
+        "recovery_samples": sum(map(len, recovered)),
+    }
