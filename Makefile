@@ -5,7 +5,7 @@ PYTHON ?= $(shell for python in python3.12 python3.13 python3 python; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null && echo $$python && break; done)
 BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
-NATIVE := $(wildcard native/*.hpp native/*.cpp)
+NATIVE := $(shell find native -name '*.hpp' -o -name '*.cpp')
 
 .PHONY: fly test lint fuzz crash docs stub messages sanitize nightly clean
 

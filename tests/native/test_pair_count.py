@@ -9,7 +9,7 @@ import pytest
 NATIVE = Path(__file__).parents[2] / "native"
 PROGRAM = """
 #include <cstdio>
-#include "pair_count.hpp"
+#include "project/pair_count.hpp"
 
 int main() {
   splatpilot::check_pair_count(0xffffffffull);

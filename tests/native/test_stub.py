@@ -6,7 +6,7 @@ from nanobind.stubgen import StubGen
 
 from splatpilot import _native
 
-STUB = Path(__file__).parents[2] / "api" / "splatpilot" / "_native.pyi"
+STUB = Path(__file__).parents[2] / "splatpilot" / "_native.pyi"
 
 
 def test_stub_is_what_the_module_gives():

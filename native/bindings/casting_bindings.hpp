@@ -1,0 +1,121 @@
+// What the Python bindings of worlds that rays are cast in share.
+#pragma once
+
+#include <nanobind/stl/string.h>
+
+#include <numeric>
+#include <string>
+#include <vector>
+
+#include "bindings/bindings.hpp"
+#include "casting/ray_casting.hpp"
+#include "core/dispatch.hpp"
+#include "core/thread_pool.hpp"
+
+namespace splatpilot {
+
+using Points = Floats<nb::shape<-1, 3>>;
+using Rotations = Floats<nb::shape<-1, 3, 3>>;
+using Numbers = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using DepthRows = Writable<nb::ndim<2>>;
+
+constexpr size_t kPack = 16;
+constexpr size_t kCameras = 4;  // to a task
+
+inline void require_worlds(const Numbers& world, size_t queries, size_t worlds) {
+  require(world.size() == queries, "the numbers of worlds differ in length from the points");
+  for (size_t n = 0; n < queries; ++n) {
+    const int64_t w = world.data()[n];
+    if (w < 0 || static_cast<size_t>(w) >= worlds) {
+      throw std::invalid_argument("world " + std::to_string(w) + " of " + std::to_string(worlds) +
+                                  " worlds, which count from 0");
+    }
+  }
+}
+
+// The rays of a camera, in whole packs.
+struct OwnRays {
+  std::vector<float> xy;
+  std::vector<uint32_t> pixels;
+  PixelRays rays{};
+
+  OwnRays(const Points& directions, float half_pixel) {
+    const size_t count = directions.shape(0), size = (count + kPack - 1) / kPack * kPack;
+    require(count > 0 && count <= 0xffffffff / 3, "the camera has no pixels, or too many");
+    require(half_pixel >= 0.0f, "the width of a pixel must not be negative");
+    const auto direction = [&](uint32_t pixel) { return directions.data() + 3 * pixel; };
+    for (uint32_t pixel = 0; pixel < count; ++pixel) {
+      const float* d = direction(pixel);
+      require(std::isfinite(d[0]) && std::isfinite(d[1]) && d[2] == 1.0f,
+              "rays must be finite and have depth 1 in the camera's frame");
+    }
+    pixels.resize(count);
+    std::iota(pixels.begin(), pixels.end(), 0u);
+    std::stable_sort(pixels.begin(), pixels.end(),
+                     [&](uint32_t a, uint32_t b) { return direction(a)[0] < direction(b)[0]; });
+    xy.resize(2 * size);
+    for (size_t i = 0; i < size; ++i) {
+      const float* d = direction(pixels[std::min(i, count - 1)]);
+      xy[i] = d[0];
+      xy[size + i] = d[1];
+    }
+    rays.x = xy.data();
+    rays.y = xy.data() + size;
+    rays.pixels = pixels.data();
+    rays.count = count;
+    rays.half_pixel = half_pixel;
+    for (int k = 0; k < 2; ++k) {
+      const auto [low, high] =
+          std::minmax_element(xy.begin() + k * size, xy.begin() + (k + 1) * size);
+      rays.low[k] = *low;
+      rays.high[k] = *high;
+    }
+  }
+};
+
+// What worlds of both kinds have: kernels, and threads that one caller uses at a time.
+class Casting {
+ public:
+  Casting(int threads, const std::string& simd)
+      : kernels_(*kernels(simd).casting), pool_(checked(threads)) {}
+
+ protected:
+  // Calls cast(camera, world, rays, pose, scratch, depth) for each camera.
+  template <typename Cast>
+  void for_each_camera(const Points& p, const Rotations& R, const Numbers& world, size_t worlds,
+                       const Points& directions, float half_pixel, const DepthRows& depth,
+                       size_t most_bodies, const Cast& cast) {
+    const size_t count = p.shape(0);
+    require(R.shape(0) == count && depth.shape(0) == count && depth.shape(1) == directions.shape(0),
+            "positions, rotations and images of cameras differ in shape");
+    require_worlds(world, count, worlds);
+    const OwnRays own(directions, half_pixel);
+    const nb::gil_scoped_release release;
+    const std::scoped_lock lock(mutex_);
+    const size_t size = kernels_.scratch(own.rays.count, most_bodies);
+    pool_.for_each((count + kCameras - 1) / kCameras, [&](size_t task) {
+      thread_local std::vector<float> scratch;
+      if (scratch.size() < size) scratch.resize(size);
+      for (size_t n = task * kCameras; n < std::min(count, (task + 1) * kCameras); ++n) {
+        CameraPose pose;
+        std::copy_n(p.data() + 3 * n, 3, pose.p);
+        std::copy_n(R.data() + 9 * n, 9, pose.R);
+        cast(static_cast<size_t>(world.data()[n]), own.rays, pose, scratch.data(),
+             depth.data() + n * own.rays.count);
+      }
+    });
+  }
+
+  const CastingKernels& kernels_;
+
+ private:
+  static int checked(int threads) {
+    require(threads >= 1 && threads <= 1024, "threads must lie between 1 and 1024");
+    return threads;
+  }
+
+  ThreadPool pool_;
+  std::mutex mutex_;
+};
+
+}  // namespace splatpilot

@@ -1,0 +1,77 @@
+// The kernels of one SIMD level; compiled once per level with SIMD_LEVEL set to its name.
+#include "backward/projection_backward.hpp"
+#include "backward/raster_backward.hpp"
+#include "project/project_arrays.hpp"
+#include "project/project_baked.hpp"
+#include "raster/tiles.hpp"
+
+namespace splatpilot::SIMD_LEVEL {
+
+static size_t first_nonfinite(const float* values, size_t count) {
+  size_t i = 0;
+  constexpr size_t kStride = 64 * kLanes;
+  for (; i + kStride <= count; i += kStride) {
+    // v * 0 is 0 for finite v and NaN otherwise, and NaN stays in a sum.
+    F16 sum = F16(0.0f);
+    for (size_t k = 0; k < kStride; k += kLanes) sum += load(values + i + k) * F16(0.0f);
+    if (lane_bits(sum >= F16(0.0f)) != 0xffff) break;
+  }
+  for (; i < count; ++i) {
+    if (!__builtin_isfinite(values[i])) return i;
+  }
+  return count;
+}
+
+static bool all_within(const float* values, size_t count, float low, float high) {
+  uint32_t bits = 0xffff;
+  size_t i = 0;
+  for (; i + kLanes <= count; i += kLanes) {
+    const F16 v = load(values + i);
+    bits &= lane_bits((v >= F16(low)) & (v <= F16(high)));
+  }
+  bool within = bits == 0xffff;
+  for (; i < count; ++i) within = within && values[i] >= low && values[i] <= high;
+  return within;
+}
+
+static bool all_normalisable(const float* quats, size_t count) {
+  bool all = true;
+  for (size_t i = 0; i < count; ++i) {
+    const float* q = quats + 4 * i;
+    const float squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    all &= squared >= kMinSquaredNorm;
+    all &= squared <= kMaxSquaredNorm;
+  }
+  return all;
+}
+
+static float multiply_add(size_t rounds) {
+  Register sums[kFmaChains];
+  for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = Register{} + 1.0f * chain;
+  const Register a = Register{} + 0.5f, b = Register{} + 1.0f;
+  for (size_t i = 0; i < rounds; ++i) {
+    for (int k = 0; k < kRegisters; ++k) {
+#pragma GCC unroll 12
+      for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = sums[chain] * a + b;
+    }
+  }
+  float total = 0.0f;
+  for (int chain = 0; chain < kFmaChains; ++chain) total += sums[chain][0];
+  return total;
+}
+
+extern const SurfelKernels kSurfelKernels;
+extern const LossKernels kLossKernels;
+extern const CastingKernels kCastingKernels;
+extern const FittingKernels kFittingKernels;
+
+#define SP_STRING_OF(name) #name
+#define SP_STRING(name) SP_STRING_OF(name)
+extern const Kernels kKernels;
+const Kernels kKernels = {
+    SP_STRING(SIMD_LEVEL), &kSurfelKernels,      &kLossKernels,    &kCastingKernels,
+    &kFittingKernels,      project_arrays,       project_baked,    bin_footprints<SplatFootprint>,
+    raster_tile,           raster_tile_backward, gather_gradients, project_backward,
+    first_nonfinite,       all_within,           all_normalisable, multiply_add};
+
+}  // namespace splatpilot::SIMD_LEVEL

@@ -1,0 +1,102 @@
+// What the parts of the surfel renderer (2D Gaussian splatting; Huang et al. 2024) pass on.
+#pragma once
+
+#include "core/types.hpp"
+
+namespace splatpilot {
+
+// The pixel's low-pass filter: a blob with a standard deviation of sqrt(1/2) px.
+constexpr float kBlobVariance = 0.5f;
+// Surfels whose plane meets the ray through their centre at a smaller sine are seen edge-on: only
+// their blob is drawn.
+constexpr float kEdgeOn = 1e-5f;
+// exp(-r2 / 2) = exp2(-kHalfLog2e r2).
+constexpr float kHalfLog2e = 0.72134752f;
+
+// A visible surfel. With d = (pixel - mean, 1) the ray through the pixel meets its plane at the
+// depth z = 1 / (w . d), at z (u . d) and z (v . d) standard deviations from its centre: the third
+// entries are what the rounding of mean leaves, and in w the inverse depth of the centre.
+// Seen edge-on, w is (0, 0, -1): no ray meets the plane in front of the camera.
+struct Surfel {
+  float mean[2];           // [px]
+  float u[3], v[3], w[3];  // [1/(m px)], the third entries [1/m]
+  float depth;             // of the centre [m]
+  float log2_opacity;
+  float color[3];
+  float normal[3];  // in the world, towards the camera
+};
+constexpr int kSurfelFields = sizeof(Surfel) / sizeof(float);
+
+// The pixels that a surfel may reach are those of an ellipse and of a disc. The ellipse is written
+// as a Splat, with the disc where that has its colour.
+struct Disc {
+  float x, y, radius;  // [px]
+};
+inline __attribute__((always_inline)) Disc disc_of(const Splat& bounds) {
+  return {bounds.color[0], bounds.color[1], bounds.color[2]};
+}
+
+// Where tiles write, or read gradients: row-major images, a null pointer where there is none.
+template <typename T>
+struct SurfelImages {
+  T* color;    // (H, W, 3)
+  T* normal;   // (H, W, 3), in the world
+  T* depth;    // (H, W), sum of weight and depth
+  T* alpha;    // (H, W)
+  T* median;   // (H, W)
+  T* distort;  // (H, W)
+};
+
+// What the backward pass needs of a block of 16 pixels: the transmittance behind the last surfel
+// drawn, how many of the tile's surfels were passed before the pixel was full, which of them gave
+// the median depth (-1: none), and the sums of weights and of weighted depths.
+struct alignas(64) SurfelBlockRecord {
+  float transmittance[16], passed[16], median[16], alpha[16], depth[16];
+};
+
+struct SurfelRasterInput {
+  const Surfel* surfels;
+  const Pair* pairs;           // grouped by tile, in depth order
+  const size_t* tile_offsets;  // (tiles + 1,)
+  int width, height, tiles_x;
+  float near_plane;  // rays that meet a surfel nearer than this miss it [m]
+};
+
+// Derivatives of the loss, summed over the pixels of a tile, with respect to fields of a Surfel
+// and, in `exponent`, to log alpha. Those with respect to u, v and w, which are vectors d times a
+// number, are told by that number's products with (u . d, v . d): needles keep their digits.
+struct alignas(64) SurfelGradient {
+  float u[2], v[2], w[2], mean[2], depth, exponent, color[3], normal[3];
+};
+static_assert(sizeof(SurfelGradient) == 64);
+
+// Where the gradients of the input go: added to rows of arrays shaped like the input.
+struct InputGradients {
+  float *means, *quats, *scales, *opacities, *colors;
+};
+
+// Of the camera: world to camera (R row by row, then t), and the camera centre, of which colours
+// by spherical harmonics depend.
+struct CameraGradient {
+  double R[9], t[3], centre[3];
+};
+
+struct SurfelKernels {
+  size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat* bounds,
+                    Surfel*, uint32_t* depth_bits);
+  BinKernel bin;
+  // `records` (tiles, 16) are null when no backward pass follows.
+  void (*raster_tile)(const SurfelRasterInput&, const SurfelImages<float>&,
+                      SurfelBlockRecord* records, int tile);
+  // Writes the gradients of a tile's pairs.
+  void (*raster_tile_backward)(const SurfelRasterInput&, const SurfelBlockRecord* records,
+                               const SurfelImages<const float>& gradients, int tile,
+                               SurfelGradient*);
+  // From gradients of `count` surfels, whose places in the input are `indices`, to those of the
+  // input and of the camera.
+  void (*project_backward)(const GaussianArrays&, const Camera&, const uint32_t* indices,
+                           const SurfelGradient*, size_t count, const InputGradients&,
+                           CameraGradient*);
+};
+
+}  // namespace splatpilot
