@@ -7,7 +7,7 @@ from pathlib import Path
 from splatpilot.analysis.tour import TourConfig, make_scene
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import DATA
-from splatpilot.systems.common.messages import unknown
+from splatpilot.systems.common.validation import unknown
 from splatpilot.training.captures import render as render_capture
 from splatpilot.training.captures.render import RenderConfig
 from splatpilot.training.reconstruction.config import ReconstructConfig

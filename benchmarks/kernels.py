@@ -14,7 +14,7 @@ from splatpilot import _native
 from splatpilot.systems.splats.scene import GaussianScene
 
 WIDTH, HEIGHT = 320, 240
-# Vector instructions of the backward pass in the inner loops of native/backward/raster_backward.hpp, counted
+# Vector instructions of the backward pass in the inner loops of native/backward, counted
 # by hand for RGB: a (Gaussian, 4x4 block) composited again and differentiated, and one reduction.
 VECTOR_WORK = {"block": 45, "pair": 40}
 FMA_ROUNDS = 200_000

@@ -30,10 +30,10 @@ from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import holds_folder
-from splatpilot.systems.common.messages import require
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import program
+from splatpilot.systems.common.validation import require
 
 CONNECT_TIMEOUT = 10.0
 """[s], for a scheduler to answer."""

@@ -13,8 +13,8 @@ import yaml
 from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, MAX_SPEED, speed_of
 from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.messages import require
 from splatpilot.systems.common.seeds import study_seeds
+from splatpilot.systems.common.validation import require
 
 # Policies of a study: registered ones, files of weights and classes of others, each with some of
 # its fields set, and a label that its flights are named by.

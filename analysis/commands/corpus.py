@@ -11,7 +11,7 @@ from splatpilot.analysis.commands.options import (
     check_config,
 )
 from splatpilot.systems.common.files import require_existing, require_unused
-from splatpilot.systems.common.messages import require
+from splatpilot.systems.common.validation import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

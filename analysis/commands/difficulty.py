@@ -3,7 +3,7 @@
 import argparse
 
 from splatpilot.analysis.commands.options import SCENARIOS, add_named, add_verb, check_scenario
-from splatpilot.systems.common.messages import require
+from splatpilot.systems.common.validation import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.options import FailureWithResultError, as_json
 from splatpilot.systems.common.extras import missing_extra
-from splatpilot.systems.common.messages import TYPES, did_you_mean, unknown
+from splatpilot.systems.common.validation import TYPES, did_you_mean, unknown
 
 
 def raised_by(error: BaseException, packages: Collection[str]) -> str:

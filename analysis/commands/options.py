@@ -27,8 +27,8 @@ from splatpilot.systems.common.files import (
     require_existing,
     require_scene,
 )
-from splatpilot.systems.common.messages import did_you_mean, require
 from splatpilot.systems.common.registry import check_name
+from splatpilot.systems.common.validation import did_you_mean, require
 
 
 class SetField(argparse.Action):

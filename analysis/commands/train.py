@@ -14,7 +14,7 @@ from splatpilot.analysis.commands.options import (
     check_scenario,
     check_trainer,
 )
-from splatpilot.systems.common.messages import require
+from splatpilot.systems.common.validation import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:

@@ -10,8 +10,8 @@ from pydrake.systems.framework import System
 
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
-from splatpilot.systems.common.messages import require
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
 from splatpilot.systems.policies.checkpoint import policy_of, shipped_weights
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig

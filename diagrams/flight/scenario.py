@@ -14,8 +14,8 @@ from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
 from splatpilot.systems.common.config import open_field
-from splatpilot.systems.common.messages import FieldError, require, unknown
 from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.common.validation import FieldError, require, unknown
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig

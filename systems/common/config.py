@@ -17,9 +17,9 @@ from typing import Any, cast, get_args, get_origin
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
-from splatpilot.systems.common.messages import TYPES, did_you_mean, require
 from splatpilot.systems.common.readers import read_text, reason_of, require_shallow
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.common.validation import TYPES, did_you_mean, require
 
 _TAGGED = object()
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from splatpilot.systems.common.messages import unknown
+from splatpilot.systems.common.validation import unknown
 
 _OURS = "splatpilot."
 _OTHER = "and module:attribute of your own"

@@ -9,7 +9,7 @@
 | from 3,000,000 | Monte Carlo simulations |
 """
 
-from splatpilot.systems.common.messages import require
+from splatpilot.systems.common.validation import require
 
 MAX_SEED = 2**31 - 1
 TRAINING_SEEDS = 1_000_000

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
-from splatpilot.systems.common.messages import require_field
+from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.policies.agile_autonomy_inference import TrajectoryNetworkSpec
 from splatpilot.systems.policies.observations import require_poolable
 from splatpilot.systems.policies.recurrent_network import NetworkSpec

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from splatpilot.systems.collision.distance_field import Distances
-from splatpilot.systems.common.messages import require, require_field
+from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.policies.motion_primitives import (
     STEEPEST,

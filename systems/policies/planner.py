@@ -12,8 +12,8 @@ from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingBalls
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.common.messages import require_field
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.motion_primitives import level_acceleration

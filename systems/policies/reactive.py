@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.common.messages import require_field
+from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.policies.motion_primitives import rotation_to, velocity_fan
 from splatpilot.systems.policies.velocity import (
     RESPONSE_TIME,

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.common.messages import require_field
+from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.policies.velocity import approach_velocity, tracking_acceleration
 from splatpilot.systems.vehicle.state import QuadrotorState
 

@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.common.messages import require_field
+from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.splats.lens import Distortion
 
 _LARGEST = 4096  # [px]

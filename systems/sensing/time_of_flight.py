@@ -16,7 +16,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.common.messages import require_field
+from splatpilot.systems.common.validation import require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
 
 LEAST_DEPTH = 1e-3

@@ -17,10 +17,10 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.files import claim_folder, holds_folder, require_writable_folder
-from splatpilot.systems.common.messages import require
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state

@@ -24,11 +24,11 @@ from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
-from splatpilot.systems.common.messages import require
 from splatpilot.systems.common.processes import map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
 from splatpilot.systems.common.readers import read_archive
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
 from splatpilot.systems.policies.student import StudentConfig
 from splatpilot.training.corpus.corpus import (

@@ -1,8 +1,20 @@
-"""Messages about what a user gave, in one form each."""
+"""Validation of configurations and options, with one form of message.
+
+A field declares the values it may have where it is defined::
+
+    @dataclass
+    class NoiseConfig(Config):
+        latency: float = bounded(0.0, "[0, 1] s")
+        model: str = bounded("gaussian", "{gaussian, uniform}")
+
+`Config.validate` checks all of them, then the conditions between fields in `Config.check`.
+"""
 
 import dataclasses
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from typing import Any, cast
 
 TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
 """What plain values of these types are called."""
@@ -88,3 +100,63 @@ def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
     enough = max(_MIN_LIKENESS, max(likeness.values(), default=0.0) - _NO_LESS)
     close = [f"{prefix}{each}" for each, ratio in likeness.items() if ratio >= enough]
     return f"did you mean {' or '.join(close)}?" if 0 < len(close) <= _MAX_NAMES else ""
+
+
+_DOMAIN = "domain"  # key in a field's metadata
+_INTERVAL = re.compile(r"([\[(])(\S+), ([^\])]+)([\])])")
+
+
+def bounded(default: Any, domain: str) -> Any:
+    """
+    Declares a field of a configuration and the values that it may have.
+
+    Args:
+        default: value, or a function that makes it, such as `list`.
+        domain: interval with its unit, as "(0, 3600] s", or set of words, as "{3dgs, 2dgs}". It
+            holds for each item of a list; None is always in it.
+    """
+    kind = "default_factory" if callable(default) else "default"
+    return dataclasses.field(**{kind: default}, metadata={_DOMAIN: domain})
+
+
+class Config:
+    """Base class of configurations, which are dataclasses."""
+
+    def validate(self) -> None:
+        """
+        Checks all fields by their domains, the configurations in them, then `check`.
+
+        Raises:
+            ValueError: naming the field, the condition and the value.
+        """
+        for field in dataclasses.fields(cast(Any, self)):
+            value, domain = getattr(self, field.name), field.metadata.get(_DOMAIN)
+            if domain:
+                require_field(self, field.name, _is_in(value, domain), f"in {domain}")
+            for part in _configurations(value):
+                part.validate()
+        self.check()
+
+    def check(self) -> None:
+        """Checks conditions between fields; raises ValueError."""
+
+
+def _configurations(value: Any) -> Iterator[Any]:
+    """Yields the configurations that a field holds."""
+    if dataclasses.is_dataclass(value) and hasattr(value, "validate"):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _configurations(part)
+
+
+def _is_in(value: Any, domain: str) -> bool:
+    if value is None:
+        return True
+    if isinstance(value, list | tuple):
+        return all(_is_in(item, domain) for item in value)
+    if domain.startswith("{"):
+        return value in domain.strip("{}").split(", ")
+    left, lower, upper, right = cast(re.Match[str], _INTERVAL.match(domain)).groups()
+    above = value >= float(lower) if left == "[" else value > float(lower)
+    return bool(above and (value <= float(upper) if right == "]" else value < float(upper)))

@@ -5,8 +5,10 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from splatpilot.systems.common.messages import (
+from splatpilot.systems.common.validation import (
+    Config,
     FieldError,
+    bounded,
     did_you_mean,
     require,
     require_field,
@@ -66,3 +68,41 @@ def test_an_unknown_name_is_told_with_the_most_similar_or_all(name, message):
 )
 def test_at_most_three_similar_names_are_suggested(name, names, question):
     assert did_you_mean(name, names) == question
+
+
+@dataclass
+class Inner(Config):
+    share: float = bounded(0.5, "[0, 1)")
+
+
+@dataclass
+class Outer(Config):
+    speed: float = bounded(1.0, "(0, 20] m/s")
+    kind: str = bounded("a", "{a, b}")
+    sizes: list[int] = bounded(lambda: [1, 2], "[1, 9]")
+    height: float | None = bounded(None, "[0, inf) m")
+    inner: Inner = field(default_factory=Inner)
+    others: dict[str, Inner] = field(default_factory=dict)
+
+    def check(self) -> None:
+        require(self.speed != 13.0, "speed", "another number", self.speed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed": 0.0}, r"Outer\.speed must be in \(0, 20\] m/s, got 0\.0"),
+        ({"speed": float("nan")}, "speed .* got nan"),
+        ({"kind": "c"}, r"kind must be in \{a, b\}, got c"),
+        ({"sizes": [1, 10]}, r"sizes must be in \[1, 9\], got \[1, 10\]"),
+        ({"height": float("inf")}, "height must be in .* got inf"),
+        ({"inner": Inner(1.0)}, r"Inner\.share must be in \[0, 1\), got 1\.0"),
+        ({"others": {"x": Inner(-0.1)}}, "share .* got -0.1"),
+        ({"speed": 13.0}, "speed must be another number, got 13"),
+    ],
+)
+def test_fields_out_of_their_domain_are_refused(changes, message):
+    Outer().validate()
+    Outer(speed=20.0, height=3.0).validate()
+    with pytest.raises(ValueError, match=message):
+        Outer(**changes).validate()
