@@ -115,8 +115,10 @@ def bounded(default: Any, domain: str) -> Any:
         domain: interval with its unit, as "(0, 3600] s", or set of words, as "{3dgs, 2dgs}". It
             holds for each item of a list; None is always in it.
     """
-    kind = "default_factory" if callable(default) else "default"
-    return dataclasses.field(**{kind: default}, metadata={_DOMAIN: domain})
+    metadata = {_DOMAIN: domain}
+    if callable(default):
+        return dataclasses.field(default_factory=cast(Any, default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 class Config:

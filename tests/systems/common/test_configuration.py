@@ -9,7 +9,8 @@ import pytest
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
-from splatpilot.diagrams.worlds.world_registry import SceneConfig, make_world, register_world
+from splatpilot.diagrams.worlds.scene_folder import SceneConfig
+from splatpilot.diagrams.worlds.world_registry import make_world, register_world
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
 from splatpilot.training.corpus.library import LibraryConfig
 
