@@ -70,14 +70,6 @@ def _train(folder: Path) -> list[str]:
     return ["train", "diffaero", "--out", f"{folder}/out", *_set(*_TRAIN)]
 
 
-def _tour(folder: Path) -> list[str]:
-    render = _set("width=64", "height=48", "path=[[1, 0, 1.8], [2, 0, 1.8]]", prefix="render.")
-    render += _set("spacing=1", "yaws=[0, 90, 180, -90]", prefix="render.")
-    flight = _set("camera.width=64", "camera.height=48", "timeout=1.5", prefix="flight.")
-    made = _set(*_RECONSTRUCT, prefix="reconstruct.")
-    return ["tour", f"{folder}/short.yaml", "--out", f"{folder}/out", *render, *made, *flight]
-
-
 def _ablate(folder: Path) -> list[str]:
     words = ["ablate", f"{folder}/tiles", "--out", f"{folder}/out"]
     return [*words, *_set(*_RECONSTRUCT)]
@@ -103,7 +95,6 @@ VERBS = {
         _benchmark(2), "*.yaml rollouts.csv table.csv rollouts/* scenarios/*"
     ),
     "train": Verb(_train, "*.npz curves.csv config.yaml"),
-    "tour": Verb(_tour, "capture/*/* scene/* flight/trajectory.npz"),
     "ablate": Verb(_ablate, "*.csv *.md tiles/*/*"),
     "fidelity": Verb(_fidelity, "*.csv */*/*", "scene/*", reads_scene=True),
 }
