@@ -11,7 +11,7 @@ from typing import Any
 from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.report import write_report
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
-from splatpilot.analysis.benchmark.study import SCENARIO, RolloutSpec, StudyConfig
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
     foreign_code,
@@ -21,6 +21,7 @@ from splatpilot.analysis.benchmark.study_folder import (
     require_test_scenes,
 )
 from splatpilot.analysis.benchmark.tables import format_table, policy_table
+from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS

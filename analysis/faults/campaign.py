@@ -1,4 +1,4 @@
-"""`splatpilot faults`: flights in which something goes wrong, many, drawn at random."""
+"""`splatpilot hardware faults`: flights in which something goes wrong, many, drawn at random."""
 
 import json
 from dataclasses import dataclass, field, replace

@@ -209,7 +209,7 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     It is what reconstruction would have written of the capture in that scale: start and goal are
     chosen for the vehicle, and a place whose scale was unknown is closed where nobody looked
     (`close_frontier`). The grid of the distance field stays; its voxels grow. What was measured of
-    the scene is not copied, `splatpilot measure` and `fidelity` measure the new one.
+    the scene is not copied, `splatpilot scene measure` and `fidelity` measure the new one.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a damaged scene, a factor that is not positive,

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from math import inf
-from pathlib import Path
 
 import numpy as np
 from pydrake.common.schema import Rotation, Transform
@@ -15,7 +14,7 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
 from splatpilot.systems.common.config import open_field
 from splatpilot.systems.common.seeds import check_seed
-from splatpilot.systems.common.validation import FieldError, require, unknown
+from splatpilot.systems.common.validation import FieldError, require
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
@@ -152,36 +151,3 @@ def _check_simulator(simulator: SimulatorConfig) -> None:
     for name in ("start_time", "target_realtime_rate"):
         value = getattr(simulator, name)
         require(value == 0, f"simulator.{name}", "0", value, "flights start then and do not wait")
-
-
-_FOLDER = Path(__file__).parents[1] / "scenarios"
-
-
-def benchmark_scenarios() -> dict[str, Path]:
-    """The files of the benchmark's scenarios by name."""
-    return _files(_FOLDER)
-
-
-def other_scenarios() -> dict[str, Path]:
-    """The files of the scenarios that come with the program and are not in the benchmark."""
-    return _files(_FOLDER / "others")
-
-
-def _files(folder: Path) -> dict[str, Path]:
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-
-
-def scenario_file(scenario: str) -> Path:
-    """
-    The file of a scenario that comes with the program, given by its name, or of another, given as a
-    path.
-
-    Raises:
-        ValueError: if it is neither.
-    """
-    known = benchmark_scenarios() | other_scenarios()
-    if scenario in known:
-        return known[scenario]
-    if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
-        return Path(scenario)
-    raise ValueError(unknown("scenario", scenario, known, "and others as YAML files"))

@@ -118,7 +118,7 @@ class SceneMetadata:
     """[px], to which images were scaled down for the making; 0 if they were not."""
     perturbation_bound: float | None = None
     """[m], how far from the poses of the capture images of the scene can be trusted, as
-    `splatpilot fidelity` measured it; None before."""
+    `splatpilot scene fidelity` measured it; None before."""
     pose_perturbation_bounds: list[float] = field(default_factory=list)
     """[m], the same for each pose of the capture, in frame order; empty before."""
 
@@ -178,7 +178,7 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
         raise ValueError(
             f"{file}: perturbation_bound is {metadata.perturbation_bound} and "
             f"pose_perturbation_bounds {metadata.pose_perturbation_bounds}; finite lengths [m] of "
-            "at least 0 are needed, run `splatpilot fidelity` again"
+            "at least 0 are needed, run `splatpilot scene fidelity` again"
         )
     return metadata
 
@@ -228,7 +228,7 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
         raise ValueError(
             f"{path / 'scene.yaml'}: the scale of this scene is unknown (metric: false), so no "
             f"distance in it can be trusted; measure something in `splatpilot view {path}` and "
-            "give the scene its size with `splatpilot scale`"
+            "give the scene its size with `splatpilot scene scale`"
         )
     gaussians = read_ply(path / "gaussians.ply")
     if metadata.frontier:
@@ -364,7 +364,7 @@ def _read_bare_gaussians(path: Path) -> World:
         raise ValueError(
             f"{path}: 98 % of the Gaussians span {np.round(upper_W - lower_W, 1).tolist()} m, for "
             f"which voxels of {voxel_size:.2f} m would be needed, more than {_COARSEST} m; crop "
-            "far Gaussians away, or give it its size with `splatpilot scale`"
+            "far Gaussians away, or give it its size with `splatpilot scene scale`"
         )
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
     p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)

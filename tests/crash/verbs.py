@@ -71,12 +71,12 @@ def _train(folder: Path) -> list[str]:
 
 
 def _ablate(folder: Path) -> list[str]:
-    words = ["ablate", f"{folder}/tiles", "--out", f"{folder}/out"]
+    words = ["scene", "ablate", f"{folder}/tiles", "--out", f"{folder}/out"]
     return [*words, *_set(*_RECONSTRUCT)]
 
 
 def _fidelity(folder: Path) -> list[str]:
-    words = ["fidelity", f"{folder}/scene", "--overwrite", "--out", f"{folder}/out"]
+    words = ["scene", "fidelity", f"{folder}/scene", "--overwrite", "--out", f"{folder}/out"]
     return [
         *words,
         *_set(*_RECONSTRUCT, prefix="reconstruct."),
