@@ -131,7 +131,7 @@ def test_truncated_file(tmp_path, missing):
 def test_foreign_file(tmp_path, content):
     """A file that is no PLY is said to be none."""
     (tmp_path / "b.ply").write_bytes(content)
-    with pytest.raises(ValueError, match=r"b\.ply: not a PLY file"):
+    with pytest.raises(ValueError, match=r"b\.ply: not a readable PLY file"):
         read_ply(tmp_path / "b.ply")
 
 

@@ -137,7 +137,7 @@ def test_claims_of_size(tmp_path):
     """A file of a hundred bytes that claims four thousand million Gaussians costs no memory."""
     for content in (gzip.compress(spz(3, 2**32 - 1)), spz(4, 2**32 - 1)):
         (tmp_path / "a.spz").write_bytes(content)
-        with pytest.raises(ValueError, match=r"a\.spz would take .* GB of memory"):
+        with pytest.raises(ValueError, match=r"a\.spz must take at most .* GB of memory"):
             read_splats(tmp_path / "a.spz")
 
 
