@@ -155,7 +155,7 @@ def test_scenarios_out_of_range_are_refused(post_world):
 )
 def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, message):
     """A registered sensor or world whose function returns nothing is an error that says so."""
-    kind = next(iter(registry._kinds.values()))
+    kind = next(iter(registry._entries.values()))
     function = "make" if registry is WORLDS else "build"
     kind = dataclasses.replace(kind, **{function: lambda *_: None})
     monkeypatch.setattr(registry, "kind_of", lambda _: kind)

@@ -47,7 +47,7 @@ def package(tmp_path, monkeypatch):
     (package / "policy.py").write_text(POLICY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(POLICIES, "_kinds", dict(POLICIES._kinds))  # gone again for other tests
+    monkeypatch.setattr(POLICIES, "_kinds", dict(POLICIES._entries))  # gone again for other tests
     return package
 
 

@@ -49,7 +49,7 @@ def folder(tmp_path, monkeypatch):
     (packages / "pairs.py").write_text(_PACKAGE)
     monkeypatch.syspath_prepend(packages)
     # What a test registers is forgotten after it.
-    monkeypatch.setattr(module.CAPTURES, "_kinds", dict(module.CAPTURES._kinds))
+    monkeypatch.setattr(module.CAPTURES, "_kinds", dict(module.CAPTURES._entries))
     capture = tmp_path / "capture"
     capture.mkdir()
     (capture / "pair.txt").touch()

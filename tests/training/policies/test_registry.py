@@ -76,7 +76,7 @@ def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_pat
         point = f"[splatpilot.trainers]\n{name} = {name}:{name}Training\n"
         (about / "entry_points.txt").write_text(point)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(TRAINERS, "_kinds", dict(TRAINERS._kinds))
+    monkeypatch.setattr(TRAINERS, "_kinds", dict(TRAINERS._entries))
     out = tmp_path / "out"
     trainer = name if installed else f"{name}:{name}Training"
     assert main(["train", trainer, "--out", str(out), "--set", "target=-2"]) == 0
