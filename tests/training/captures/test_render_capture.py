@@ -79,7 +79,7 @@ def test_a_world_may_be_named_as_in_the_benchmark(tmp_path, monkeypatch, capsys)
     assert "planned" in capsys.readouterr().err
     assert planned == [(load_config(Scenario(), benchmark_scenarios()["P02"]).world, 3)]
     assert main(["capture", "render", "P99", *words]) == 1
-    assert "P99: there is no such file" in capsys.readouterr().err
+    assert "No such file or folder: P99" in capsys.readouterr().err
 
 
 def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
@@ -210,7 +210,7 @@ def test_bad_input_is_named(room, tmp_path, capsys):
     (tmp_path / "damaged.gltf").write_text("{")
     out = tmp_path / "capture"
     for world, options, message in (
-        (tmp_path / "no.gltf", [], "no such file"),
+        (tmp_path / "no.gltf", [], "No such file"),
         (tmp_path / "world.stl", [], "a mesh must be one of .gltf, .glb, .obj"),
         (tmp_path / "damaged.glb", [], "damaged.glb: not a readable mesh"),
         (tmp_path / "damaged.gltf", [], "damaged.gltf"),
