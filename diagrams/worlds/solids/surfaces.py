@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.vehicle.flatness import cross
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> Gau
     R_WP = np.stack([surfels.t, np.cross(surfels.n, surfels.t), surfels.n], axis=-1)
     return GaussianScene.from_colors(
         means=surfels.p,
-        quats=np.roll(Rotation.from_matrix(R_WP).as_quat(), 1, axis=1),
+        quats=Rotation.from_matrix(R_WP).as_quat(scalar_first=True),
         scales=np.column_stack([surfels.extent, np.full(N, THICKNESS)]),
         opacities=np.broadcast_to(opacity, N),
         colors=np.clip(colors, 0, 1),
@@ -109,7 +108,7 @@ def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
 
 def _perpendicular_to_one(d: NDArray[np.float64]) -> NDArray[np.float64]:
     """`perpendicular` of a single vector (3,), a tenth of the time."""
-    v = cross(np.array((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)), d)
+    v = np.cross(np.array((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)), d)
     x, y, z = v.tolist()
     return v / math.sqrt(x * x + y * y + z * z)
 
@@ -207,7 +206,7 @@ def tube(
     s = np.clip((j + 0.5 + offset + jitter[1]) / rows, 0, 1).ravel()
     width = 1 + (taper - 1) * s
     e_1 = _perpendicular_to_one(axis)
-    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), cross(axis, e_1))
+    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(axis, e_1))
     across = COVERAGE * 2 * np.pi * radius / columns
     return Surfels(
         p=p_A + np.outer(s * length, axis) + (radius * width)[:, None] * normal,
