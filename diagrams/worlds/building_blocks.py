@@ -13,7 +13,7 @@ from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.diagrams.worlds.solids.surfaces import Plot
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import grid_shape
-from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape
+from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 WALL = 0.3
@@ -141,7 +141,7 @@ def start_and_goal(
 
 def clear_of(shape: Shape, points: list[NDArray], clearance: float) -> bool:
     """Whether all `points` (3,) [m] are at least `clearance` [m] from a shape."""
-    return bool((type(shape).distances(np.array(points), *shape.parameters()) >= clearance).all())
+    return bool((ShapeUnion.of([shape]).distance(points) >= clearance).all())
 
 
 def check_positive(config: object, *names: str) -> None:

@@ -12,7 +12,7 @@ from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
 from splatpilot.diagrams.worlds.solids.surfaces import Plot
 from splatpilot.diagrams.worlds.solids.surfels import build, draw
 from splatpilot.diagrams.worlds.world import MovingBodies, World
-from splatpilot.systems.collision.shapes import MovingBalls, Sphere
+from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.scene import GaussianScene
 
@@ -171,7 +171,7 @@ def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
         voxel_size=config.voxel_size,
     )
     world = build(blueprint)
-    balls = MovingBalls([o.radius for o in moving], [o.path for o in moving], PERIOD)
+    balls = MovingSpheres([o.radius for o in moving], [o.path for o in moving], PERIOD)
     sun = light(world.esdf)
     bodies = [_draw_body(o, blueprint, sun) for o in moving]
     return replace(world, moving=MovingBodies(balls, MovingGaussians(bodies, balls.centers)))

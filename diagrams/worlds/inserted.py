@@ -16,7 +16,14 @@ from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Shape, Sphere
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Box,
+    Capsule,
+    Shape,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -116,7 +123,7 @@ def _shape(config: InsertedConfig, p: NDArray, rng: np.random.Generator) -> Shap
 
 
 def _distances(shape: Shape, p_W: NDArray) -> NDArray:
-    return type(shape).distances(p_W, *shape.parameters())
+    return ShapeUnion.of([shape]).distance(p_W)
 
 
 def _surface(shape: Shape) -> NDArray:

@@ -9,7 +9,14 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
 from splatpilot.diagrams.worlds.solids.surfels import draw
-from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from splatpilot.systems.collision.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    Shape,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.splats.baked_scene import BakedScene
 
 SIZE, FOCAL, AWAY = 200, 400.0, 5.0  # [px], [px], [m]
@@ -67,7 +74,7 @@ def _is_seen(shape: Shape, X_WC: RigidTransform) -> NDArray[np.bool_]:
     rays_W /= np.linalg.norm(rays_W, axis=1, keepdims=True)
     p_WQ = np.tile(X_WC.translation(), (len(rays_W), 1))
     for _ in range(40):
-        distance = type(shape).distances(p_WQ, *shape.parameters())
+        distance = ShapeUnion.of([shape]).distance(p_WQ)
         p_WQ += np.minimum(distance, 1.0)[:, None] * rays_W
-    near = type(shape).distances(p_WQ, *shape.parameters()) < 1e-3
+    near = ShapeUnion.of([shape]).distance(p_WQ) < 1e-3
     return near.reshape(SIZE, SIZE)
