@@ -131,15 +131,10 @@ def recolored_background(background: Background, look: Appearance) -> Background
 def _paint(colors: Array, look: Appearance) -> Array:
     """What is added to sRGB colours (N, 3): alike for alike ones, so that a material stays one."""
     spacing = 1 / (_PAINTS - 1)
-    channels = (np.ascontiguousarray(look.paint[..., i]) for i in range(3))
     lower = np.full(3, -0.5 * spacing)
-    return np.stack(
-        [
-            interpolate_grid(grid, lower, spacing, colors, with_gradient=False)[0]
-            for grid in channels
-        ],
-        axis=1,
-    ).astype(np.float32)
+    grids = np.moveaxis(look.paint, -1, 0).copy()
+    added = [interpolate_grid(g, lower, spacing, colors, with_gradient=False)[0] for g in grids]
+    return np.stack(added, axis=1).astype(np.float32)
 
 
 def _light(means: Array, normals: Array, look: Appearance) -> Array:

@@ -272,6 +272,8 @@ def test_bad_grids_are_refused(change, message):
 def test_points_must_have_three_coordinates():
     with pytest.raises(ValueError, match=r"\(5, 2\)"):
         sphere_field().distance(np.zeros((5, 2)))
+    with pytest.raises(ValueError, match=r"\(5, 2\)"):
+        sphere_field().distance(torch.zeros(5, 2))
 
 
 @pytest.fixture
@@ -425,8 +427,3 @@ def test_gradient_stays_finite_on_the_box():
     p = torch.tensor(np.stack([field.lower_W, field.upper_W]), requires_grad=True)
     field.distance(p).sum().backward()
     assert p.grad is not None and torch.isfinite(p.grad).all()
-
-
-def test_points_must_have_three_coordinates():
-    with pytest.raises(ValueError, match=r"\(5, 2\)"):
-        stateful_field().distance(torch.zeros(5, 2))

@@ -13,6 +13,7 @@ from splatpilot.systems.collision.shapes import (
     Cylinder,
     HalfSpace,
     MovingSpheres,
+    ShapeUnion,
     Sphere,
 )
 
@@ -143,12 +144,12 @@ def test_union_is_the_minimum_over_its_shapes():
     union = AnalyticDistanceField(shapes, lower, upper)
     p = np.random.default_rng(6).uniform(lower, upper, (1500, 3))
     p = np.concatenate([p, [10.0, 5.0, 2.0] + 0.4 * np.random.default_rng(7).random((1500, 3))])
-    alone = np.stack([type(shape).distances(p, *shape.parameters()) for shape in shapes])
+    alone = np.stack([ShapeUnion.of([shape]).distance(p) for shape in shapes])
     expected, nearest = alone.min(axis=0), alone.argmin(axis=0)
     sample = union.query(p)
     np.testing.assert_allclose(sample.distance, expected, rtol=0.0, atol=1e-14)
     np.testing.assert_array_equal(union.distance(p), sample.distance)
-    gradients = np.stack([type(s).gradients(p, *s.parameters()) for s in shapes])
+    gradients = np.stack([ShapeUnion.of([shape]).nearest(p)[1] for shape in shapes])
     np.testing.assert_allclose(sample.gradient, gradients[nearest, np.arange(len(p))], atol=1e-9)
     for row in (0, 700):
         broken = p.copy()
@@ -266,10 +267,10 @@ def test_samples_of_trajectories_meet_the_balls_of_their_times():
         np.testing.assert_array_equal(along[:, s], expected)
 
 
-def test_the_middle_of_a_ball_has_no_gradient():
+def test_the_gradient_at_a_spheres_center_is_a_unit_vector():
     sample = SPHERES.among(AnalyticDistanceField([], LOWER, UPPER), 0.0).query(PATHS[1][0])
     assert sample.distance == -0.25 and sample.state == FieldState.OCCUPIED
-    assert not sample.gradient.any()
+    assert np.linalg.norm(sample.gradient) == pytest.approx(1.0)
 
 
 def test_balls_without_a_path_are_refused():
