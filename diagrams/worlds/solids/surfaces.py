@@ -15,14 +15,14 @@ from splatpilot.systems.splats.scene import GaussianScene
 
 
 @dataclass(frozen=True, eq=False)
-class Plot:
+class FloorPlan:
     """A flyable volume, seen from above."""
 
     lower: NDArray[np.float64]  # (3,) [m], in W
     upper: NDArray[np.float64]  # (3,) [m]
 
     @classmethod
-    def of_size(cls, length: float, width: float, height: float) -> Plot:
+    def of_size(cls, length: float, width: float, height: float) -> FloorPlan:
         """The volume from x = 0 to length, centred on y = 0, on the ground z = 0, all in [m]."""
         return cls(np.array([0.0, -width / 2, 0.0]), np.array([length, width / 2, height]))
 
@@ -126,15 +126,15 @@ def rectangle(
 
 
 def ground_rings(
-    plot: Plot, spacings: Sequence[float], rng: np.random.Generator
+    plan: FloorPlan, spacings: Sequence[float], rng: np.random.Generator
 ) -> Iterator[NDArray[np.float64]]:
     """Samples the ground in and around a volume ring by ring: points (N, 2) of each, from the
     volume to `GROUND_REACH`, at the `spacings` [m] of the five rings."""
-    lower, upper = plot.lower[:2], plot.upper[:2]
+    lower, upper = plan.lower[:2], plan.upper[:2]
     inner = 0.0
     for outer, spacing in zip(_RINGS, spacings, strict=True):
         p = rectangle(lower - outer, upper + outer, spacing, rng)
-        yield p[plot.outside(p) >= inner]
+        yield p[plan.outside(p) >= inner]
         inner = outer
 
 

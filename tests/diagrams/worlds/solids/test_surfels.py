@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.systems.collision.shapes import (
     Box,
@@ -48,8 +48,8 @@ def test_outlines_are_those_of_the_solid(kind):
     edges by more than 12 mm, 2 mm of a wire, nor is it smaller by that."""
     shape, material = SHAPES[kind]
     bounds = np.full(3, -9.0), np.full(3, 9.0)
-    blueprint = Blueprint(kind, *bounds, [Solid(shape, material)], *bounds, light=lambda _: _Even())
-    scene = BakedScene(draw(blueprint, blueprint.solids, _Even()))
+    spec = WorldSpec(kind, *bounds, [Solid(shape, material)], *bounds, light=lambda _: _Even())
+    scene = BakedScene(draw(spec, spec.solids, _Even()))
     drawn = solid = rim = 0
     for azimuth in np.linspace(0, 2 * np.pi, 5, endpoint=False):
         X_WC = RigidTransform(
