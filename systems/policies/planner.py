@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, Value
 
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require_field
@@ -136,7 +136,7 @@ class PrivilegedPlanner(LeafSystem):
         esdf: Esdf,
         config: PrivilegedPlannerConfig | None = None,
         params: QuadrotorParams | None = None,
-        moving: MovingBalls | None = None,
+        moving: MovingSpheres | None = None,
     ) -> None:
         """Constructs the planner.
 

@@ -15,7 +15,7 @@ from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.indoor import RoomConfig
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.diagrams.worlds.splits import find_test_source, source_digest
-from splatpilot.diagrams.worlds.world_registry import make_blueprint
+from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import render as render_capture
 from splatpilot.training.captures.capture_registry import read_capture
@@ -73,7 +73,7 @@ def test_a_world_may_be_named_as_in_the_benchmark(tmp_path, monkeypatch, capsys)
         planned.append((config, seed))
         raise ValueError("planned")
 
-    monkeypatch.setattr(render_capture, "make_blueprint", plan)
+    monkeypatch.setattr(render_capture, "make_spec", plan)
     words = ["--out", str(tmp_path / "capture"), "--seed", "3"]
     assert main(["capture", "render", "P02", *words]) == 1
     assert "planned" in capsys.readouterr().err
@@ -139,11 +139,11 @@ def test_generated_world_is_rendered_where_it_is(opengl, tmp_path):
     config = RenderConfig(width=64, height=48, path=[[1.5, 0.4, 1.5]], yaws=[0.0, 120.0])
     run(world=scenario, out=tmp_path / "capture", config=config, seed=4)
     capture = read_capture(tmp_path / "capture")
-    blueprint = make_blueprint(RoomConfig(length=6, width=4, height=2.6, items=1), 4)
+    spec = make_spec(RoomConfig(length=6, width=4, height=2.6, items=1), 4)
     for frame in capture.frames():
         v, u = np.mgrid[:48, :64] + 0.5
         p_CQ = frame.back_project(u, v, frame.depth)[np.isfinite(frame.depth)]
-        distance = blueprint.distance_field.distance(frame.X_WC.multiply(p_CQ.T).T)
+        distance = spec.distance_field.distance(frame.X_WC.multiply(p_CQ.T).T)
         inside = np.isfinite(distance)
         assert inside.sum() > 500
         assert np.abs(distance[inside]).max() < 0.01
