@@ -6,11 +6,11 @@ from typing import cast
 
 import numpy as np
 import torch
+from depth_errors import DepthFrame
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.analysis.depth_errors import DepthFrame
 from splatpilot.analysis.reconstruction.scene_measures import SceneViews
 from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
