@@ -10,10 +10,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from splatpilot.diagrams.worlds.solids.patterns import SIGN
 from splatpilot.diagrams.worlds.solids.shading import Daylight, Illumination, Lamplight, Sunlight
 from splatpilot.diagrams.worlds.solids.solid import Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import grid_shape
-from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape
+from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 WALL = 0.3
@@ -49,10 +49,10 @@ def ground(material: str, seed: int = 0) -> Solid:
     return Solid(HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0), material, seed)
 
 
-def hall(plot: Plot, materials: list[str], rng: np.random.Generator) -> list[Solid]:
+def hall(plan: FloorPlan, materials: list[str], rng: np.random.Generator) -> list[Solid]:
     """The walls of a hall about its volume, each of one of the `materials`: its inner face is a
     bound of the volume; those at the least and greatest y first, then those at its two ends."""
-    (x0, y0, _), (x1, y1, z1) = plot.lower, plot.upper
+    (x0, y0, _), (x1, y1, z1) = plan.lower, plan.upper
     sides = (
         ((x0 - WALL, y0 - WALL, 0), (x1 + WALL, y0, z1)),
         ((x0 - WALL, y1, 0), (x1 + WALL, y1 + WALL, z1)),
@@ -65,9 +65,13 @@ def hall(plot: Plot, materials: list[str], rng: np.random.Generator) -> list[Sol
     ]
 
 
-def roof(plot: Plot) -> Solid:
+def roof(plan: FloorPlan) -> Solid:
     """A ceiling whose lower face is the top of the volume."""
-    (x0, y0), (x1, y1), z = plot.lower[:2] - WALL, plot.upper[:2] + WALL, plot.upper[2]
+    (x0, y0), (x1, y1), z = (
+        plan.lower[:2] - WALL,
+        plan.upper[:2] + WALL,
+        plan.upper[2],
+    )
     return box((x0, y0, z), (x1, y1, z + 0.2), "ceiling", 0)
 
 
@@ -113,24 +117,24 @@ def daylight(rng: np.random.Generator) -> tuple[Daylight, Callable[[Esdf], Illum
     return hour, lambda esdf: Sunlight(hour, esdf)
 
 
-def lamplight(plot: Plot, rng: np.random.Generator) -> Callable[[Esdf], Illumination]:
+def lamplight(plan: FloorPlan, rng: np.random.Generator) -> Callable[[Esdf], Illumination]:
     """Lamps under the roof, about 4 m apart."""
-    lower, upper = plot.lower, plot.upper
+    lower, upper = plan.lower, plan.upper
     n = np.maximum(np.round((upper - lower)[:2] / 4.0).astype(int), 1)
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
-    plan = lower[:2] + (np.stack([i, j], axis=-1).reshape(-1, 2) + 0.5) * (upper - lower)[:2] / n
+    at = lower[:2] + (np.stack([i, j], axis=-1).reshape(-1, 2) + 0.5) * (upper - lower)[:2] / n
     warmth = rng.uniform(-0.5, 1.0)
     tint = np.array([1.0, 0.96 - 0.05 * warmth, 0.92 - 0.2 * warmth]) * rng.uniform(0.8, 1.15)
-    lamps = np.column_stack([plan, np.full(len(plan), upper[2])])
+    lamps = np.column_stack([at, np.full(len(at), upper[2])])
     return lambda esdf: Lamplight(lamps, tint, esdf)
 
 
 def start_and_goal(
-    plot: Plot, rng: np.random.Generator, heights: tuple[float, float] = (1.2, 2.4)
+    plan: FloorPlan, rng: np.random.Generator, heights: tuple[float, float] = (1.2, 2.4)
 ) -> tuple[NDArray, NDArray]:
     """Draws a start (3,) and a goal (3,) [m] at the two ends of the volume along x, at `heights`
     [m] between the two."""
-    lower, upper = plot.lower, plot.upper
+    lower, upper = plan.lower, plan.upper
     aside = min(0.3 * (upper - lower)[1], (upper - lower)[1] / 2 - INSET)
     y, z = (lower + upper)[1] / 2 + rng.uniform(-aside, aside, 2), rng.uniform(*heights, 2)
     return (
@@ -141,7 +145,7 @@ def start_and_goal(
 
 def clear_of(shape: Shape, points: list[NDArray], clearance: float) -> bool:
     """Whether all `points` (3,) [m] are at least `clearance` [m] from a shape."""
-    return bool((type(shape).distances(np.array(points), *shape.parameters()) >= clearance).all())
+    return bool((ShapeUnion.of([shape]).distance(points) >= clearance).all())
 
 
 def check_positive(config: object, *names: str) -> None:

@@ -27,8 +27,8 @@ from splatpilot.diagrams.worlds.building_blocks import (
     turned_box,
 )
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, draw_feasible
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.shapes import Capsule, Cylinder, Sphere
 
 
@@ -171,30 +171,30 @@ class RoomConfig:
         check_size(self, "room", 6, 4, 2.4)
 
 
-def room_blueprint(config: RoomConfig, seed: int) -> Blueprint:
+def room_spec(config: RoomConfig, seed: int) -> WorldSpec:
     """Furnishes the room of `config`.
 
     Raises:
         ValueError: for values with which none can be made, or without a way through.
     """
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
 
-    def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(plot, rng, (1.0, min(1.9, config.height - 0.9)))
-        inner = plot.lower[:2] + 0.7, plot.upper[:2] - 0.7
+    def draw(rng: np.random.Generator) -> WorldSpec:
+        p_WS, p_WG = start_and_goal(plan, rng, (1.0, min(1.9, config.height - 0.9)))
+        inner = plan.lower[:2] + 0.7, plan.upper[:2] - 0.7
         furniture = furnish(config.items, *inner, config.height, [p_WS, p_WG], rng)
-        sides = hall(plot, ["plaster", "plaster", "wood", "brick"], rng)
+        sides = hall(plan, ["plaster", "plaster", "wood", "brick"], rng)
         signs = signs_in(sides, 2, 2, rng)
         floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-        return Blueprint(
+        return WorldSpec(
             name="room",
-            lower_W=plot.lower,
-            upper_W=plot.upper,
-            solids=[floor, roof(plot), *sides, *signs, *furniture],
+            lower_W=plan.lower,
+            upper_W=plan.upper,
+            solids=[floor, roof(plan), *sides, *signs, *furniture],
             p_WS=p_WS,
             p_WG=p_WG,
-            light=lamplight(plot, rng),
+            light=lamplight(plan, rng),
             seed=seed,
             voxel_size=config.voxel_size,
         )
@@ -289,20 +289,20 @@ class _Partition(NamedTuple):
         return p
 
 
-def office_blueprint(config: OfficeConfig, seed: int) -> Blueprint:
+def office_spec(config: OfficeConfig, seed: int) -> WorldSpec:
     """Divides and furnishes the floor of `config`.
 
     Raises:
         ValueError: for values with which none can be made, or without a way through.
     """
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
 
-    def draw(rng: np.random.Generator) -> Blueprint:
+    def draw(rng: np.random.Generator) -> WorldSpec:
         partitions: list[_Partition] = []
-        rooms = _divide(_Room(plot.lower[:2], plot.upper[:2]), config, partitions, rng)
-        p_WS = _place_in([r for r in rooms if r.lower[0] == plot.lower[0]], config, rng)
-        p_WG = _place_in([r for r in rooms if r.upper[0] == plot.upper[0]], config, rng)
+        rooms = _divide(_Room(plan.lower[:2], plan.upper[:2]), config, partitions, rng)
+        p_WS = _place_in([r for r in rooms if r.lower[0] == plan.lower[0]], config, rng)
+        p_WG = _place_in([r for r in rooms if r.upper[0] == plan.upper[0]], config, rng)
         free = [p_WS, p_WG]
         free += [wall.point(0, door.middle, 1.1) for wall in partitions for door in wall.doors]
         areas = np.array([np.prod(room.upper - room.lower) for room in rooms])
@@ -311,7 +311,7 @@ def office_blueprint(config: OfficeConfig, seed: int) -> Blueprint:
             rooms, rng.multinomial(config.items, areas / areas.sum()), strict=True
         ):
             furniture += furnish(int(items), *room.inside(0.9), config.height, free, rng)
-        sides = hall(plot, ["plaster", "plaster", "concrete"], rng)
+        sides = hall(plan, ["plaster", "plaster", "concrete"], rng)
         signs = signs_in(sides, 3, 2, rng)
         walls: list[Solid] = []
         for partition in partitions:
@@ -321,14 +321,14 @@ def office_blueprint(config: OfficeConfig, seed: int) -> Blueprint:
                 for face in (2 * partition.axis, 2 * partition.axis + 1):
                     signs += signs_on(piece, face, int(rng.integers(2)), rng)
         floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-        return Blueprint(
+        return WorldSpec(
             name="office",
-            lower_W=plot.lower,
-            upper_W=plot.upper,
-            solids=[floor, roof(plot), *sides, *walls, *signs, *furniture],
+            lower_W=plan.lower,
+            upper_W=plan.upper,
+            solids=[floor, roof(plan), *sides, *walls, *signs, *furniture],
             p_WS=p_WS,
             p_WG=p_WG,
-            light=lamplight(plot, rng),
+            light=lamplight(plan, rng),
             seed=seed,
             voxel_size=config.voxel_size,
         )

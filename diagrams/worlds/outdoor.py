@@ -36,8 +36,8 @@ from splatpilot.diagrams.worlds.forest.forest import Forest
 from splatpilot.diagrams.worlds.forest.layout import BARK, TrunksConfig
 from splatpilot.diagrams.worlds.forest.scenery import trees_around
 from splatpilot.diagrams.worlds.solids.shading import Illumination
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot, merge
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, merge
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.systems.collision.shapes import Capsule, Sphere
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -78,35 +78,35 @@ class ClutterConfig:
         check_size(self, "field", 6, 4, 3)
 
 
-def clutter_blueprint(config: ClutterConfig, seed: int) -> Blueprint:
+def clutter_spec(config: ClutterConfig, seed: int) -> WorldSpec:
     """Strews the field of `config`: obstacles anywhere but near start and goal, overlapping or not.
 
     Raises:
         ValueError: for values with which none can be made, or without a way through.
     """
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
 
-    def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(plot, rng)
+    def draw(rng: np.random.Generator) -> WorldSpec:
+        p_WS, p_WG = start_and_goal(plan, rng)
         obstacles: list[Solid] = []
         for make, number in ((_sphere, config.spheres), (_box, config.boxes)):
             for _ in range(number):
                 for _ in range(50):  # elsewhere, if it is too near the start or goal
-                    solid = make(config, plot, rng)
+                    solid = make(config, plan, rng)
                     if clear_of(solid.shape, [p_WS, p_WG], CLEARING):
                         obstacles.append(solid)
                         break
         hour, light = daylight(rng)
-        return Blueprint(
+        return WorldSpec(
             name="clutter",
-            lower_W=plot.lower,
-            upper_W=plot.upper,
+            lower_W=plan.lower,
+            upper_W=plan.upper,
             solids=[ground(("grass", "paving", "concrete")[rng.integers(3)]), *obstacles],
             p_WS=p_WS,
             p_WG=p_WG,
             light=light,
-            surroundings=trees_around(plot, hour, seed),
+            surroundings=trees_around(plan, hour, seed),
             seed=seed,
             voxel_size=config.voxel_size,
         )
@@ -114,16 +114,16 @@ def clutter_blueprint(config: ClutterConfig, seed: int) -> Blueprint:
     return draw_feasible(draw, seed)
 
 
-def _sphere(config: ClutterConfig, plot: Plot, rng: np.random.Generator) -> Solid:
+def _sphere(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> Solid:
     radius = rng.uniform(config.sphere_min, config.sphere_max)
-    p = rng.uniform(plot.lower, plot.upper)
+    p = rng.uniform(plan.lower, plan.upper)
     material = _BALLS[rng.integers(len(_BALLS))]
     return Solid(Sphere(p, float(radius)), material, int(rng.integers(1000)))
 
 
-def _box(config: ClutterConfig, plot: Plot, rng: np.random.Generator) -> Solid:
+def _box(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> Solid:
     half = rng.uniform(config.half_min, config.half_max, 3)
-    p = rng.uniform(plot.lower, plot.upper)
+    p = rng.uniform(plan.lower, plan.upper)
     if config.floating:
         turn = RotationMatrix(Rotation.random(rng=rng).as_matrix())
     else:
@@ -161,20 +161,20 @@ class BranchesConfig(TrunksConfig):
             raise ValueError(f"limb_length = {self.limb_length} m must be 0.2 to 5 m")
 
 
-def branches_blueprint(config: BranchesConfig, seed: int) -> Blueprint:
+def branches_spec(config: BranchesConfig, seed: int) -> WorldSpec:
     """Grows the forest of `config` and puts limbs and wires into it.
 
     Raises:
-        ValueError: see `forest_blueprint`.
+        ValueError: see `forest_spec`.
         InfeasibleFlightError: if limbs and wires leave no route.
     """
     forest = Forest(config, seed)
-    bare = forest.blueprint()
+    bare = forest.spec()
     for attempt in range(TRIES):
         thin = _limbs_and_wires(forest, config, np.random.default_rng([seed, 20, attempt]))
-        blueprint = replace(bare, name="branches", solids=[*bare.solids, *thin])
-        if is_feasible(blueprint):
-            return replace(blueprint, gaussians=partial(_gaussians, forest, blueprint, thin))
+        spec = replace(bare, name="branches", solids=[*bare.solids, *thin])
+        if is_feasible(spec):
+            return replace(spec, gaussians=partial(_gaussians, forest, spec, thin))
     raise InfeasibleFlightError(
         f"branches: limbs = {config.limbs} and wires = {config.wires} leave no route in {TRIES} "
         f"draws from seed {seed}; use fewer of them or a wider spacing"
@@ -182,9 +182,9 @@ def branches_blueprint(config: BranchesConfig, seed: int) -> Blueprint:
 
 
 def _gaussians(
-    forest: Forest, blueprint: Blueprint, thin: list[Solid], light: Illumination
+    forest: Forest, spec: WorldSpec, thin: list[Solid], light: Illumination
 ) -> GaussianScene:
-    return merge([forest.gaussians(), draw(blueprint, thin, light)])
+    return merge([forest.gaussians(), draw(spec, thin, light)])
 
 
 def _limbs_and_wires(
@@ -261,7 +261,7 @@ class WallsConfig:
             )
 
 
-def walls_blueprint(config: WallsConfig, seed: int) -> Blueprint:
+def walls_spec(config: WallsConfig, seed: int) -> WorldSpec:
     """Builds the hall of `config`.
 
     `big_wall` leaves a way at either side of one wall, one of them wider; `u_trap` opens a
@@ -272,29 +272,29 @@ def walls_blueprint(config: WallsConfig, seed: int) -> Blueprint:
         ValueError: for values with which none can be built, or without a way through.
     """
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
 
-    def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(plot, rng)
+    def draw(rng: np.random.Generator) -> WorldSpec:
+        p_WS, p_WG = start_and_goal(plan, rng)
         across = {"big_wall": _big_wall, "u_trap": _u_trap, "slits": _slits, "slalom": _slalom}
         if config.pattern in ("big_wall", "u_trap"):  # both stand in the straight way
             p_WS[1], p_WG[1] = 0.3 * p_WS[1], 0.3 * p_WG[1]
         obstacles = across[config.pattern](config, rng)
-        sides = hall(plot, _FACADES, rng)
+        sides = hall(plan, _FACADES, rng)
         signs = signs_in(sides, 3, 1, rng)
         for wall in obstacles:
             signs += signs_on(wall, 0, 1, rng)
         hour, light = daylight(rng)
         floor = ("paving", "grass", "concrete")[rng.integers(3)]
-        return Blueprint(
+        return WorldSpec(
             name=config.pattern,
-            lower_W=plot.lower,
-            upper_W=plot.upper,
+            lower_W=plan.lower,
+            upper_W=plan.upper,
             solids=[ground(floor), *sides, *obstacles, *signs],
             p_WS=p_WS,
             p_WG=p_WG,
             light=light,
-            surroundings=trees_around(plot, hour, seed),
+            surroundings=trees_around(plan, hour, seed),
             seed=seed,
             voxel_size=config.voxel_size,
         )
@@ -401,17 +401,17 @@ class OverUnderConfig:
             )
 
 
-def over_under_blueprint(config: OverUnderConfig, seed: int) -> Blueprint:
+def over_under_spec(config: OverUnderConfig, seed: int) -> WorldSpec:
     """Builds the hall of `config`.
 
     Raises:
         ValueError: for values with which none can be built, or without a way through.
     """
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
 
-    def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(plot, rng)
+    def draw(rng: np.random.Generator) -> WorldSpec:
+        p_WS, p_WG = start_and_goal(plan, rng)
         half, step = config.width / 2, (config.length - 2 * INSET) / (config.barriers + 1)
         first = int(rng.integers(2))
         barriers = []
@@ -421,23 +421,23 @@ def over_under_blueprint(config: OverUnderConfig, seed: int) -> Blueprint:
             corners = (x - WALL / 2, -half, low), (x + WALL / 2, half, high)
             material = _MATERIALS[rng.integers(len(_MATERIALS))]
             barriers.append(box(*corners, material, int(rng.integers(1000))))
-        sides = hall(plot, ["plaster", "brick", "concrete", "metal"], rng)
+        sides = hall(plan, ["plaster", "brick", "concrete", "metal"], rng)
         signs = [s for wall in barriers for s in signs_on(wall, 0, 2, rng)]
         signs += signs_in(sides, 3, 0, rng)
-        return Blueprint(
+        return WorldSpec(
             name="over_under",
-            lower_W=plot.lower,
-            upper_W=plot.upper,
+            lower_W=plan.lower,
+            upper_W=plan.upper,
             solids=[
                 ground(("tiles", "concrete")[rng.integers(2)], int(rng.integers(10))),
-                roof(plot),
+                roof(plan),
                 *sides,
                 *barriers,
                 *signs,
             ],
             p_WS=p_WS,
             p_WG=p_WG,
-            light=lamplight(plot, rng),
+            light=lamplight(plan, rng),
             seed=seed,
             voxel_size=config.voxel_size,
         )

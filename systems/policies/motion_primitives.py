@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatpilot.systems.vehicle.flatness import cross
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 MIN_UPRIGHT = 0.5  # Cosine of the tilt above which `level_acceleration` stays constant.
@@ -62,7 +61,7 @@ def rotation_to(direction_W: np.ndarray) -> np.ndarray:
     x_W = direction_W / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = math.hypot(x_W[0], x_W[1])
     y_W = np.array([-x_W[1], x_W[0], 0.0]) / level if level > 1e-6 else np.array([0.0, 1.0, 0.0])
-    return np.column_stack([x_W, y_W, cross(x_W, y_W)])
+    return np.column_stack([x_W, y_W, np.cross(x_W, y_W)])
 
 
 def select_distinct(

@@ -30,7 +30,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
 )
 from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.student_data import StudentData

@@ -15,7 +15,7 @@ from splatpilot.diagrams.worlds.building_blocks import (
     poisson_disk,
 )
 from splatpilot.diagrams.worlds.solids.solid import Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
 from splatpilot.systems.collision.shapes import Capsule, HalfSpace, Sphere
 
@@ -125,7 +125,7 @@ class Trees:
 
 
 @dataclass(frozen=True, eq=False)
-class ForestLayout(Plot):
+class ForestLayout(FloorPlan):
     """Trees, rocks and fallen logs on the ground z = 0."""
 
     trees: Trees
@@ -192,8 +192,8 @@ def lay_out(
 ) -> ForestLayout:
     """Places everything, leaving discs of radius `clearance` [m] about `clear` (K, 2) open."""
     clear = np.asarray(clear)
-    plot = Plot.of_size(config.length, config.width, config.height)
-    lower, upper = plot.lower, plot.upper
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
+    lower, upper = plan.lower, plan.upper
     base = poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
     N = len(base)
     radius = rng.uniform(config.radius_min, config.radius_max, N)

@@ -17,7 +17,7 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingBalls, Sphere
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -92,7 +92,7 @@ def test_balls_are_drawn_where_they_are(meshcat):
     """Each ball has its radius, stands where it is at the time of the last picture, and far below
     while it is nowhere."""
     paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
-    balls = MovingBalls([0.5, 0.25], paths, period=0.1)
+    balls = MovingSpheres([0.5, 0.25], paths, period=0.1)
     builder = DiagramBuilder()
     builder.AddSystem(BallsVisualizer(meshcat, balls, period=0.1))
     simulator = Simulator(builder.Build())

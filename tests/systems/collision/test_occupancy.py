@@ -1,5 +1,3 @@
-"""Distance fields from occupancy grids."""
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,6 @@ def slab() -> np.ndarray:
 
 
 def test_a_slab_has_its_faces_on_the_voxel_faces():
-    """Without offsets the distance to a slab is exact along its normal, inside and outside."""
     field = esdf_from_occupancy(slab(), None, np.array([1.0, 0.0, 0.0]), 0.1)
     x = np.linspace(1.06, 3.94, 50)
     p = np.stack([x, np.full(50, 0.2), np.full(50, 0.2)], -1)
@@ -29,7 +26,6 @@ def test_a_slab_has_its_faces_on_the_voxel_faces():
 
 
 def test_offsets_move_the_surface_within_the_voxels():
-    """A slab whose offsets put its faces at 2.03 and 2.46 m has them there."""
     x = 1.0 + 0.1 * (np.arange(30) + 0.5)
     offset = np.maximum(2.03 - x, x - 2.46)[:, None, None] + np.zeros((30, 4, 4))
     offset[np.abs(offset) > 0.1] = np.nan
@@ -39,7 +35,6 @@ def test_offsets_move_the_surface_within_the_voxels():
 
 
 def test_faces_without_offsets_stay_on_the_voxel_faces():
-    """Where one side of a slab has offsets and the other none, the other is its voxels' faces."""
     x = 1.0 + 0.1 * (np.arange(30) + 0.5)
     offset = (2.03 - x)[:, None, None] + np.zeros((30, 4, 4))
     offset[x > 2.1] = np.nan
@@ -50,7 +45,6 @@ def test_faces_without_offsets_stay_on_the_voxel_faces():
 
 
 def test_unknown_voxels_are_marked_and_measured_to_what_was_seen():
-    """Unknown voxels keep their state; their distance is that to the occupied ones."""
     unknown = np.zeros((30, 4, 4), bool)
     unknown[20:] = True
     field = esdf_from_occupancy(slab(), unknown, np.array([1.0, 0.0, 0.0]), 0.1)
@@ -60,13 +54,11 @@ def test_unknown_voxels_are_marked_and_measured_to_what_was_seen():
 
 
 def test_a_world_without_obstacles_is_finite():
-    """With no occupied voxel the distance is finite and larger than the box."""
     field = esdf_from_occupancy(np.zeros((4, 4, 4), bool), None, np.zeros(3), 0.1)
     assert 0.6 < field.distance([0.2, 0.2, 0.2]) < 0.7
 
 
 def test_contradictions_are_refused():
-    """Wrong shapes, voxels both unknown and occupied and offsets of the wrong sign are named."""
     occupied, zero = slab(), np.zeros(3)
     with pytest.raises(ValueError, match=r"unknown \(2, 2, 2\)"):
         esdf_from_occupancy(occupied, np.zeros((2, 2, 2), bool), zero, 0.1)
@@ -79,7 +71,6 @@ def test_contradictions_are_refused():
 
 
 def test_grid_shape_covers_the_box_with_whole_voxels():
-    """The grid has the least number of voxels that cover the box, unharmed by rounding."""
     assert grid_shape(np.zeros(3), np.array([36.0, 16.0, 6.0]), 0.1) == (360, 160, 60)
     assert grid_shape(np.full(3, -1.0), np.array([0.01, 0.1, 1.0]), 0.25) == (5, 5, 8)
 
@@ -95,6 +86,5 @@ def test_grid_shape_covers_the_box_with_whole_voxels():
     ],
 )
 def test_impossible_grids_are_refused(upper, voxel_size, message):
-    """Empty boxes, bad voxel sizes and grids beyond memory end in a message with the remedy."""
     with pytest.raises(ValueError, match=message):
         grid_shape(np.zeros(3), np.array(upper), voxel_size)

@@ -2,18 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import true_depth
+from depth_errors import DepthErrors, depth_errors
 from pydrake.math import RigidTransform
+from true_depth import TrueDepth, frames_along_flight, ghosts_along_flight
 
-from splatpilot.analysis import depth_truth
-from splatpilot.analysis.depth_errors import depth_errors
-from splatpilot.analysis.depth_truth import (
-    TrueDepth,
-    frames_along_flight,
-    frames_of_capture,
-    ghosts_along_flight,
-)
 from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
-from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
+from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -24,15 +19,14 @@ CAMERA = OnboardCamera(64, 36)
 
 @pytest.mark.parametrize("scenario", ["P04", "P10", "P11"])
 def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
-    """Along every ray the solids' distances are positive up to its depth and zero there."""
     config = load_config(Scenario(), scenario_file(scenario))
-    blueprint = replace(make_blueprint(config.world, 0), surroundings=list)
-    X_WC = RigidTransform(blueprint.p_WS) @ CAMERA.X_BC()
-    depth = TrueDepth(blueprint).image(CAMERA, X_WC)
+    spec = replace(make_spec(config.world, 0), surroundings=list)
+    X_WC = RigidTransform(spec.p_WS) @ CAMERA.X_BC()
+    depth = TrueDepth(spec).image(CAMERA, X_WC)
     hit = np.isfinite(depth)
     assert hit.mean() > 0.4
     rays_W = CAMERA.ray_slopes()[hit] @ X_WC.rotation().matrix().T
-    shapes = [solid.shape for solid in (*blueprint.solids, *blueprint.scenery)]
+    shapes = [solid.shape for solid in (*spec.solids, *spec.scenery)]
     field = AnalyticDistanceField(shapes, np.full(3, -500.0), np.full(3, 500.0))
     p_WQ = X_WC.translation() + depth[hit][:, None] * rays_W
     np.testing.assert_allclose(field.distance(p_WQ), 0, atol=3e-3)
@@ -42,21 +36,18 @@ def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
 
 
 def test_scenery_has_no_truth():
-    """In a field of boxes the trees around it are unknown, the ground and the boxes are not."""
     config = load_config(Scenario(), scenario_file("P04"))
-    blueprint = make_blueprint(config.world, 0)
-    X_WC = RigidTransform(blueprint.p_WG - (4, 0, 0)) @ CAMERA.X_BC()  # the end is in sight
-    bare = TrueDepth(replace(blueprint, surroundings=list)).image(CAMERA, X_WC)
-    truth = TrueDepth(blueprint).image(CAMERA, X_WC)
+    spec = make_spec(config.world, 0)
+    X_WC = RigidTransform(spec.p_WG - (4, 0, 0)) @ CAMERA.X_BC()  # the end is in sight
+    bare = TrueDepth(replace(spec, surroundings=list)).image(CAMERA, X_WC)
+    truth = TrueDepth(spec).image(CAMERA, X_WC)
     unknown = np.isnan(truth) & ~np.isnan(bare)
     assert unknown.mean() > 0.1
     assert not unknown[bare < 5].any()
     np.testing.assert_array_equal(truth[~unknown], bare[~unknown])
 
 
-def test_what_cameras_see_in_free_space_is_a_ghost(monkeypatch):
-    """A Gaussian as large as a wall that the distance field does not know fills what stands behind
-    it; without it no pixel of the planner's flight ends in free space."""
+def test_depth_that_ends_in_free_space_is_a_ghost(monkeypatch):
     config = load_config(Scenario(), scenario_file("P04"))
     assert ghosts_along_flight(config, CAMERA, 4).max() == 0.0
     world = make_world(config.world, config.seed)
@@ -68,15 +59,13 @@ def test_what_cameras_see_in_free_space_is_a_ghost(monkeypatch):
         colors=[[0.5, 0.5, 0.5]],
     )
     haunted = replace(world, gaussians=world.gaussians.merged_with(wall))
-    monkeypatch.setattr(depth_truth, "make_world", lambda *_: haunted)
+    monkeypatch.setattr(true_depth, "make_world", lambda *_: haunted)
     shares = ghosts_along_flight(config, CAMERA, 4)
     assert shares[0] > 0.3
     assert shares[-1] == 0.0  # It lies behind.
 
 
 def test_a_camera_in_a_furnished_room_sees_what_is_there():
-    """Along the planner's flight through P10 at most 0.5 % of the pixels are off by more than 0.1 m
-    or 5 %, and depths nearer than 4 m are unbiased within 0.5 %."""
     config = load_config(Scenario(), scenario_file("P10"))
     frames = frames_along_flight(config, [CAMERA], 12)[0]
     errors = depth_errors(frames, CAMERA.max_depth)
@@ -86,13 +75,16 @@ def test_a_camera_in_a_furnished_room_sees_what_is_there():
     assert errors["elsewhere"].too_near + errors["elsewhere"].too_far <= 0.001
 
 
-def test_a_scene_is_compared_with_frames_withheld_from_it(place):
-    """Against depth rendered of itself a scene has no errors; what a wider camera sees beyond the
-    captured image is left out; a scene of which nothing was withheld is refused."""
-    seen = frames_of_capture(place.scene("same", held_out=[8]), [CAMERA])[0]
-    same = depth_errors(seen, CAMERA.max_depth)["all"]
-    assert (same.pixels, same.too_near, same.too_far) == (64 * 36, 0, 0)
-    wide = frames_of_capture(place.scene("wide", held_out=[8]), [OnboardCamera(64, 36, fov_x=120)])
-    assert depth_errors(wide[0], CAMERA.max_depth)["all"].left_out > 0.3
-    with pytest.raises(ValueError, match="no frames were withheld"):
-        frames_of_capture(place.scene("all", held_out=[]), [CAMERA])
+def test_each_error_is_counted():
+    truth = np.full(120, 2.0)
+    truth[100:] = np.nan
+    depth = 1.01 * truth
+    depth[100:] = 0.3
+    depth[:10] = 1.8  # too near
+    depth[10:13] = 0.0  # nearer than the camera sees
+    depth[15:18] = 2.3  # too far
+    depth[18:20] = np.inf  # a hole
+    errors = DepthErrors.of(depth, truth, 20.0)
+    assert errors.pixels == 100 and errors.left_out == pytest.approx(20 / 120)
+    shares = errors.too_near, errors.far_too_near, errors.too_far, errors.holes
+    assert shares == pytest.approx((0.13, 0.03, 0.05, 0.02))

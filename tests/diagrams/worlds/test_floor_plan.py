@@ -4,9 +4,9 @@ import itertools
 
 import numpy as np
 
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 
-PLOT = Plot.of_size(6.0, 4.0, 3.0)
+PLOT = FloorPlan.of_size(6.0, 4.0, 3.0)
 
 
 def test_surfaces_face_the_volume_if_they_face_one_of_its_corners():

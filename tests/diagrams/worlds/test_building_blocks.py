@@ -11,10 +11,10 @@ from splatpilot.diagrams.worlds.building_blocks import (
     start_and_goal,
 )
 from splatpilot.diagrams.worlds.indoor import RoomConfig
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 
-PLOT = Plot.of_size(12.0, 8.0, 4.0)
+PLOT = FloorPlan.of_size(12.0, 8.0, 4.0)
 
 
 def _distance(solids, p_W: np.ndarray) -> np.ndarray:

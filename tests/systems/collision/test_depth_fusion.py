@@ -1,5 +1,3 @@
-"""Distance fields from depth images."""
-
 import os
 from pathlib import Path
 
@@ -78,7 +76,6 @@ def capture() -> tuple[list[np.ndarray], list[RigidTransform]]:
 
 
 def test_the_fused_field_is_that_of_the_room(capture):
-    """Near surfaces the field is unbiased to 0.05 voxel and 0.2 voxel rms; farther it errs near."""
     depths, X_WCs = capture
     lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs)
     voxel_size = 0.1
@@ -100,7 +97,6 @@ def test_the_fused_field_is_that_of_the_room(capture):
 
 
 def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
-    """From one view, what lies behind the walls, beside the image and out of range is unknown."""
     depths, X_WCs = capture
     box = np.full(3, -0.5), np.array([4.5, 3.5, 3.0])
     field = esdf_from_depth_images(depths[:1], K, X_WCs[:1], *box, 0.1, max_range=2.0)
@@ -118,7 +114,6 @@ def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
 
 @pytest.mark.parametrize("voxel_size", [0.1, 0.037])
 def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch, voxel_size):
-    """The field is the same, bit for bit, when no block is skipped."""
     depths, X_WCs = capture
     box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
     skipping = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
@@ -140,7 +135,6 @@ def wall(distance: float, slope: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("slope", [0.0, 1.0, 2.0])
 def test_a_wall_is_measured_along_its_normal(slope):
-    """A wall seen at an angle has the distance to its plane, not that along the optical axis."""
     box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
     field = esdf_from_depth_images([wall(1.5, slope)], K, [RigidTransform()], *box, 0.05)
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
@@ -154,7 +148,6 @@ def test_a_wall_is_measured_along_its_normal(slope):
 
 
 def test_pixels_without_depth_say_nothing():
-    """0, NaN and negative pixels leave everything unknown, beside valid ones too."""
     box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
     clean = wall(1.5)
     for nothing in (0.0, np.nan, -1.0):
@@ -171,8 +164,6 @@ def test_pixels_without_depth_say_nothing():
 
 
 def test_the_sky_clears_the_space_before_it():
-    """Infinite depth frees its pixel's space up to the range, moves no surface that another view
-    measures, and does not widen the bounds."""
     box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
     half_sky = wall(1.5)
     half_sky[:, :60] = np.inf
@@ -188,7 +179,6 @@ def test_the_sky_clears_the_space_before_it():
 
 
 def test_a_wall_out_of_range_clears_the_space_before_it():
-    """Depth beyond the range frees the range and sets no obstacle."""
     box = np.array([-0.3, -0.3, 0.2]), np.array([0.3, 0.3, 3.0])
     field = esdf_from_depth_images([wall(2.5)], K, [RigidTransform()], *box, 0.1, max_range=1.6)
     assert not (field.states == OCCUPIED).any()
@@ -197,7 +187,6 @@ def test_a_wall_out_of_range_clears_the_space_before_it():
 
 
 def test_bounds_hold_all_seen_points_and_cameras(capture):
-    """The box of the room's views is the room, with the margin; range clips it."""
     depths, X_WCs = capture
     lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs, margin=0.2)
     np.testing.assert_allclose(lower_W, [-0.2, -0.2, -0.2], atol=0.01)
@@ -224,7 +213,6 @@ def test_bounds_hold_all_seen_points_and_cameras(capture):
     ],
 )
 def test_bad_arguments_are_refused(change, message):
-    """Each wrong argument ends with a message that names it and its value."""
     good = {
         "depths": [wall(1.0)],
         "K": K,
@@ -239,14 +227,11 @@ def test_bad_arguments_are_refused(change, message):
 
 
 def test_images_of_different_shapes_are_refused():
-    """The second image's shape must be the first's."""
     with pytest.raises(ValueError, match=r"depth image 1 has shape \(4, 4\)"):
         bounds_of_depth_images([wall(1.0), np.ones((4, 4))], K, [RigidTransform()] * 2)
 
 
 def test_the_hospital():
-    """A real capture: the free volume and unknown share are as known for it, its own depth points
-    lie on the field's surface."""
     if "SPLATPILOT_DATA" not in os.environ:
         pytest.skip("SPLATPILOT_DATA is not set: the TartanAir hospital capture is needed")
     folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"

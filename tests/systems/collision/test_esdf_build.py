@@ -1,12 +1,16 @@
-"""Distance fields from Gaussians."""
-
 import numpy as np
 import pytest
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.esdf_build import density_on_grid, esdf_from_gaussians
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import (
+    density_on_grid,
+    esdf_from_distance_field,
+    esdf_from_gaussians,
+)
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
 from splatpilot.systems.splats.scene import GaussianScene
 
 VOXEL = 0.1
@@ -31,7 +35,6 @@ def shell(radius: float = 1.2, spacing: float = 0.06, opacity: float = 0.9) -> G
 
 
 def test_density_is_the_sum_of_all_gaussians():
-    """Against a direct sum over every Gaussian and voxel, also where they reach over the bounds."""
     random = np.random.default_rng(0)
     n, shape = 60, (24, 18, 15)
     means = random.uniform(-0.3, [2.7, 2.1, 1.8], (n, 3))
@@ -56,7 +59,6 @@ def test_density_is_the_sum_of_all_gaussians():
 
 @pytest.mark.parametrize(("spacing", "opacity"), [(0.06, 0.9), (0.04, 0.5), (0.1, 0.95)])
 def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near(spacing, opacity):
-    """On both sides of a sphere the bias is 0.4 to 0.65 voxel to the safe side, spread small."""
     field = esdf_from_gaussians(shell(1.2, spacing, opacity), VOXEL)
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
     height = np.linalg.norm(p, axis=-1) - 1.2
@@ -68,7 +70,6 @@ def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near(spacing, opacity):
 
 
 def test_a_shell_has_no_holes():
-    """No free path of face neighbours leads through a sphere of opaque Gaussians."""
     field = esdf_from_gaussians(shell(), VOXEL)
     components = np.zeros(field.shape, int)
     label(field.states == FieldState.FREE, output=components)
@@ -79,7 +80,6 @@ def test_a_shell_has_no_holes():
 
 @pytest.mark.parametrize("threshold", [0.5, 0.1, 0.01])
 def test_a_cloud_thicker_than_a_voxel_reaches_to_its_threshold(threshold):
-    """A big round Gaussian is a ball out to where its density falls to the threshold."""
     scene = gaussians(np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], [[0.3, 0.3, 0.3]], [1.0])
     box = np.full(3, 1.6)
     field = esdf_from_gaussians(scene, 0.05, -box, box, threshold)
@@ -89,14 +89,12 @@ def test_a_cloud_thicker_than_a_voxel_reaches_to_its_threshold(threshold):
 
 
 def test_transparent_gaussians_are_no_obstacle():
-    """A thin haze below the threshold leaves the space free."""
     scene = gaussians(np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], [[0.3, 0.3, 0.3]], [0.3])
     field = esdf_from_gaussians(scene, VOXEL)
     assert (field.states == FieldState.FREE).all()
 
 
 def test_what_was_not_observed_is_unknown_unless_occupied():
-    """The mask of observed voxels turns free into unknown and leaves obstacles."""
     scene = shell()
     free = esdf_from_gaussians(scene, VOXEL)
     observed = np.zeros(free.shape, bool)
@@ -118,6 +116,30 @@ def test_what_was_not_observed_is_unknown_unless_occupied():
     ],
 )
 def test_bad_arguments_are_refused(change, message):
-    """Each wrong argument ends with a message that names it and its value."""
     with pytest.raises(ValueError, match=message):
         esdf_from_gaussians(shell(), **{"voxel_size": VOXEL} | change)
+
+
+def test_values_at_the_voxel_centers_are_the_fields_own():
+    pillar = Cylinder(np.array([0.4, 0.3, -1.0]), np.array([0.5, 0.5, 3.0]), 0.2)
+    field = AnalyticDistanceField(
+        [HalfSpace(np.array([0.0, 0.0, 1.0]), 0.07), pillar],
+        np.array([-0.5, 0.0, 0.0]),
+        np.array([1.5, 1.1, 0.75]),
+    )
+    grid = esdf_from_distance_field(field, 0.1)
+    assert grid.shape == (20, 11, 8)
+    p = np.stack(np.meshgrid(*grid.voxel_centers(), indexing="ij"), -1)
+    p[..., 2] = np.minimum(p[..., 2], 0.75)  # the last layer's centres lie on the bounds
+    np.testing.assert_allclose(grid.distances, field.distance(p), atol=1e-6)
+    np.testing.assert_array_equal(grid.states, field.query(p).state)
+    assert (grid.states == FieldState.OCCUPIED).any()
+
+
+def test_unknown_space_stays_unknown():
+    states = np.zeros((8, 8, 8), np.uint8)
+    states[4:] = FieldState.UNKNOWN
+    coarse = Esdf(np.ones((8, 8, 8), np.float32), states, np.zeros(3), 0.2)
+    fine = esdf_from_distance_field(coarse, 0.1)
+    assert fine.shape == (16, 16, 16)
+    assert fine.volume(FieldState.UNKNOWN) == coarse.volume(FieldState.UNKNOWN)

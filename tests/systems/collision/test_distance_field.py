@@ -1,5 +1,3 @@
-"""The collision signals of a distance."""
-
 import math
 
 import numpy as np
@@ -10,7 +8,6 @@ from splatpilot.systems.collision.distance_field import in_collision, soft_barri
 
 
 def test_equation_three_at_hand_computed_values():
-    """It is log(1 + exp(beta (r + margin - d))) / beta, so log(2) / beta at d = r + margin."""
     assert soft_barrier(1.354, 0.354) == pytest.approx(math.log(2.0) / 4.0)
     assert soft_barrier(0.9, 0.3, beta=2.0, margin=0.5) == pytest.approx(
         math.log1p(math.exp(-0.2)) / 2.0
@@ -18,7 +15,6 @@ def test_equation_three_at_hand_computed_values():
 
 
 def test_stable_at_both_ends():
-    """Deep inside it is r + margin - d, far away a positive exponential tail, never inf or nan."""
     d = np.array([-1e6, -100.0, 100.0])
     np.testing.assert_allclose(soft_barrier(d, 0.354)[:2], 1.354 - d[:2])
     assert soft_barrier(d, 0.354)[2] == pytest.approx(math.exp(4.0 * (1.354 - 100.0)) / 4.0)
@@ -27,7 +23,6 @@ def test_stable_at_both_ends():
 
 
 def test_torch_gives_the_same_values_and_gradients():
-    """Tensors give numpy's values; the gradient is -sigmoid(beta (r + margin - d)), stable too."""
     d = torch.tensor([-1e4, -1.0, 0.0, 1.3, 5.0, 80.0], dtype=torch.float64, requires_grad=True)
     value = soft_barrier(d, 0.354)
     np.testing.assert_allclose(value.detach(), soft_barrier(d.detach().numpy(), 0.354), rtol=1e-12)
@@ -40,13 +35,11 @@ def test_torch_gives_the_same_values_and_gradients():
 
 
 def test_beta_must_be_positive():
-    """A barrier without sharpness is refused."""
     with pytest.raises(ValueError, match=r"beta is 0\.0"):
         soft_barrier(1.0, 0.354, beta=0.0)
 
 
 def test_hard_indicator():
-    """Collision is a distance below the radius; at the radius, beyond it or unknown it is none."""
     d = np.array([0.353, 0.354, 1.0, -1.0, np.nan])
     np.testing.assert_array_equal(in_collision(d, 0.354), [True, False, False, True, False])
     assert in_collision(torch.tensor([0.1, 1.0]), 0.354).tolist() == [True, False]
