@@ -76,26 +76,26 @@ def heading_along_motion(motion_W: Any, full_speed: float) -> tuple[Any, Any]:
 class FlatnessControllerConfig(Config):
     """Gains and limits of the controller."""
 
-    # Time between updates.
+    # [s] Time between updates.
     period: float = bounded(0.02, "[1e-4, inf) s")
-    # How far ahead of now the waypoint lies. At three times the attitude's lag, 3 / tilt_gain,
+    # [s] How far ahead of now the waypoint lies. At three times the attitude's lag, 3 / tilt_gain,
     # that lag cancels the leading tracking error; longer is smoother, shorter stiffer.
     lookahead: float = bounded(0.4, "(0, inf) s")
-    # Minimum thrust over mass.
+    # [m/s^2] Minimum thrust over mass.
     min_thrust: float = bounded(2.0, "(0, inf) m/s^2")
-    # Maximum thrust over mass.
+    # [m/s^2] Maximum thrust over mass.
     max_thrust: float = bounded(20.0, "(0, inf) m/s^2")
-    # Maximum commanded angle between body z and vertical, below pi/2.
+    # [rad] Maximum commanded angle between body z and vertical, below pi/2.
     max_tilt: float = bounded(0.8, "(0, 1.5707) rad")
-    # Commanded roll and pitch rate per angle of tilt error.
+    # [1/s] Commanded roll and pitch rate per angle of tilt error.
     tilt_gain: float = bounded(10.0, "(0, inf) 1/s")
-    # Maximum commanded rate about an axis in the body's x-y plane.
+    # [rad/s] Maximum commanded rate about an axis in the body's x-y plane.
     max_tilt_rate: float = bounded(6.0, "(0, inf) rad/s")
-    # Commanded yaw rate per angle of yaw error.
+    # [1/s] Commanded yaw rate per angle of yaw error.
     yaw_gain: float = bounded(3.0, "(0, inf) 1/s")
-    # Maximum commanded yaw rate.
+    # [rad/s] Maximum commanded yaw rate.
     max_yaw_rate: float = bounded(2.0, "(0, inf) rad/s")
-    # Horizontal speed from which yaw follows the motion fully.
+    # [m/s] Horizontal speed from which yaw follows the motion fully.
     yaw_speed: float = bounded(0.5, "(0, inf) m/s")
 
     def check(self) -> None:

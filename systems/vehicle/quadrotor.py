@@ -36,12 +36,12 @@ _NORM_GAIN = 5.0  # [1/s] pull of the quaternion towards unit length; errors dec
 class QuadrotorParams(Config):
     """Parameters of the quadrotor; the defaults describe a small camera drone."""
 
-    # Linear drag coefficient over mass. Identified racing quadrotors have 0.39-0.54
+    # [1/s] Linear drag coefficient over mass. Identified racing quadrotors have 0.39-0.54
     # (Faessler, Franchi, Scaramuzza, RA-L 2018).
     drag: float = bounded(0.375, "[0, inf) 1/s")
-    # First-order lag of the body rates behind their command.
+    # [s] First-order lag of the body rates behind their command.
     rate_time_constant: float = bounded(0.05, "(0, inf) s")
-    # Gravitational acceleration, along -z of the world.
+    # [m/s^2] Gravitational acceleration, along -z of the world.
     gravity: float = bounded(GRAVITY, "[0, inf) m/s^2")
 
 
