@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction.measure_scene import SHEET, measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
+from splatpilot.analysis.reconstruction.scene_measures import SceneMetrics
 from splatpilot.diagrams.worlds.scene_folder import check_scene_target, read_scene_metadata
 from splatpilot.systems.common.files import held_folder, require_unused
 from splatpilot.systems.common.progress import resumable
@@ -24,7 +24,7 @@ def run(
     config: ReconstructConfig,
     restart: bool = False,
     overwrite: bool = False,
-) -> tuple[ReconstructSummary, SceneMeasures]:
+) -> tuple[ReconstructSummary, SceneMetrics]:
     """Turns the capture in a folder into the scene folder `out`, with its `metrics.json`, and
     prints what came of it; see `reconstruct` and `measure_scene`. With `overwrite` it takes the
     place of the scene that is there.
