@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction.measure_scene import SHEET, measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
+from splatpilot.analysis.reconstruction.scene_measures import SceneMetrics
 from splatpilot.diagrams.worlds.scene_folder import CAPTURE, check_scene_target, read_scene_metadata
 from splatpilot.systems.common.files import held_folder, require_unused
 from splatpilot.systems.common.progress import resumable
@@ -41,7 +41,7 @@ def run_rendered(
     seed: int = 0,
     restart: bool = False,
     overwrite: bool = False,
-) -> tuple[ReconstructSummary, SceneMeasures]:
+) -> tuple[ReconstructSummary, SceneMetrics]:
     """Renders a mesh or a scenario's generated world to `out/capture` and makes the scene `out` of
     it; see `render_capture.run` and `run`. A capture of the same settings is used again."""
     check_scene_target(out)
@@ -63,7 +63,7 @@ def run(
     config: ReconstructConfig,
     restart: bool = False,
     overwrite: bool = False,
-) -> tuple[ReconstructSummary, SceneMeasures]:
+) -> tuple[ReconstructSummary, SceneMetrics]:
     """Turns the capture in a folder into the scene folder `out`, with its `metrics.json`, and
     prints what came of it; see `reconstruct` and `measure_scene`. With `overwrite` it takes the
     place of the scene that is there.
