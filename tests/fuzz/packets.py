@@ -70,7 +70,7 @@ def _read_messages(folder: Path) -> Any:
         packet = _packet(folder / f"{number}")
         try:
             values.append((codec, codec.unpack(decode_message(codec, packet), 0.0)))
-        except struct.error as error:  # It refuses as ValueError does, see `Received.taking`.
+        except struct.error as error:  # It refuses as ValueError does, see `Receiver._take`.
             raise ValueError(str(error)) from None
     return values
 

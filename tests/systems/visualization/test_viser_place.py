@@ -57,14 +57,11 @@ def server():
 
 
 def test_a_page_is_served(server):
-    """Whoever asks by HTTP gets viser's page."""
     with urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}") as answer:
         assert answer.status == 200 and b"<html" in answer.read()
 
 
 def test_a_browser_shows_what_the_camera_sees(server, browser):
-    """From the pose of the camera a browser draws what our renderer does; a slice of the distance
-    field comes into view when asked for, and moves with its slider."""
     tab = browser.new_page(viewport={"width": 2 * WIDTH, "height": 2 * HEIGHT})
     tab.set_default_timeout(120_000)
     tab.goto(f"http://127.0.0.1:{server.get_port()}")
@@ -101,7 +98,6 @@ def test_a_browser_shows_what_the_camera_sees(server, browser):
 
 
 def test_without_viser_the_remedy_is_named(monkeypatch, capsys):
-    """One sentence says what to install, before the place is made."""
 
     def absent(name: str):
         raise ModuleNotFoundError(name=name)
