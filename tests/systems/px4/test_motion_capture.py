@@ -10,7 +10,7 @@ from natnet_frame import natnet_frame
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.messaging.tof_receiver import UdpConfig
+from splatpilot.systems.messaging.receiver import UdpConfig
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
 
 LATENCY = 0.02
@@ -29,7 +29,7 @@ class Camera:
 
     def _tell_time(self) -> None:
         context = self.simulator.get_mutable_context()
-        self.system.unix_time_input_port().FixValue(context, [context.get_time()])
+        self.system.GetInputPort("unix_time").FixValue(context, [context.get_time()])
 
     def see(
         self, body: int = 3, position=(1.0, 2.0, 3.0), q=(0, 0, 0, 1), tracked=True, number=None
@@ -55,8 +55,6 @@ class Camera:
 
 
 def test_pose_is_that_of_the_body_in_our_frames():
-    """Of the named body position and attitude are turned from y up to z up; others are none of our
-    business."""
     stream = Camera(UdpConfig(port=0))
     assert stream.after(0.0)[1] == np.inf
     turn = Rotation.from_euler("y", 0.5)  # about the vertical
@@ -120,7 +118,6 @@ def test_in_a_process_with_the_wall_clock_the_time_of_reading_counts():
 
 
 def test_what_is_no_frame_is_counted(caplog):
-    """Frames that are cut, random bytes and strangers' frames are refused, and change nothing."""
     stream = Camera(UdpConfig(port=0))
     good = natnet_frame(1, 3, [1.0, 2.0, 3.0], [0, 0, 0, 1])
     stream.send(good)
@@ -132,11 +129,10 @@ def test_what_is_no_frame_is_counted(caplog):
     pose, _, rejected = stream.after(0.02)
     np.testing.assert_array_equal(pose, before)
     assert rejected == 5
-    assert "motion capture: a message is refused, 1 so far" in caplog.text
+    assert "motion capture: message rejected, 1 so far" in caplog.text
 
 
 def test_a_multicast_group_is_joined_where_one_is_named():
-    """What is sent to the group arrives."""
     stream = Camera(UdpConfig(port=0, group="239.255.42.199"))
     stream.send(natnet_frame(1, 3, [1.0, 2.0, 3.0], [0, 0, 0, 1]), to="239.255.42.199")
     pose, _, _ = stream.after(0.02)
@@ -144,10 +140,9 @@ def test_a_multicast_group_is_joined_where_one_is_named():
 
 
 def test_bad_config_is_named():
-    """A value out of range names the field."""
-    with pytest.raises(ValueError, match=r"motion_capture\.version is \[1, 0\]"):
+    with pytest.raises(ValueError, match=r"version must be .* got \[1, 0\]"):
         MotionCaptureConfig(version=[1, 0]).validate()
-    with pytest.raises(ValueError, match=r"motion_capture\.udp\.group is '10.0.0.1'"):
+    with pytest.raises(ValueError, match=r"group must be .* got 10.0.0.1"):
         MotionCaptureConfig(UdpConfig(group="10.0.0.1")).validate()
-    with pytest.raises(ValueError, match=r"motion_capture\.latency must be .* got 2"):
+    with pytest.raises(ValueError, match=r"latency must be .* got 2"):
         MotionCaptureConfig(latency=2.0).validate()
