@@ -90,9 +90,7 @@ class ReconstructConfig:
     """default: steps between resets of all opacities, while there are changes; 0 for never."""
     grow_gradient: float = 2e-4
     """default: mean gradient of a Gaussian's place on the image, in half widths of it, above which
-    it is doubled or split; of absolute values with `absgrad`, for which 8e-4 is usual."""
-    absgrad: bool = False
-    """default: compare absolute gradients (Ye et al. 2024)."""
+    it is doubled or split."""
     prune_opacity: float = 0.005
     """Gaussians fainter than this are removed, or by mcmc moved to others."""
     noise: float = 5e5

@@ -73,7 +73,7 @@ class DefaultStrategy:
         meta = rendering.meta
         rows, means2d = meta["gaussian_ids"], meta["means2d"]
         if self._config.representation == "3dgs":
-            gradient = means2d.absgrad if self._config.absgrad else means2d.grad
+            gradient = means2d.grad
         else:
             # Surfels: u = f x / z, so that dL/du is about z / f dL/dx with x in the camera.
             by_means = splats["means"].grad
@@ -358,7 +358,6 @@ class Optimization:
             background=backdrop,
             depth_mode=config.depth_mode,
             eps2d=0.0 if outlines else EPS2D,
-            absgrad=config.absgrad and config.strategy == "default",
             distortion=self._objective.wants_distortion(self.step),
             renderer=self._renderer,
         )
