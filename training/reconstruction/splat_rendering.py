@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatpilot._native import Renderer
 from splatpilot.systems.splats.rasterization import EPS2D, rasterize
-from splatpilot.systems.splats.scene import degree_of
+from splatpilot.systems.splats.scene import harmonic_degree
 from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 
@@ -36,7 +36,6 @@ def render(
     background: Tensor | None = None,
     depth_mode: str = "D",
     eps2d: float = EPS2D,
-    absgrad: bool = False,
     distortion: bool = False,
     renderer: Renderer | None = None,
 ) -> Rendering:
@@ -52,19 +51,18 @@ def render(
         depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
             is 0 where no surface is.
         eps2d: of Gaussians, see `rasterize`; surfels have a blur of their own.
-        absgrad: see `rasterize`.
         distortion: whether surfels render it.
         renderer: see `rasterize`.
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
-        "sh_degree": degree_of(gaussians[4].shape[1]),
+        "sh_degree": harmonic_degree(gaussians[4].shape[1]),
         "backgrounds": background,
         "renderer": renderer,
     }
     if representation == "3dgs":
         image, alpha, meta = rasterize(
-            *scene, **options, render_mode=f"RGB+{depth_mode}", eps2d=eps2d, absgrad=absgrad
+            *scene, **options, render_mode=f"RGB+{depth_mode}", eps2d=eps2d
         )
         color, depth = image[0].split((3, 1), dim=-1)
         return Rendering(color, depth.reshape(height, width), alpha.reshape(height, width), meta)
