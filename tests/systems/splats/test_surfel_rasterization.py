@@ -94,7 +94,6 @@ def call_reference(scene, width=WIDTH, height=HEIGHT, **options):
 @pytest.mark.parametrize("simd", LEVELS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_images_agree_with_reference(simd, seed):
-    """Every image equals the float64 reference, at every SIMD level, threshold flips apart."""
     scene = random_scene(seed=seed)
     expected = call_reference(scene, background=(0.1, 0.7, 0.3))
     clear = expected.margin > 1e-4
@@ -137,11 +136,6 @@ def lengths(gradient: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
 def test_gradients_agree_with_reference(sh_degree):
-    """Gradients of all images with respect to all inputs equal autograd's through the reference.
-
-    All but 1 % are within gsplat's tolerance (1e-5 relative, 1e-3 absolute) of float64, and those
-    of a surfel within that and what moving the inputs by half a last place does to float64.
-    """
     scene = random_scene(seed=3, sh_degree=sh_degree)
     clear = call_reference(scene, sh_degree=sh_degree).margin > 1e-4
     exact = reference_gradients(scene, clear, sh_degree=sh_degree)
@@ -167,7 +161,6 @@ def test_gradients_agree_with_reference(sh_degree):
 
 @pytest.mark.parametrize("sine", [1e-4, 1e-3, 1e-2, 1e-1])
 def test_nearly_edge_on_surfels_keep_their_digits(sine):
-    """Where rays graze surfels, gradients are nearer to float64 than torch's in float32."""
     scene = edge_on_scene(sine)
     clear = call_reference(scene).margin > 1e-2
     assert clear.float().mean() > 0.8
@@ -192,7 +185,6 @@ def test_nearly_edge_on_surfels_keep_their_digits(sine):
 
 
 def test_third_scale_does_not_matter():
-    """A surfel is flat: its third scale changes nothing, not even where it is NaN."""
     scene = random_scene(seed=2)
     other = scene | {"scales": scene["scales"].clone()}
     other["scales"][:, 2] = torch.tensor([0.0, math.nan, 1e9]).repeat(100)
@@ -201,7 +193,6 @@ def test_third_scale_does_not_matter():
 
 
 def test_surfel_facing_the_camera_is_a_gaussian_disc():
-    """Face on, alpha is a Gaussian of the projected size, at the surfel's depth and normal."""
     images = render(single_surfel(opacity=0.8), width=33, height=33)
     y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
     expected = 0.8 * torch.exp(-(x**2 + y**2) / (2 * 5.0**2))  # 100 px * 0.1 m / 2 m
@@ -215,7 +206,6 @@ def test_surfel_facing_the_camera_is_a_gaussian_disc():
 
 
 def test_small_surfel_is_the_blob():
-    """A surfel far smaller than a pixel covers what a deviation of sqrt(1/2) px does."""
     images = render(single_surfel(scale=1e-6), width=33, height=33)
     y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
     expected = 0.5 * torch.exp(-(x**2 + y**2))
@@ -243,7 +233,6 @@ def tilted_plane(tilt=1.1) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor]:
 
 
 def test_tilted_plane_has_exact_depth_and_normals():
-    """Surfels on one plane give its depth and normal at every pixel, where Gaussians do not."""
     scene, normal, depth = tilted_plane()
     axis = rotation_matrices(scene["quats"][:1])[0, :, 2]
     assert (axis.cross(normal, dim=0)).norm() < 1e-6
@@ -261,7 +250,6 @@ def test_tilted_plane_has_exact_depth_and_normals():
 
 
 def test_surface_normals_are_in_the_world_and_differentiable():
-    """A turned camera sees the same normals, and their gradient moves the surfels."""
     scene, normal, _ = tilted_plane()
     R = rotation_matrices(torch.tensor([[1.0, 0.1, -0.2, 0.3]]))[0]
     turned = scene | {"means": scene["means"] @ R.T, "viewmats": scene["viewmats"].clone()}
@@ -277,7 +265,6 @@ def test_surface_normals_are_in_the_world_and_differentiable():
 
 
 def test_depth_without_a_plane_has_no_normal():
-    """Beside pixels that see nothing normals are zero where no plane is, and gradients bounded."""
     depths = torch.zeros(1, 7, 7, 1)
     depths[0, 3, 3] = 2.0
     depths[0, 1, 1:5] = 2.0
@@ -300,7 +287,6 @@ def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def test_distortion_is_the_weighted_spread():
-    """Two surfels give twice the product of their weights and the distance between them."""
     scene = single_surfel(opacity=0.5)
     scene = {
         k: v if k in ("viewmats", "Ks") else v.repeat(2, *[1] * (v.ndim - 1))
@@ -317,7 +303,6 @@ def test_distortion_is_the_weighted_spread():
 
 @pytest.mark.parametrize("quat", [(1.0, 1.0, 0, 0), (1.0, 1.0 + 1e-6, 0, 0), (1.0, 1.001, 0, 0)])
 def test_edge_on_surfel_is_its_blob(quat):
-    """Seen from the side a surfel is drawn where its centre is, and gradients are finite."""
     scene = single_surfel(quat=quat)
     for name in LEARNED:
         scene[name] = scene[name].requires_grad_()
@@ -332,13 +317,11 @@ def test_edge_on_surfel_is_its_blob(quat):
     ("depth", "visible"), [(-2.0, False), (0.0, False), (0.0099, False), (0.01, True), (5.0, True)]
 )
 def test_near_plane_is_the_limit(depth, visible):
-    """A surfel is drawn if its centre is at or beyond the near plane, never if behind it."""
     images = render(single_surfel(depth=depth, scale=0.001), width=33, height=33)
     assert bool(images["alpha"].any()) == visible
 
 
 def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
-    """A floor that passes below and behind the camera ends at the horizon."""
     quat = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # normal along -y
     scene = single_surfel(opacity=0.9, scale=3.0, depth=1.0, quat=quat)
     scene["means"][0, 1] = 0.5
@@ -350,7 +333,6 @@ def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
 
 
 def test_empty_scene_is_background():
-    """No surfels give the background and zeros, with gradients that are empty."""
     scene = random_scene(count=0)
     for name in LEARNED:
         scene[name] = scene[name].requires_grad_()
@@ -364,7 +346,6 @@ def test_empty_scene_is_background():
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (16, 16), (17, 33), (97, 1)])
 def test_odd_sizes_agree_with_reference(size):
-    """Images that end inside tiles and blocks are complete and equal the reference."""
     width, height = size
     scene = random_scene(seed=8, size=size)
     expected = call_reference(scene, width, height)
@@ -382,7 +363,6 @@ def all_bits(scene, **options):
 
 @pytest.mark.parametrize("simd", LEVELS)
 def test_same_bits_for_any_number_of_threads(simd):
-    """Images and gradients do not depend on threads, nor on what was rendered before."""
     scene = random_scene(count=6000, seed=6, size=(150, 110), sh_degree=1)
     options = {"width": 150, "height": 110, "sh_degree": 1}
     renderer = create_renderer(1, simd)
@@ -394,7 +374,6 @@ def test_same_bits_for_any_number_of_threads(simd):
 
 
 def test_batch_of_cameras_equals_single_calls():
-    """C cameras give the images of C calls and the sum of their gradients, in any order."""
     scene = random_scene(seed=3, cameras=3)
     scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
     leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
@@ -415,7 +394,6 @@ def test_batch_of_cameras_equals_single_calls():
 
 
 def test_backward_twice_gives_the_same():
-    """A graph that is retained can be walked again, whatever was rendered in between."""
     scene = random_scene(seed=4)
     scene["means"].requires_grad_()
     renderer = create_renderer()
@@ -427,7 +405,6 @@ def test_backward_twice_gives_the_same():
 
 
 def test_modes_and_meta():
-    """Each render mode has its channels, and meta lists the visible surfels."""
     scene = random_scene(seed=4)
     depth = render(scene)
     expected = depth["depth"] / depth["alpha"].clamp(min=1e-10)
@@ -462,7 +439,6 @@ def test_modes_and_meta():
     threads=st.integers(1, 2),
 )
 def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, simd, threads):
-    """Any valid scene gives finite images and gradients, and alpha in [0, 1]."""
     scene = random_scene(count=count, seed=seed, size=(width, height))
     scene["means"] *= 10.0**spread
     scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
@@ -479,7 +455,6 @@ def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), spread=st.floats(-1, 1), log_scale=st.floats(-3, 1))
 def test_fuzz_agrees_with_reference(seed, spread, log_scale):
-    """Random scenes agree with the reference wherever no decision is within rounding."""
     scene = random_scene(count=80, seed=seed, size=(29, 23))
     scene["means"] *= 10.0**spread
     scene["scales"] = scene["scales"] * 10.0**log_scale
@@ -523,7 +498,6 @@ def _set(name, index, value):
     ],
 )
 def test_bad_input_is_named(change, message):
-    """Each mistake raises ValueError that names the tensor, the place, the value and the limit."""
     scene = change(random_scene() | {"width": WIDTH, "height": HEIGHT})
     with pytest.raises(ValueError, match=message):
         rasterize_surfels(**scene)
