@@ -1,6 +1,6 @@
 """A study on disk.
 
-    study.yaml       what is flown, and the program that flies it; of a shard, which it is
+    study.yaml       what is flown, and the program that flies it
     scenarios/       the scenarios, every field written out
     scenes/          the reconstructed scenes they fly in
     weights/         of policies that were given as files, by their labels
@@ -28,12 +28,12 @@ import numpy as np
 import yaml
 
 from splatpilot.analysis.benchmark.rollout import ARRAYS, INFEASIBLE, Fault, Rollout
-from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import SCENARIO, RolloutSpec, StudyConfig
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.worlds.scene_folder import (
+    CAPTURE,
     ENVIRONMENT,
     FRONTIER,
     SceneSource,
@@ -73,16 +73,13 @@ class StudyFolder:
         """The file that holds a flight."""
         return self.path / "rollouts" / f"{id}.npz"
 
-    def claim(
-        self, config: StudyConfig, program: dict[str, str], shard: Shard | None = None
-    ) -> None:
+    def claim(self, config: StudyConfig, program: dict[str, str]) -> None:
         """
         Makes the folder, or checks that the one there is of the same study.
 
         Args:
             config: what is flown.
             program: `provenance.program()` and `foreign_code`.
-            shard: which part of the study is flown here; all of it by default.
 
         Raises:
             ValueError: if another study, or something else, is there.
@@ -93,8 +90,6 @@ class StudyFolder:
             "study": yaml.safe_load(dump_config(config)),
             "program": program,
         }
-        if shard is not None:
-            described["shard"] = str(shard)
         if (self.path / "study.yaml").is_file():
             self._check_same(described)
         else:
@@ -129,11 +124,6 @@ class StudyFolder:
                     f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
                     "another folder, or ask for the same study"
                 )
-        parts = [f"shard {d['shard']}" if "shard" in d else "all" for d in (there, described)]
-        if parts[0] != parts[1]:
-            raise ValueError(
-                f"{self.path} holds {parts[0]} of this study, not {parts[1]}; choose another folder"
-            )
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
@@ -154,7 +144,7 @@ class StudyFolder:
                 f"{file}: format version {version}, this program knows {FORMAT_VERSION}; use the "
                 "version of the program that made the study"
             )
-        for name, kind in (("study", dict), ("program", dict), ("shard", str | None)):
+        for name, kind in (("study", dict), ("program", dict)):
             if not isinstance(described.get(name), kind):
                 raise ValueError(
                     f"{file} describes no study: {name} is {described.get(name)!r:.80}; restore "
@@ -180,11 +170,6 @@ class StudyFolder:
     def program(self) -> dict[str, str]:
         """What `claim` or `keep_program` was told of the program."""
         return self._described()["program"]
-
-    def shard(self) -> Shard | None:
-        """Which part of the study is flown here; None for all of it."""
-        text = self._described().get("shard")
-        return None if text is None else Shard.parse(text)
 
     def write(self, rollout: Rollout) -> None:
         """Keeps a flight."""
@@ -425,7 +410,8 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
     if not kept.exists():
         if scene.is_dir():
             with folder_written_atomically(kept) as partial:
-                shutil.copytree(scene, partial, dirs_exist_ok=True)
+                own = shutil.ignore_patterns(CAPTURE)
+                shutil.copytree(scene, partial, dirs_exist_ok=True, ignore=own)
         else:
             with written_atomically(kept) as partial:
                 shutil.copyfile(scene, partial)

@@ -48,7 +48,7 @@ from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.render import true_camera
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.metrics import fit_exposure, mean_measure
+from splatpilot.training.reconstruction.metrics import fit_exposure, mean_metric
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 
@@ -248,7 +248,7 @@ def study_scene(
         )
     # As beside the path, nothing is left out.
     on_path = (views.measure(views.frame(i)) for i in views.measured)
-    on_path_psnr_db, _ = mean_measure(on_path, "psnr_db")
+    on_path_psnr_db, _ = mean_metric(on_path, "psnr_db")
     assert on_path_psnr_db is not None
     camera = find_camera(Path(views.metadata.capture))
     if camera is not None:

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from scipy.optimize import isotonic_regression
 
 from splatpilot.training.captures.capture import Capture, back_project, no_depth
-from splatpilot.training.reconstruction.metrics import SceneRenderer, ViewMeasures
+from splatpilot.training.reconstruction.metrics import SceneRenderer, ViewMetrics
 
 # From measured errors to how far they can be trusted: monotone fits and where they cross limits.
 #
@@ -105,7 +105,7 @@ class Sample:
     floater_fraction: float
 
     @classmethod
-    def of(cls, frame: int, offset: float, unseen: float, found: ViewMeasures) -> "Sample":
+    def of(cls, frame: int, offset: float, unseen: float, found: ViewMetrics) -> "Sample":
         """Returns the sample of a view that has been measured, with true depth."""
         assert found.psnr_db is not None and found.depth_mae_m is not None
         assert found.depth_relative is not None and found.floater_fraction is not None

@@ -25,10 +25,10 @@ from splatpilot.analysis.reconstruction.figures import (
 from splatpilot.analysis.reconstruction.measure_scene import measure_scene
 from splatpilot.analysis.reconstruction.scene_measures import (
     NAMES,
-    SceneMeasures,
+    SceneMetrics,
     SceneViews,
-    format_measure,
-    read_measures,
+    format_metric,
+    read_metrics,
 )
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.common.config import dump_config
@@ -40,7 +40,7 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
-from splatpilot.training.reconstruction.initialize import MOST_STEPS, held_out_frames, triangulate
+from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_frames, triangulate
 from splatpilot.training.reconstruction.metrics import fit_exposure, floaters, has_true_depth
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
@@ -98,7 +98,7 @@ ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") fo
 class AblationResult:
     """The measures of all arms on one capture or more."""
 
-    captures: dict[str, dict[str, SceneMeasures]]  # by name of the capture and key of the arm
+    captures: dict[str, dict[str, SceneMetrics]]  # by name of the capture and key of the arm
 
     def values(self, arm: Arm, name: str) -> list[float]:
         """Returns a measure of an arm on each capture that has it."""
@@ -127,7 +127,7 @@ class AblationResult:
         for capture, arms in self.captures.items():
             for arm in ARMS:
                 cells = [
-                    format_measure(arms[arm.key].mean(name), NAMES[name][1]) for name in COLUMNS
+                    format_metric(arms[arm.key].mean(name), NAMES[name][1]) for name in COLUMNS
                 ]
                 rows.append([capture, arm.title, *cells])
         if len(self.captures) > 1:
@@ -135,7 +135,7 @@ class AblationResult:
                 cells = [_spread(self.values(arm, name), NAMES[name][1]) for name in COLUMNS]
                 rows.append(["mean ± spread", arm.title, *cells])
         for arm, known in paper_rows():
-            cells = [format_measure(known.get(name), NAMES[name][1]) for name in COLUMNS]
+            cells = [format_metric(known.get(name), NAMES[name][1]) for name in COLUMNS]
             rows.append(["paper", arm.title, *cells])
         return rows
 
@@ -155,7 +155,7 @@ def paper_rows() -> list[tuple[Arm, dict[str, float]]]:
     ]
 
 
-def _ratio(before: SceneMeasures, after: SceneMeasures, name: str) -> str:
+def _ratio(before: SceneMetrics, after: SceneMetrics, name: str) -> str:
     a, b = before.mean(name), after.mean(name)
     if a is None or b is None:
         return "-"
@@ -234,7 +234,7 @@ def run(
             "optimises, and measures on held-out frames; neither may be 0"
         )
     if config.iterations < 0:  # all arms take the same
-        config = replace(config, iterations=MOST_STEPS)
+        config = replace(config, iterations=MAX_STEPS)
     opened = [(path, _open(path, config.capture)) for path in captures]
     names = [capture.name for _, capture in opened]
     for path, capture in opened:
@@ -262,7 +262,7 @@ def _open(path: Path, config: CaptureConfig) -> Capture:
     return read_capture(path, config)
 
 
-def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMeasures]:
+def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMetrics]:
     """Makes and measures the arms of one capture that are not there yet."""
     found = {}
     points = capture.points
@@ -283,7 +283,7 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
                 reconstruct(seen, scene, arm_config(arm, config))
             with written_atomically(file) as written:
                 written.write_text(recipe)
-        found[arm.key] = read_measures(scene) or measure_scene(scene, capture)
+        found[arm.key] = read_metrics(scene) or measure_scene(scene, capture)
     return found
 
 
@@ -343,7 +343,7 @@ def _write_sheet(path: Path, capture: Capture, out: Path, result: AblationResult
         error = np.abs(view.depth - np.where(known, frame.depth, 0))
         mask = floaters(view.depth, frame.depth)
         fraction, mae = found.floater_fraction or 0.0, found.depth_mae_m or 0.0
-        rows[0].append(Panel(image, format_measure(found.psnr_db, "{:.1f} dB")))
+        rows[0].append(Panel(image, format_metric(found.psnr_db, "{:.1f} dB")))
         rows[1].append(Panel(mark_floaters(image, mask), f"{fraction:.1%}"))
         rows[2].append(Panel(colorize(view.depth, depths, view.alpha > 0)))
         rows[3].append(Panel(colorize(error, errors, known), f"{mae:.2f} m"))

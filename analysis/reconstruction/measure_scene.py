@@ -16,9 +16,9 @@ from splatpilot.analysis.reconstruction.figures import (
 )
 from splatpilot.analysis.reconstruction.scene_measures import (
     METRICS,
-    SceneMeasures,
+    SceneMetrics,
     SceneViews,
-    format_measure,
+    format_metric,
     unseen_share,
 )
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
@@ -42,7 +42,7 @@ def load_lpips() -> tuple[Lpips | None, str]:
         return None, str(error)
 
 
-def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
+def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
     """Measures a scene folder and leaves `metrics.json` and the sheet `views.png` in it.
 
     It is measured on the held-out frames; if none was held out, on every eighth frame, which says
@@ -62,14 +62,14 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
         strict[i] = views.measure(frame, lpips=lpips, fit_gain=False)
     height, width = size
     held_out, unseen = bool(views.metadata.held_out), unseen_share(scene)
-    measures = SceneMeasures(held_out, width, height, frames, strict, missing, unseen)
+    measures = SceneMetrics(held_out, width, height, frames, strict, missing, unseen)
     _write_views(scene / SHEET, views, measures)
     with written_atomically(scene / METRICS) as partial:  # Last: it says that all is there.
         partial.write_text(json.dumps(measures.as_json(), indent=2))
     return measures
 
 
-def run(scene: Path, overwrite: bool = False) -> SceneMeasures:
+def run(scene: Path, overwrite: bool = False) -> SceneMetrics:
     """Measures a scene folder, see `measure_scene`, and prints what it is and the table.
 
     Raises:
@@ -89,7 +89,7 @@ def run(scene: Path, overwrite: bool = False) -> SceneMeasures:
     return measures
 
 
-def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None:
+def _write_views(path: Path, views: SceneViews, measures: SceneMetrics) -> None:
     """Draws some of the frames: truth and scene, in colour and depth."""
     numbers = list(measures.frames)
     picked = sorted({numbers[k] for k in np.linspace(0, len(numbers) - 1, _SHEET_ROWS).astype(int)})
@@ -104,7 +104,7 @@ def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None
         found = measures.frames[i]
         vignetting = views.metadata.vignetting
         image, _ = fit_exposure(view.color, frame.image / 255, vignetting, frame.valid)
-        label = format_measure(found.psnr_db, "{:.1f} dB")
+        label = format_metric(found.psnr_db, "{:.1f} dB")
         row = [Panel(frame.image / 255), Panel(image, label)]
         rows.append(row + depth_panels(frame, view, found.depth_mae_m, depths, errors))
     columns = ["captured", "scene", "captured depth", "depth of the scene", "depth error"]

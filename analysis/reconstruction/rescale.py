@@ -29,7 +29,7 @@ from splatpilot.training.captures.capture_config import CaptureConfig, complete_
 from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.captures.up_and_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.distance_field import render_depth_of
+from splatpilot.training.reconstruction.distance_field import render_depth
 from splatpilot.training.reconstruction.reconstruct import start_and_goal
 
 # Rows are W's axes in the file's, by which of those is up; x stays where it can.
@@ -295,7 +295,7 @@ def _closed(
     capture = read_capture_of(scene, about)
     factor = shrink_factor(capture.width, about.image_width)
     threads = ReconstructConfig().renderer_threads
-    depth = render_depth_of(capture, factor, gaussians, about.representation, threads)
+    depth = render_depth(capture, factor, gaussians, about.representation, threads)
     return close_frontier(field, depth.images(), depth.K, depth.X_WCs)
 
 

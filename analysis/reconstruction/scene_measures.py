@@ -30,8 +30,8 @@ from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import (
     SceneRenderer,
-    ViewMeasures,
-    mean_measure,
+    ViewMetrics,
+    mean_metric,
     measure_view,
 )
 from splatpilot.training.reconstruction.photometry import ThinnedFrame, seen_pixels
@@ -54,16 +54,16 @@ _MOSTLY_UNSEEN = 0.5
 
 
 @dataclass(frozen=True)
-class SceneMeasures:
+class SceneMetrics:
     """A scene against the frames of its capture."""
 
     held_out: bool
     """Whether the frames had no part in making the scene."""
     width: int  # [px], at which it was measured: images are shrunk as they were for the making
     height: int
-    frames: dict[int, ViewMeasures]
+    frames: dict[int, ViewMetrics]
     """In the pixels that show what the scene was made from, exposed to fit."""
-    strict_frames: dict[int, ViewMeasures]
+    strict_frames: dict[int, ViewMetrics]
     """In all pixels, with a gain of 1."""
     lpips_missing: str
     """Why there is no LPIPS; empty if there is."""
@@ -72,11 +72,11 @@ class SceneMeasures:
 
     def mean(self, name: str) -> float | None:
         """Returns the mean of a measure over the frames that have it; None if none has."""
-        return mean_measure(self.frames.values(), name)[0]
+        return mean_metric(self.frames.values(), name)[0]
 
     def strict_mean(self, name: str) -> float | None:
         """Returns the same in all pixels, with a gain of 1."""
-        return mean_measure(self.strict_frames.values(), name)[0]
+        return mean_metric(self.strict_frames.values(), name)[0]
 
     @property
     def worst_hole_fraction(self) -> float | None:
@@ -89,7 +89,7 @@ class SceneMeasures:
         each frame."""
         return {
             **{name: self.mean(name) for name in NAMES},
-            "counts": {name: mean_measure(self.frames.values(), name)[1] for name in NAMES},
+            "counts": {name: mean_metric(self.frames.values(), name)[1] for name in NAMES},
             "strict": {name: self.strict_mean(name) for name in NAMES},
             "worst_hole_fraction": self.worst_hole_fraction,
             "held_out": self.held_out,
@@ -108,16 +108,16 @@ class SceneMeasures:
             f"{'':<22} {'seen pixels, gain fitted':<26} all pixels, no gain",
         ]
         for name, (title, form) in NAMES.items():
-            mean, count = mean_measure(self.frames.values(), name)
-            told = format_measure(mean, form)
+            mean, count = mean_metric(self.frames.values(), name)
+            told = format_metric(mean, form)
             if 0 < count < len(self.frames):
                 told += f" ({count} of {len(self.frames)} frames)"
-            strict = format_measure(self.strict_mean(name), form)
+            strict = format_metric(self.strict_mean(name), form)
             lines.append(f"{title:<22} {told:<26} {strict}")
-        worst = format_measure(self.worst_hole_fraction, NAMES["hole_fraction"][1])
+        worst = format_metric(self.worst_hole_fraction, NAMES["hole_fraction"][1])
         lines.append(f"{'holes, worst frame':<22} {worst}")
         unseen = self.flight_unseen_fraction
-        lines.append(f"{'unseen in flight':<22} {format_measure(unseen, '{:.1%}')}")
+        lines.append(f"{'unseen in flight':<22} {format_metric(unseen, '{:.1%}')}")
         if unseen is not None and unseen > _MOSTLY_UNSEEN:
             lines.append(
                 "warning: a flight from the default start to the default goal looks mostly into "
@@ -128,12 +128,12 @@ class SceneMeasures:
         return "\n".join(lines)
 
 
-def format_measure(value: float | None, form: str) -> str:
+def format_metric(value: float | None, form: str) -> str:
     """Returns a figure as text, a dash for None."""
     return "-" if value is None else form.format(value)
 
 
-def read_measures(scene: Path) -> SceneMeasures | None:
+def read_metrics(scene: Path) -> SceneMetrics | None:
     """Returns what `metrics.json` of the scene folder says; None if there is none.
 
     Raises:
@@ -144,10 +144,10 @@ def read_measures(scene: Path) -> SceneMeasures | None:
         return None
     try:
         content = json.loads(file.read_text())
-        said = {field.name: content[field.name] for field in fields(SceneMeasures)}
+        said = {field.name: content[field.name] for field in fields(SceneMetrics)}
         for name in ("frames", "strict_frames"):
-            said[name] = {int(i): ViewMeasures(**frame) for i, frame in said[name].items()}
-        return SceneMeasures(**said)
+            said[name] = {int(i): ViewMetrics(**frame) for i, frame in said[name].items()}
+        return SceneMetrics(**said)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: {error!r}; delete the file and measure again") from error
 
@@ -221,7 +221,7 @@ class SceneViews:
         lpips: Lpips | None = None,
         *,
         fit_gain: bool = True,
-    ) -> ViewMeasures:
+    ) -> ViewMetrics:
         """Compares both, in the pixels `seen` or in all, see `measure_view`."""
         on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
         return measure_view(
@@ -260,7 +260,7 @@ def unseen_share(scene: Path) -> float | None:
     camera = MakeCamera(Scenario(), replace(world, gaussians=seen, background=(0.0, 0.0, 0.0)))
     # Every point beyond the goal is the goal: the poses are those before it.
     reach = float(toa.value(world.p_WS))  # [m] at 1 m/s in the open, and no less than the length
-    points, directions = toa.way(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
+    points, directions = toa.path(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
     before = np.flatnonzero(np.linalg.norm(directions[:, :2], axis=1) > 0.0)
     chosen = before[np.linspace(0, len(before) - 1, _POSES).astype(int)]
     shares = []

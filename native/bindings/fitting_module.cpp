@@ -1,4 +1,4 @@
-// Python bindings of what fits Gaussians to images: losses, shapes, Adam, and the distance of
+// Python bindings of what fits Gaussians to images: losses, shapes, and the distance of
 // Gaussians from the surface that a depth image shows.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
@@ -75,30 +75,6 @@ double log_depth_loss(const Values& rendered, const Values& depth,
 }
 
 const FittingKernels& fitting(const std::string& simd) { return *kernels(simd).fitting; }
-
-void adam_step(const ValuesOut& parameters, const Values& gradients, const ValuesOut& means,
-               const ValuesOut& squares, double rate, int step, double mean_decay,
-               double square_decay, double epsilon, const std::string& simd) {
-  const size_t count = parameters.size();
-  require(gradients.size() == count && means.size() == count && squares.size() == count,
-          "parameters, gradients and their averages differ in size");
-  require(step >= 1, "steps are counted from 1");
-  const AdamInput in{parameters.data(),
-                     gradients.data(),
-                     means.data(),
-                     squares.data(),
-                     count,
-                     static_cast<float>(mean_decay),
-                     static_cast<float>(square_decay),
-                     static_cast<float>(1.0 - mean_decay),
-                     static_cast<float>(1.0 - square_decay),
-                     static_cast<float>(rate / (1.0 - std::pow(mean_decay, step))),
-                     static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(square_decay, step))),
-                     static_cast<float>(epsilon)};
-  const FittingKernels& kernels = fitting(simd);
-  const nb::gil_scoped_release release;
-  kernels.adam(in);
-}
 
 void splat_shapes(const Means& log_scales, const Opacities& logit_opacities, const Values& smallest,
                   const Rows3& scales, const ValuesOut& opacities, const std::string& simd) {
@@ -252,9 +228,6 @@ double surface_loss(const Means& means, const Quats& quats, const Means& scales,
 }  // namespace
 
 void bind_fitting(nb::module_& m) {
-  m.def("adam_step", &adam_step, nb::kw_only(), "parameters"_a, "gradients"_a, "means"_a,
-        "squares"_a, "rate"_a, "step"_a, "mean_decay"_a, "square_decay"_a, "epsilon"_a,
-        "simd"_a = "", "Moves parameters, and the averages of gradients and of their squares.");
   m.def("splat_shapes", &splat_shapes, nb::kw_only(), "log_scales"_a, "logit_opacities"_a,
         "smallest"_a, "scales"_a, "opacities"_a, "simd"_a = "",
         "Writes sqrt(exp(2 log_scales) + smallest^2) and sigmoid(logit_opacities).");

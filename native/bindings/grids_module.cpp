@@ -1,9 +1,12 @@
 // Python bindings of worlds of regular grids, of distances in one of them, and of descent along
 // the gradient of another.
+#include <nanobind/stl/optional.h>
+
 #include <limits>
+#include <optional>
 
 #include "bindings/casting_bindings.hpp"
-#include "fields/trilinear.hpp"
+#include "fields/grid_interpolation.hpp"
 
 namespace splatpilot {
 namespace {
@@ -13,6 +16,7 @@ using Grid = Floats<nb::ndim<3>>;
 using Point = Doubles<nb::shape<3>>;
 using QueryPoints = Doubles<nb::shape<-1, 3>>;
 using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Gradients = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using WayPoints = nb::ndarray<double, nb::shape<-1, 4>, nb::c_contig, nb::device::cpu>;
 using GridShapes = nb::ndarray<const int64_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 
@@ -74,45 +78,46 @@ class GridWorlds : Casting {
   std::vector<GridWorld> grids_;
 };
 
-// Operation by operation what `splatpilot.systems.collision.esdf.Esdf.query` computes.
 void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W, double voxel_size,
-                    bool occupied_outside, const QueryPoints& p_WQ, const Distances& distances) {
+                    bool occupied_outside, const QueryPoints& p_WQ, const Distances& distances,
+                    const std::optional<Gradients>& gradients) {
   const size_t count = p_WQ.shape(0);
-  require(distances.size() == count, "points and distances differ in number");
+  require(distances.size() == count && (!gradients || gradients->shape(0) == count),
+          "points, distances and gradients differ in number");
   require(voxel_size > 0.0, "voxels need a size");
-  int64_t last[3];
-  double first[3];  // centre of the first voxel
+  VoxelGrid voxels{grid.data(), {}, {}, voxel_size};
   for (int k = 0; k < 3; ++k) {
-    last[k] = static_cast<int64_t>(grid.shape(k)) - 2;
-    require(last[k] >= 0, "a grid needs at least 2 voxels along each axis");
-    first[k] = lower_W.data()[k] + 0.5 * voxel_size;
+    voxels.shape[k] = static_cast<int64_t>(grid.shape(k));
+    require(voxels.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
+    voxels.lower_W[k] = lower_W.data()[k];
   }
-  const int64_t row = last[2] + 2, layer = row * (last[1] + 2);
   const double *lower = lower_W.data(), *upper = upper_W.data();
   for (size_t i = 0; i < count; ++i) {
     const double* p = p_WQ.data() + 3 * i;
-    double f[3], beyond[3];
-    int64_t at = 0;
+    double in_box[3], beyond[3];
     bool inside = true;
     for (int k = 0; k < 3; ++k) {
-      // What is not a number stays so in the fraction, and stands in the first cell.
-      const double in_box = p[k] < lower[k] ? lower[k] : p[k] > upper[k] ? upper[k] : p[k];
-      const double position = (in_box - first[k]) / voxel_size;
-      const int64_t cell = position > 0.0 ? std::min(static_cast<int64_t>(position), last[k]) : 0;
-      f[k] = position - static_cast<double>(cell);
-      beyond[k] = p[k] - in_box;
-      inside = inside && p[k] == in_box;
-      at += cell * (k == 0 ? layer : k == 1 ? row : 1);
+      in_box[k] = p[k] < lower[k] ? lower[k] : p[k] > upper[k] ? upper[k] : p[k];
+      beyond[k] = p[k] - in_box[k];
+      inside = inside && p[k] == in_box[k];  // false also for NaN
     }
+    double* gradient = gradients ? gradients->data() + 3 * i : nullptr;
     if (!inside && !occupied_outside) {
       distances.data()[i] = std::numeric_limits<double>::quiet_NaN();
+      if (gradient) std::fill_n(gradient, 3, 0.0);
       continue;
     }
-    double distance = trilinear<double, double>(grid.data() + at, layer, row, f, nullptr);
+    Interpolant at = voxels.interpolate(in_box);
     if (!inside) {
-      distance -= std::sqrt(beyond[0] * beyond[0] + beyond[1] * beyond[1] + beyond[2] * beyond[2]);
+      const double away =
+          std::sqrt(beyond[0] * beyond[0] + beyond[1] * beyond[1] + beyond[2] * beyond[2]);
+      at.value -= away;
+      for (int k = 0; k < 3; ++k) {
+        at.gradient[k] = (beyond[k] == 0.0 ? at.gradient[k] : 0.0) - beyond[k] / away;
+      }
     }
-    distances.data()[i] = distance;
+    distances.data()[i] = at.value;
+    if (gradient) std::copy_n(at.gradient, 3, gradient);
   }
 }
 
@@ -128,46 +133,27 @@ struct Vector {
 
 Vector vector(const Point& p) { return {p.data()[0], p.data()[1], p.data()[2]}; }
 
-class TimeGrid {
- public:
-  TimeGrid(const Grid& times, const Vector& lower_W, double voxel_size)
-      : times_(times.data()), lower_W_(lower_W), voxel_size_(voxel_size) {
-    for (int k = 0; k < 3; ++k) {
-      shape_[k] = static_cast<int64_t>(times.shape(k));
-      require(shape_[k] >= 2, "a grid needs at least 2 voxels along each axis");
-    }
+// The gradient at a point brought between the outermost voxel centers.
+Vector gradient(const VoxelGrid& grid, const Vector& p_WQ) {
+  double p[3] = {p_WQ.x, p_WQ.y, p_WQ.z};
+  for (int k = 0; k < 3; ++k) {
+    const double first = grid.lower_W[k] + 0.5 * grid.voxel_size;
+    const double last = first + static_cast<double>(grid.shape[k] - 1) * grid.voxel_size;
+    p[k] = std::min(std::max(first, p[k]), last);  // NaN becomes `first`
   }
-
-  // The gradient of the trilinear interpolation; differences are of single precision, as there.
-  Vector gradient(const Vector& p_WQ) const {
-    const double p[3] = {p_WQ.x, p_WQ.y, p_WQ.z};
-    const double lower[3] = {lower_W_.x, lower_W_.y, lower_W_.z};
-    int64_t cell[3];
-    double f[3];
-    for (int k = 0; k < 3; ++k) {
-      const double position = (p[k] - lower[k]) / voxel_size_ - 0.5;
-      // What is not a number stands at 0.
-      const double inside = std::min(std::max(0.0, position), static_cast<double>(shape_[k] - 1));
-      cell[k] = std::min(static_cast<int64_t>(inside), shape_[k] - 2);
-      f[k] = inside - static_cast<double>(cell[k]);
-    }
-    const int64_t row = shape_[2], layer = shape_[1] * shape_[2];
-    double slope[3];
-    trilinear<float>(times_ + cell[0] * layer + cell[1] * row + cell[2], layer, row, f, slope);
-    return Vector{slope[0], slope[1], slope[2]} / voxel_size_;
-  }
-
- private:
-  const float* times_;
-  int64_t shape_[3];
-  Vector lower_W_;
-  double voxel_size_;
-};
+  const Interpolant at = grid.interpolate(p);
+  return {at.gradient[0], at.gradient[1], at.gradient[2]};
+}
 
 size_t descend(const Grid& times, const Point& lower_W, double voxel_size, const Point& p_WG,
                const Point& p_WQ, double step, double length, const WayPoints& way) {
   require(voxel_size > 0.0 && step > 0.0, "voxels and steps need a size");
-  const TimeGrid grid(times, vector(lower_W), voxel_size);
+  VoxelGrid grid{times.data(), {}, {}, voxel_size};
+  for (int k = 0; k < 3; ++k) {
+    grid.shape[k] = static_cast<int64_t>(times.shape(k));
+    require(grid.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
+    grid.lower_W[k] = lower_W.data()[k];
+  }
   const Vector goal = vector(p_WG);
   Vector p = vector(p_WQ), direction = {0.0, 0.0, 0.0};
   double covered = 0.0;
@@ -179,7 +165,7 @@ size_t descend(const Grid& times, const Point& lower_W, double voxel_size, const
     if (!(covered < length) || distance < 1e-9) return count + 1;
     // The mean with the last direction: plain steepest descent zigzags in a valley.
     direction =
-        distance < 2.0 * step ? to_goal / distance : (direction - grid.gradient(p).unit()).unit();
+        distance < 2.0 * step ? to_goal / distance : (direction - gradient(grid, p).unit()).unit();
     const double stride = std::min(step, distance);
     p = {p.x + stride * direction.x, p.y + stride * direction.y, p.z + stride * direction.z};
     covered += stride;
@@ -202,9 +188,10 @@ void bind_grids(nb::module_& m) {
       .def("interpolate", &GridWorlds::interpolate, nb::kw_only(), "p_WQ"_a, "world"_a, "values"_a,
            "gradients"_a, "Writes the trilinear interpolants (N,) and their gradients (N, 3).");
   m.def("grid_distances", &grid_distances, nb::kw_only(), "grid"_a, "lower_W"_a, "upper_W"_a,
-        "voxel_size"_a, "occupied_outside"_a, "p_WQ"_a, "distances"_a,
-        "Writes the distances (N,) at N points: between the centres of voxels, those of the grid\n"
-        "interpolated trilinearly; outside, minus the way to the box, or NaN.");
+        "voxel_size"_a, "occupied_outside"_a, "p_WQ"_a, "distances"_a, "gradients"_a = nb::none(),
+        "Writes the distances (N,) at N points and their gradients (N, 3): between the centers of\n"
+        "voxels the trilinear interpolant of the grid; outside, minus the distance to the box, or\n"
+        "NaN with a gradient of zero.");
   m.def("descend", &descend, nb::kw_only(), "times"_a, "lower_W"_a, "voxel_size"_a, "p_WG"_a,
         "p_WQ"_a, "step"_a, "length"_a, "way"_a,
         "Writes points and the length up to them, rows (4,), down the gradient of `times` from\n"

@@ -25,7 +25,7 @@ static float interpolate(const GridWorld& grid, const float* p, float* gradient)
   }
   const size_t stride_y = static_cast<size_t>(grid.shape[2]);
   const size_t stride_x = static_cast<size_t>(grid.shape[1]) * stride_y;
-  const float value = trilinear<float>(grid.values + cell, stride_x, stride_y, f, gradient);
+  const float value = trilinear(grid.values + cell, stride_x, stride_y, f, gradient);
   for (int k = 0; k < 3; ++k) gradient[k] /= grid.voxel_size;
   return value;
 }

@@ -6,16 +6,16 @@
 namespace splatpilot {
 
 // Returns the interpolant in the cell whose lowest corner is `near`, at fractions f of the cell;
-// its gradient by f, unless null. Differences along x have the type of their own.
-template <typename Difference, typename Real>
+// its gradient by f, unless null.
+template <typename Real>
 inline __attribute__((always_inline)) Real trilinear(const float* near, size_t layer, size_t row,
                                                      const Real f[3], Real* gradient) {
   const float* far = near + layer;
-  Difference step[2][2];  // by y and z
-  Real along[2][2];       // interpolated along x
+  Real step[2][2];   // by y and z
+  Real along[2][2];  // interpolated along x
   for (size_t j = 0; j < 2; ++j) {
     for (size_t k = 0; k < 2; ++k) {
-      const Difference low = near[j * row + k];
+      const Real low = near[j * row + k];
       step[j][k] = far[j * row + k] - low;
       along[j][k] = low + f[0] * step[j][k];
     }

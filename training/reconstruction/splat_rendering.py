@@ -1,4 +1,4 @@
-"""Rendering of Gaussians or surfels for reconstruction: the two rasterisers behind one call."""
+"""Rendering of Gaussians or surfels for reconstruction."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,10 +19,10 @@ class Rendering:
     color: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) [m], accumulated, expected or median
     alpha: Tensor  # (H, W)
-    meta: dict[str, Any]  # of the rasteriser
+    meta: dict[str, Any]  # of the rasterizer
     normals: Tensor | None = None  # (H, W, 3) sum of weight and normal; surfels only
     surface_normals: Tensor | None = None  # (H, W, 3) from depth; surfels only
-    distortion: Tensor | None = None  # (H, W) [m]; surfels only, if asked for
+    distortion: Tensor | None = None  # (H, W) [m]; surfels only, if requested
 
 
 def render(
@@ -39,7 +39,7 @@ def render(
     distortion: bool = False,
     renderer: Renderer | None = None,
 ) -> Rendering:
-    """Renders colour and depth.
+    """Renders color and depth.
 
     Args:
         representation: "3dgs" or "2dgs".
@@ -47,11 +47,11 @@ def render(
         viewmat: (1, 4, 4) world to camera.
         K: (1, 3, 3) [px].
         width, height: [px].
-        background: (1, 3), black if None.
+        background: (1, 3), black by default.
         depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
-            is 0 where no surface is.
-        eps2d: of Gaussians, see `rasterize`; surfels have a blur of their own.
-        distortion: whether surfels render it.
+            is 0 without a surface.
+        eps2d: blur of Gaussians, see `rasterize`; surfels have their own.
+        distortion: whether surfels render the distortion along their rays.
         renderer: see `rasterize`.
     """
     scene = *gaussians, viewmat, K, width, height

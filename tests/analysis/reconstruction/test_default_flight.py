@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures, unseen_share
+from splatpilot.analysis.reconstruction.scene_measures import SceneMetrics, unseen_share
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
@@ -55,7 +55,7 @@ def test_a_scene_that_cannot_be_flown_in_has_no_share(write_scene):
 
 
 def test_a_flight_that_looks_mostly_into_unseen_space_is_warned_of():
-    measures = SceneMeasures(True, 8, 8, {}, {}, "", flight_unseen_fraction=0.2)
+    measures = SceneMetrics(True, 8, 8, {}, {}, "", flight_unseen_fraction=0.2)
     assert "unseen in flight       20.0%" in str(measures)
     assert "warning" not in str(measures)
     assert "warning: a flight" in str(replace(measures, flight_unseen_fraction=0.6))
