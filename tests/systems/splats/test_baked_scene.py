@@ -4,7 +4,6 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -78,7 +77,7 @@ def test_culling_by_boxes_loses_nothing(seed):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_other_colours_are_as_if_baked_anew(degree):
+def test_other_colors_equal_a_new_scene(degree):
     scene = random_scene(count=3000, sh_degree=1)
     other = replace(scene, sh=random_scene(count=3000, seed=1, sh_degree=degree).sh)
     baked = BakedScene(scene)
@@ -98,14 +97,14 @@ def test_other_colours_are_as_if_baked_anew(degree):
         ((300, 2, 3), "1, 4, 9 or 16"),
     ],
 )
-def test_colours_of_other_gaussians_are_refused(shape, message):
+def test_colors_of_other_gaussians_are_refused(shape, message):
     baked = BakedScene(random_scene(count=300))
     with pytest.raises(ValueError, match=message):
         baked.recolored(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("simd", LEVELS)
-def test_threads_and_repeats_give_equal_bits(simd):
+def test_threads_and_repeats_give_identical_views(simd):
     scene = random_scene(count=5000)
     first = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, X_WC)
     shared = BakedScene(scene, threads=3, simd=simd)
@@ -127,15 +126,7 @@ def test_threads_and_repeats_give_equal_bits(simd):
             np.testing.assert_array_equal(got, want)
 
 
-def test_views_do_not_share_memory():
-    baked = BakedScene(random_scene())
-    view = baked.render(K, WIDTH, HEIGHT, X_WC)
-    copy = view.color.copy()
-    baked.render(K, WIDTH, HEIGHT, RigidTransform(np.array([0, 0, -9.0])))
-    np.testing.assert_array_equal(view.color, copy)
-
-
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 64, 65])
+@pytest.mark.parametrize("count", [0, 15, 17, 65])
 def test_counts_that_do_not_fill_groups(count):
     scene = random_scene(count=count, sh_degree=1)
     view = BakedScene(scene).render(K, WIDTH, HEIGHT, X_WC)
@@ -156,7 +147,7 @@ def test_flat_and_needle_gaussians_keep_their_shape():
     assert np.quantile(np.abs(view.color - image[..., :3]), 0.99) < 1e-4
 
 
-def test_near_and_far_cut_by_depth_of_centre():
+def test_near_and_far_cut_by_depth_of_center():
     scene = random_scene()
     baked = BakedScene(scene)
     view = baked.render(K, WIDTH, HEIGHT, X_WC, near=2.5, far=3.0)
@@ -180,6 +171,7 @@ def test_near_and_far_cut_by_depth_of_centre():
         ({"height": -1}, "image size must be .* got 83 x -1"),
         ({"near": 0.0}, "0 < near < far"),
         ({"near": 5.0, "far": 4.0}, "depth range must be .* got 5 to 4 m"),
+        ({"max_depth": -1.0}, "max_depth must be > 0 m, got -1"),
         ({"background": (1.0, 2.0)}, r"background must be 3 finite numbers, got \[1.0, 2.0\]"),
     ],
 )
@@ -191,18 +183,6 @@ def test_bad_cameras_are_named(change, message):
     if "background" not in change:
         with pytest.raises(ValueError, match=message):
             baked.render_depth(**arguments)
-
-
-def test_a_greatest_depth_that_is_none_is_named():
-    baked = BakedScene(random_scene(count=5))
-    for render in (baked.render, baked.render_depth):
-        with pytest.raises(ValueError, match=r"max_depth must be > 0 m, got -1"):
-            render(K, WIDTH, HEIGHT, X_WC, max_depth=-1.0)
-
-
-def test_bad_thread_counts_are_named():
-    with pytest.raises(ValueError, match=r"threads must be .* got 0"):
-        BakedScene(random_scene(count=5), threads=0)
 
 
 def test_environment_selects_the_simd_level():
@@ -229,19 +209,10 @@ def test_environment_selects_the_simd_level():
     assert done.returncode != 0 and "'v9' is not available" in done.stderr
 
 
-def test_only_attributes_of_the_scene_are_needed():
-    scene = random_scene(count=50)
-    bare = SimpleNamespace(**{n: getattr(scene, n) for n in scene.__dataclass_fields__})
-    np.testing.assert_array_equal(
-        BakedScene(bare).render(K, 20, 20, X_WC).color,  # pyright: ignore[reportArgumentType]
-        BakedScene(scene).render(K, 20, 20, X_WC).color,
-    )
-
-
 @pytest.mark.parametrize("simd", LEVELS)
 @pytest.mark.parametrize("lens", [None, Distortion(model="fisheye", radial=[0.05, 0.0, 0.0, 0.0])])
 @pytest.mark.parametrize("size", [0.02, 0.3, 1.0, 6.0])
-def test_depth_alone_has_the_same_bits(simd, lens, size):
+def test_depth_alone_is_identical(simd, lens, size):
     bodies = random_scene(count=200, seed=1, sh_degree=0)
     moving = PlacedGaussians(
         *(getattr(bodies, name) for name in ("means", "quats", "scales", "opacities", "sh"))
@@ -329,7 +300,7 @@ def wall(X_CP, half_width, half_height, step=0.05):
     }
 
 
-def scene_of(*walls):
+def wall_scene(*walls):
     joined = {name: np.concatenate([w[name] for w in walls]) for name in walls[0]}
     return GaussianScene.from_colors(**joined, colors=np.full((len(joined["means"]), 3), 0.5))
 
@@ -368,7 +339,7 @@ def test_agrees_with_reference(simd, seed):
 @pytest.mark.parametrize("simd", LEVELS)
 def test_a_slanted_plane_has_the_depth_of_the_plane(simd):
     X_CP = RigidTransform(RollPitchYaw(0.9, -0.5, 0.2), [0.1, 0.2, 4.0])
-    scene = scene_of(wall(X_CP, 8.0, 8.0, step=0.1))
+    scene = wall_scene(wall(X_CP, 8.0, 8.0, step=0.1))
     view = BakedScene(scene, simd=simd).render(K_WALL, **SIZE, X_WC=RigidTransform())
     truth = plane_depth(X_CP, **SIZE)
     inside = (truth > 1.0) & (truth < 6.0)
@@ -384,7 +355,7 @@ def test_large_gaussians_close_to_the_camera_are_no_haze(simd):
     near = ~above[:, None] & (truth < 8.0)
     assert near.mean() > 0.4
     for deviation, limit in ((0.3, 0.05), (0.15, 1e-5)):
-        floor = scene_of(wall(X_CP, 12.0, 12.0, step=deviation / 0.7))
+        floor = wall_scene(wall(X_CP, 12.0, 12.0, step=deviation / 0.7))
         depth = BakedScene(floor, simd=simd).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
         assert (depth[above] == 0).all()
         assert np.median(np.abs(depth / truth - 1)[near]) < limit
@@ -392,7 +363,7 @@ def test_large_gaussians_close_to_the_camera_are_no_haze(simd):
 
 def test_a_pixel_beside_an_edge_shows_what_is_behind():
     near, far = RigidTransform([-2.0, 0, 1.0]), RigidTransform([0, 0, 6.0])
-    scene = scene_of(wall(near, 2.0, 2.0), wall(far, 8.0, 8.0, step=0.1))  # near ends at x = 0
+    scene = wall_scene(wall(near, 2.0, 2.0), wall(far, 8.0, 8.0, step=0.1))  # near ends at x = 0
     depth = BakedScene(scene).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
     error = np.minimum(np.abs(depth - 1.0), np.abs(depth - 6.0))
     assert error.max() < 1e-3
@@ -422,23 +393,6 @@ def test_half_of_the_light_decides():
     two["means"][1, 2] = 3.0
     depth = rasterize(**two, **size, render_mode="MD")[0][0, ..., 0]
     assert abs(depth[16, 16].item() - 3.0) < 1e-5 and depth[0, 0] == 0
-
-
-@pytest.mark.parametrize("simd", LEVELS)
-def test_baked_scenes_have_the_same(simd):
-    scene = random_gaussians(count=1500, seed=3, sh_degree=1)
-    names = ("means", "quats", "scales", "opacities")
-    arrays = [scene[name].numpy() for name in names]
-    baked = BakedScene(GaussianScene(*arrays, sh=scene["colors"].numpy()), simd=simd)
-    X_CW = scene["viewmats"][0].double().numpy()
-    R_CW = RotationMatrix.ProjectToRotationMatrix(X_CW[:3, :3])
-    X_WC = RigidTransform(R_CW, X_CW[:3, 3]).inverse()
-    view = baked.render(scene["Ks"][0].double().numpy(), **SIZE, X_WC=X_WC)
-    image, _, _ = rasterize(
-        **scene, **SIZE, sh_degree=1, render_mode="RGB+MD", renderer=create_renderer(1, simd)
-    )
-    difference = np.abs(view.depth - image[0, ..., 3].numpy())
-    assert np.median(difference) < 1e-5 and np.quantile(difference, 0.99) < 2e-3
 
 
 def test_it_is_constant_in_gradients():
@@ -493,7 +447,7 @@ def test_a_body_is_drawn_like_what_stands(count):
 
 
 @pytest.mark.parametrize("simd", LEVELS)
-def test_threads_change_no_bit(simd):
+def test_moving_views_are_identical_for_any_number_of_threads(simd):
     scene, body = random_scene(5000, seed=1), random_scene(3000, seed=2, sh_degree=0)
     moving = MovingGaussians([body], lambda time: np.array([[0.0, 0.0, 0.5]]))
     nowhere = MovingGaussians([body], lambda time: np.full((1, 3), np.inf))
