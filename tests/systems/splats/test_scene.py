@@ -2,11 +2,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from reference_harmonics import evaluate_sh
+from scipy.special import sph_harm_y
 
-from splatpilot.systems.splats.scene import C0, GaussianScene
+from splatpilot.systems.splats.scene import (
+    C0,
+    GaussianScene,
+    choose_origin,
+    harmonic_degree,
+    sh_basis,
+    sh_rotations,
+)
+
+
+def evaluate_sh(sh: Any, directions: Any) -> np.ndarray:
+    """Returns the sum over the basis (..., 3) of coefficients (..., K, 3)."""
+    sh = np.asarray(sh, dtype=np.float64)
+    basis = sh_basis(directions, harmonic_degree(sh.shape[-2]))
+    return np.einsum("...k,...kc->...c", basis, sh)
 
 
 def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:
@@ -31,7 +47,6 @@ def covariances(scene: GaussianScene) -> np.ndarray:
 
 
 def test_arrays_are_float32_contiguous_with_unit_quaternions():
-    """Whatever comes in, float32 contiguous arrays with normalised quaternions are kept."""
     arrays = random_arrays()
     arrays["means"] = np.asfortranarray(arrays["means"])
     scene = GaussianScene(**arrays)
@@ -44,14 +59,12 @@ def test_arrays_are_float32_contiguous_with_unit_quaternions():
 
 
 def test_tiny_quaternions_are_normalised():
-    """A quaternion of length 1e-6 is a rotation like any other."""
     arrays = random_arrays()
     scene = GaussianScene(**arrays | {"quats": (arrays["quats"] * 1e-6).astype(np.float32)})
     np.testing.assert_allclose(scene.quats, GaussianScene(**arrays).quats, atol=1e-6)
 
 
 def test_from_colors_gives_those_colors_from_everywhere():
-    """A scene made from colours shows them in every direction."""
     arrays = random_arrays()
     del arrays["sh"]
     colors = np.random.default_rng(1).uniform(size=(6, 3))
@@ -64,18 +77,17 @@ def test_from_colors_gives_those_colors_from_everywhere():
 @pytest.mark.parametrize(
     ("name", "index", "value", "message"),
     [
-        ("means", (3, 1), np.nan, r"means\[3, 1\] = nan must be finite \(1 of 6"),
-        ("sh", (2, 0, 1), np.inf, r"sh\[2, 0, 1\] = inf must be finite"),
-        ("scales", (1, 2), 0.0, r"scales\[1, 2\] = 0\.0 must be > 0 m"),
-        ("scales", (1, 2), -0.5, r"scales\[1, 2\] = -0\.5 must be > 0 m.*exponential"),
-        ("scales", (4, 0), np.inf, r"scales\[4, 0\] = inf must be finite"),
-        ("opacities", (5,), 0.0, r"opacities\[5\] = 0\.0 must be in \(0, 1\].*sigmoid"),
-        ("opacities", (0,), 1.5, r"opacities\[0\] = 1\.5 must be in \(0, 1\]"),
-        ("quats", (2,), 0.0, r"quats\[2\] = .* must not be zero.*\(1, 0, 0, 0\)"),
+        ("means", (3, 1), np.nan, r"means\[3, 1\] must be finite, got nan \(1 of 6"),
+        ("sh", (2, 0, 1), np.inf, r"sh\[2, 0, 1\] must be finite, got inf"),
+        ("scales", (1, 2), 0.0, r"scales\[1, 2\] must be > 0 m, got 0\.0"),
+        ("scales", (1, 2), -0.5, r"scales\[1, 2\] must be > 0 m, got -0\.5.*exponential"),
+        ("scales", (4, 0), np.inf, r"scales\[4, 0\] must be finite, got inf"),
+        ("opacities", (5,), 0.0, r"opacities\[5\] must be in \(0, 1\], got 0\.0.*sigmoid"),
+        ("opacities", (0,), 1.5, r"opacities\[0\] must be in \(0, 1\], got 1\.5"),
+        ("quats", (2,), 0.0, r"quats\[2\] must be of a length > 0.*\(1, 0, 0, 0\)"),
     ],
 )
 def test_bad_values_are_named(name, index, value, message):
-    """A bad value is refused with array, index, value, limit and remedy."""
     arrays = random_arrays()
     arrays[name][index] = value
     with pytest.raises(ValueError, match=message):
@@ -83,20 +95,18 @@ def test_bad_values_are_named(name, index, value, message):
 
 
 def test_wrong_shapes_and_lengths_are_refused():
-    """Arrays of the wrong shape, of different lengths and of an odd number of SH are refused."""
     arrays = random_arrays()
-    with pytest.raises(ValueError, match=r"quats has shape \(6, 3\), expected \(N, 4\)"):
+    with pytest.raises(ValueError, match=r"quats must be of shape \(N, 4\), got \(6, 3\)"):
         GaussianScene(**arrays | {"quats": arrays["means"]})
-    with pytest.raises(ValueError, match=r"sh has shape \(6, 4\), expected \(N, K, 3\)"):
+    with pytest.raises(ValueError, match=r"sh must be of shape \(N, K, 3\), got \(6, 4\)"):
         GaussianScene(**arrays | {"sh": np.zeros((6, 4), np.float32)})
-    with pytest.raises(ValueError, match=r"different lengths .*means 6.*scales 5"):
+    with pytest.raises(ValueError, match=r"of one length.*'means': 6.*'scales': 5"):
         GaussianScene(**arrays | {"scales": arrays["scales"][:5]})
-    with pytest.raises(ValueError, match="5 spherical-harmonic coefficients"):
+    with pytest.raises(ValueError, match="1, 4, 9 or 16, got 5"):
         GaussianScene(**arrays | {"sh": np.zeros((6, 5, 3), np.float32)})
 
 
 def test_transform_moves_points_shapes_and_view_dependence():
-    """A moved scene has moved centres, rotated covariances, and looks the same from moved eyes."""
     scene = GaussianScene(**random_arrays(K=16))
     X_WO = RigidTransform(RollPitchYaw(0.4, -1.1, 2.3), np.array([1.0, -2.0, 3.0]))
     moved = scene.transformed_by(X_WO)
@@ -113,7 +123,6 @@ def test_transform_moves_points_shapes_and_view_dependence():
 
 
 def test_transform_there_and_back_is_the_identity():
-    """Moving by X and by its inverse gives the scene back."""
     scene = GaussianScene(**random_arrays(K=9))
     X = RigidTransform(RollPitchYaw(1, 2, 3), np.array([0.5, 0.25, -1.0]))
     back = scene.transformed_by(X).transformed_by(X.inverse())
@@ -123,7 +132,6 @@ def test_transform_there_and_back_is_the_identity():
 
 
 def test_scaled_scene_has_all_lengths_times_the_factor():
-    """Centres and deviations grow; what is seen of them from eyes that moved along does not."""
     scene = GaussianScene(**random_arrays(K=9))
     scaled = scene.scaled_by(2.5)
     np.testing.assert_allclose(scaled.means, 2.5 * scene.means, rtol=1e-6)
@@ -133,7 +141,6 @@ def test_scaled_scene_has_all_lengths_times_the_factor():
 
 
 def test_merge_places_the_other_scene_and_pads_the_lower_degree():
-    """Merging keeps the first scene as it is and puts the other, zero padded, at X_WO."""
     first = GaussianScene(**random_arrays(N=3, K=9))
     other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
     X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
@@ -149,3 +156,87 @@ def test_merge_places_the_other_scene_and_pads_the_lower_degree():
     reverse = other.merged_with(first)
     np.testing.assert_array_equal(reverse.means, np.concatenate([other.means, first.means]))
     assert reverse.sh_degree == 2
+
+
+def random_directions(count: int, seed: int = 0) -> np.ndarray:
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def test_basis_is_the_real_part_of_the_complex_harmonics():
+    d = random_directions(200)
+    polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
+    columns = []
+    for degree in range(4):
+        for m in range(-degree, degree + 1):
+            Y = sph_harm_y(degree, abs(m), polar, azimuth)
+            columns.append(Y.real if m == 0 else np.sqrt(2) * (Y.real if m > 0 else Y.imag))
+    np.testing.assert_allclose(sh_basis(d, 3), np.stack(columns, axis=-1), atol=1e-14)
+
+
+def test_basis_keeps_the_published_signs():
+    x, y, z = random_directions(1)[0]
+    expected = [0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x, 1.09254843 * x * y]
+    np.testing.assert_allclose(sh_basis([x, y, z], 3)[:5], expected, rtol=1e-7)
+
+
+def test_constant_coefficient_is_direction_independent():
+    np.testing.assert_allclose(
+        evaluate_sh([[[1.0, 2.0, 3.0]]], random_directions(9)), C0 * np.tile([1, 2, 3], (9, 1))
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    rpy=st.tuples(*[st.floats(-7, 7)] * 3),
+    degree=st.integers(0, 3),
+    seed=st.integers(0, 2**16),
+)
+def test_rotated_coefficients_describe_the_rotated_function(rpy, degree, seed):
+    R_WO = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
+    sh_O = np.random.default_rng(seed).normal(size=((degree + 1) ** 2, 3))
+    matrices = sh_rotations(R_WO, degree)
+    sh_W = np.concatenate(
+        [M @ sh_O[k * k : (k + 1) ** 2] for k, M in zip(range(degree + 1), matrices, strict=True)]
+    )
+    d_W = random_directions(20, seed)
+    d_O = d_W @ R_WO
+    np.testing.assert_allclose(evaluate_sh(sh_W, d_W), evaluate_sh(sh_O, d_O), atol=1e-12)
+    for M in matrices:
+        np.testing.assert_allclose(M @ M.T, np.eye(len(M)), atol=1e-12)
+
+
+def test_degree_of_counts():
+    assert [harmonic_degree(K) for K in (1, 4, 9, 16)] == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="1, 4, 9 or 16, got 5"):
+        harmonic_degree(5)
+    with pytest.raises(ValueError, match="0 to 3, got 4"):
+        sh_basis([0, 0, 1], 4)
+
+
+NEAR = np.random.default_rng(0).normal(size=(100, 3))
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "moves"),
+    [
+        (1.0, 900.0, False),
+        (1.0, 1100.0, True),
+        (1000.0, 900.0, False),  # as large as it is far
+        (1e-3, 0.9, False),
+        (1e-3, 5.0, True),  # in units of kilometers
+        (0.0, 900.0, False),
+        (0.0, 1100.0, True),
+    ],
+)
+def test_origin_moves_to_what_is_far(scale, offset, moves):
+    positions = scale * NEAR + [offset, 0, 0]
+    origin = choose_origin(positions)
+    assert origin.any() == moves
+    if moves:
+        assert np.linalg.norm(np.median(positions - origin, axis=0)) <= 1
+
+
+def test_origin_is_in_whole_meters():
+    origin = choose_origin(5 * NEAR + [456789.3, 812345.6, -283.1])
+    np.testing.assert_array_equal(origin, np.round(origin))

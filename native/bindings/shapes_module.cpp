@@ -1,11 +1,25 @@
-// Python bindings of worlds of analytic shapes.
+// Python bindings of worlds of analytic shapes, and of one in double precision.
+#include <nanobind/stl/optional.h>
+
+#include <cstdint>
+#include <limits>
+#include <optional>
+
 #include "bindings/casting_bindings.hpp"
+
+// The distances below are compiled for every machine.
+#define SIMD_LEVEL baseline
+#include "fields/shape_distances.hpp"
 
 namespace splatpilot {
 namespace {
 
 using namespace nb::literals;
 using Rows = Floats<nb::shape<-1, kShapeSize>>;
+using DoubleRows = Doubles<nb::shape<-1, kShapeSize>>;
+using QueryPoints = Doubles<nb::shape<-1, 3>>;
+using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Gradients = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Kinds = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // Centre and half size along each axis of what encloses a body, a little more than needed.
@@ -123,9 +137,90 @@ class ShapeWorlds : Casting {
   size_t most_bodies_ = 0;
 };
 
+constexpr size_t kNone = SIZE_MAX;  // in place of a shape
+constexpr size_t kBatch = 512;      // of points, which share their candidates for the nearest shape
+
+class ShapeField {
+ public:
+  ShapeField(const DoubleRows& shapes, const Kinds& kinds)
+      : rows_(shapes.data(), shapes.data() + shapes.size()),
+        kinds_(kinds.data(), kinds.data() + kinds.size()) {
+    require(kinds.size() == shapes.shape(0), "the kinds of shapes differ in number from them");
+    for (const uint8_t kind : kinds_) require(kind < kShapeKinds, "a shape is of no known kind");
+  }
+
+  void nearest(const QueryPoints& p, const Distances& distances,
+               const std::optional<Gradients>& gradients) const {
+    const size_t count = p.shape(0);
+    require(distances.size() == count && (!gradients || gradients->shape(0) == count),
+            "points, distances and gradients differ in number");
+    const nb::gil_scoped_release release;
+    std::vector<size_t> shapes(kBatch);
+    std::vector<double> at_center(kinds_.size());
+    for (size_t first = 0; first < count; first += kBatch) {
+      const size_t batch = std::min(kBatch, count - first);
+      nearest_of_batch(p.data() + 3 * first, batch, distances.data() + first, shapes.data(),
+                       at_center);
+      if (!gradients) continue;
+      for (size_t i = 0; i < batch; ++i) {
+        double* gradient = gradients->data() + 3 * (first + i);
+        const size_t shape = shapes[i];
+        if (shape == kNone) {
+          std::fill_n(gradient, 3, 0.0);
+        } else {
+          distance(shape, p.data() + 3 * (first + i), gradient);
+        }
+      }
+    }
+  }
+
+ private:
+  double distance(size_t shape, const double* p, double* gradient = nullptr) const {
+    const double* row = rows_.data() + shape * kShapeSize;
+    return SIMD_LEVEL::shape_distance(kinds_[shape], row, p, gradient);
+  }
+
+  // Distances are 1-Lipschitz: within R of a centre c the nearest shape is at most min d(c) + R
+  // away, so a shape with d(c) > min d(c) + 2 R is nowhere the nearest.
+  void nearest_of_batch(const double* p, size_t count, double* distances, size_t* shapes,
+                        std::vector<double>& at_center) const {
+    double lower[3], upper[3], center[3], span[3];
+    for (int k = 0; k < 3; ++k) {
+      lower[k] = upper[k] = p[k];
+      for (size_t i = 1; i < count; ++i) {
+        lower[k] = std::min(lower[k], p[3 * i + k]);
+        upper[k] = std::max(upper[k], p[3 * i + k]);
+      }
+      center[k] = 0.5 * (lower[k] + upper[k]);
+      span[k] = upper[k] - lower[k];
+    }
+    double least = std::numeric_limits<double>::infinity();
+    for (size_t shape = 0; shape < kinds_.size(); ++shape) {
+      at_center[shape] = distance(shape, center);
+      least = std::min(least, at_center[shape]);
+    }
+    const double limit = least + SIMD_LEVEL::length(span) + 1e-9;
+    std::fill_n(distances, count, std::numeric_limits<double>::infinity());
+    std::fill_n(shapes, count, kNone);
+    for (size_t shape = 0; shape < kinds_.size(); ++shape) {
+      if (at_center[shape] > limit) continue;  // keeps all where a point is not finite
+      for (size_t i = 0; i < count; ++i) {
+        const double d = distance(shape, p + 3 * i);
+        if (d < distances[i]) {
+          distances[i] = d;
+          shapes[i] = shape;
+        }
+      }
+    }
+  }
+
+  std::vector<double> rows_;
+  std::vector<uint8_t> kinds_;
+};
+
 }  // namespace
 
-void bind_shape_worlds(nb::module_& m) {
+void bind_shapes(nb::module_& m) {
   nb::class_<ShapeWorlds>(m, "ShapeWorlds", "The analytic shapes of several worlds.")
       .def(nb::init<const Rows&, const Kinds&, const Numbers&, int, const std::string&>(),
            nb::kw_only(), "shapes"_a, "kinds"_a, "first"_a, "threads"_a = 1, "simd"_a = "",
@@ -139,6 +234,13 @@ void bind_shape_worlds(nb::module_& m) {
       .def("nearest", &ShapeWorlds::nearest, nb::kw_only(), "p_WQ"_a, "world"_a, "values"_a,
            "gradients"_a,
            "Writes the distances (N, K) of the K nearest shapes and their gradients (N, K, 3).");
+  nb::class_<ShapeField>(m, "ShapeField", "The distance field of analytic shapes.")
+      .def(nb::init<const DoubleRows&, const Kinds&>(), nb::kw_only(), "shapes"_a, "kinds"_a,
+           "Rows and kinds as of `ShapeWorlds`.")
+      .def("nearest", &ShapeField::nearest, nb::kw_only(), "p_WQ"_a, "distances"_a,
+           "gradients"_a = nb::none(),
+           "Writes the signed distances (N,) of N points to the nearest shape and their gradients\n"
+           "(N, 3); infinite and zero where there is no shape.");
 }
 
 }  // namespace splatpilot
