@@ -48,7 +48,7 @@ from splatpilot.systems.common.files import (
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_archive, read_text, reason_of, require_shallow
+from splatpilot.systems.common.readers import read_archive, read_text, reason_of
 
 FORMAT_VERSION = 1
 
@@ -133,7 +133,6 @@ class StudyFolder:
                 "has written"
             )
         text = read_text(file)
-        require_shallow(text, str(file))
         try:
             described = yaml.safe_load(text)
             version = described["format_version"]

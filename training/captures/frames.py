@@ -27,7 +27,6 @@ from splatpilot.systems.common.readers import (
     read_text,
     reason_of,
     require_readable_size,
-    require_whole_chunks,
 )
 from splatpilot.training.captures.capture import (
     Capture,
@@ -234,9 +233,7 @@ def _clean(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _decode(file: Path, flags: int) -> NDArray:
-    content = file.read_bytes()
-    require_whole_chunks(file, content)
-    raw = np.frombuffer(content, np.uint8)
+    raw = np.frombuffer(file.read_bytes(), np.uint8)
     try:
         image = cv2.imdecode(raw, flags) if len(raw) else None
     except cv2.error:  # more pixels than OpenCV decodes
