@@ -29,7 +29,7 @@ from .systems.vehicle.quadrotor_state import QuadrotorState
 from .systems.vehicle.state_to_pose import StateToPose
 from .training.captures.capture import Capture
 from .training.captures.read_capture import read_capture, register_capture
-from .training.policies.registry import register_trainer
+from .training.policies.trainer_registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [

@@ -368,7 +368,7 @@ def flatness_commands(
         params: of the vehicles.
         heading: (N,) [rad], where they look; None: along their velocity.
     """
-    xp = _namespace(state)
+    xp = array_namespace(state)
     _, v, q_WB, _ = QuadrotorState.of(state)
     f = a_WB + params.drag * v
     level, lift = f[:, :2], (f[:, 2:] + params.gravity).clip(min=control.min_thrust)
@@ -401,7 +401,7 @@ def flatness_commands(
 def headings_and_pulls(v: Any, control: FlatnessControllerConfig, heading: Any) -> tuple[Any, Any]:
     """Where to look (N,) [rad], `heading` or along the velocity v (N, 3), and how strongly (N,),
     0 to 1."""
-    xp = _namespace(v)
+    xp = array_namespace(v)
     if heading is not None:
         return heading, xp.ones_like(heading)
     pull = (lengths(v[:, :2])[:, 0] / control.yaw_speed).clip(max=1.0)
@@ -410,7 +410,7 @@ def headings_and_pulls(v: Any, control: FlatnessControllerConfig, heading: Any) 
 
 def attitudes_from_thrust(f: Any, yaw: Any) -> Any:
     """R_WB (N, 3, 3) with z along f (N, 3), upwards, and x above the direction of yaw (N,)."""
-    xp = _namespace(f)
+    xp = array_namespace(f)
     z = unit_vectors(f)
     cos, sin = xp.cos(yaw), xp.sin(yaw)
     x = xp.stack([cos * z[:, 2], sin * z[:, 2], -sin * z[:, 1] - cos * z[:, 0]], 1)
@@ -420,7 +420,7 @@ def attitudes_from_thrust(f: Any, yaw: Any) -> Any:
 
 def rotation_matrices(q: Any) -> Any:
     """The rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz of any length."""
-    xp = _namespace(q)
+    xp = array_namespace(q)
     w, x, y, z = unit_vectors(q).T
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -432,7 +432,7 @@ def rotation_matrices(q: Any) -> Any:
 
 def lengths(vectors: Any) -> Any:
     """Lengths (N, 1) of vectors (N, n); of tensors with gradient zero where they are zero."""
-    xp = _namespace(vectors)
+    xp = array_namespace(vectors)
     if xp is np:
         return np.sqrt((vectors * vectors).sum(1, keepdims=True))
     return xp.linalg.vector_norm(vectors, dim=1, keepdim=True)
@@ -445,14 +445,14 @@ def unit_vectors(vectors: Any) -> Any:
 
 def _cross(a: Any, b: Any) -> Any:
     """a x b, (N, 3) each; numpy's own costs ten times as much on few."""
-    xp = _namespace(a)
+    xp = array_namespace(a)
     if xp is not np:
         return xp.linalg.cross(a, b)
     (a1, a2, a3), (b1, b2, b3) = a.T, b.T
     return np.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], 1)
 
 
-def _namespace(array: Any) -> ModuleType:
+def array_namespace(array: Any) -> ModuleType:
     """The module whose functions an array takes: numpy or torch."""
     torch = sys.modules.get("torch")  # A tensor can only come from a torch already imported.
     return torch if torch is not None and isinstance(array, torch.Tensor) else np
