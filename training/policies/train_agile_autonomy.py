@@ -26,6 +26,8 @@ from splatpilot.systems.common.validation import bounded, require_field
 from splatpilot.systems.policies.agile_autonomy import (
     AGILE_NETWORK,
     FOV_X,
+    MAX_DEPTH,
+    MIN_DEPTH,
     MODES,
     PROGRESS,
     RATE,
