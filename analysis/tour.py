@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction import run as reconstruction
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import METRICS
+from splatpilot.analysis.reconstruction.measure_scene import METRICS, measure_scene
 from splatpilot.diagrams.flight import fly
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata

@@ -95,7 +95,7 @@ def test_wrong_shards_are_refused(study, shards, tmp_path):
     refused(f"{first} and {copy('again')} are both shard 1/2", first, tmp_path / "again")
     refused("its number of shards is None, not 2", first, whole)
     refused("is a study flown whole", whole)
-    refused("there is no such file; a study is a folder", first, tmp_path / "nowhere")
+    refused("a study is a folder", first, tmp_path / "nowhere")
     for name, old, new, message in (
         ("foreign", "seeds: 3", "seeds: 4", "another study than .*: its seeds is 4, not 3"),
         ("older", "numpy: ", "numpy: 0", "its numpy is 0"),
