@@ -20,7 +20,7 @@ from harness import header, machine, row
 from torch import Tensor
 from torch_geometry import TorchGeometry
 
-from splatpilot.diagrams.worlds.world_registry import make_blueprint
+from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.common.seeds import first_training_seed
 from splatpilot.training.corpus.library import world_of
 from splatpilot.training.policies.evaluation import render_depth
@@ -53,8 +53,7 @@ def in_turns(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, f
 def with_torch(worlds: WorldBatch, kinds: list[str]) -> WorldBatch:
     """The same worlds with casting in torch."""
     plans = [
-        make_blueprint(world_of(kinds[i % len(kinds)]), first_training_seed(0) + i)
-        for i in range(COUNT)
+        make_spec(world_of(kinds[i % len(kinds)]), first_training_seed(0) + i) for i in range(COUNT)
     ]
     other = copy(worlds)
     other.geometry = TorchGeometry(

@@ -18,8 +18,7 @@ from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.commands.options import SCENARIOS
 from splatpilot.analysis.faults.campaign import FaultsConfig
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
-from splatpilot.analysis.places import PlaceConfig
-from splatpilot.analysis.tour import TourConfig
+from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -41,8 +40,7 @@ IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 CONFIGS: dict[str, Any] = {
     "reconstruct": ReconstructConfig,
     "ablate": ReconstructConfig,
-    "tour": TourConfig,
-    "places": PlaceConfig,
+    "places": RenderedSceneConfig,
     "fidelity": FidelityConfig,
     "px4": Px4Config,
     "faults": FaultsConfig,

@@ -27,7 +27,7 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import dump_config, parse_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.registry import import_modules
-from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, way_lengths
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, path_lengths
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 _JERK_STRIDE = 5
@@ -90,7 +90,7 @@ def shortest_length(lengths: TimeOfArrival, p_WS: np.ndarray, goal_radius: float
     a path.
 
     Args:
-        lengths: of the paths to the goal, `way_lengths`.
+        lengths: of the paths to the goal, `path_lengths`.
         p_WS: start.
         goal_radius: [m].
     """
@@ -256,7 +256,7 @@ def _world(described: _Described, seed: int) -> World:
 @functools.lru_cache(maxsize=2)
 def _lengths_to(world: World, p_WG: tuple[float, ...]) -> TimeOfArrival:
     field = world.esdf if world.esdf.occupied_outside else world.esdf.conservative()
-    return way_lengths(field, np.array(p_WG))
+    return path_lengths(field, np.array(p_WG))
 
 
 def _way_lengths(world: World, scenario: Scenario) -> TimeOfArrival:

@@ -10,7 +10,6 @@ from pathlib import Path
 from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.report import write_report
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
-from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import SCENARIO, RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
@@ -99,7 +98,6 @@ def run(
     out: Path,
     jobs: int | None = None,
     cluster: str | None = None,
-    shard: Shard | None = None,
 ) -> list[Row]:
     """
     Flies the missing flights of a study, and writes tables and report; for the files, see
@@ -114,10 +112,9 @@ def run(
         out: its folder.
         jobs: worker processes; one for each core by default.
         cluster: address of a dask scheduler to use instead.
-        shard: part of the study to fly, for a later merge.
 
     Returns:
-        The rows of `table.csv`; none of a shard.
+        The rows of `table.csv`.
 
     Raises:
         ValueError: for an invalid study, another one in `out`, or a `Fault`.
@@ -125,18 +122,17 @@ def run(
     """
     require(jobs is None or jobs >= 1, "--jobs", "at least 1", jobs)
     scenarios = config.load_scenarios()
-    share = config.rollouts() if shard is None else shard.of(config.rollouts())
-    names = {spec.scenario for spec in share}
+    names = {spec.scenario for spec in config.rollouts()}
     absent = absent_scenes({name: scenarios[name] for name in scenarios if name in names})
-    specs = [spec for spec in share if spec.scenario not in absent]
-    if not specs and shard is None:
+    specs = [spec for spec in config.rollouts() if spec.scenario not in absent]
+    if not specs:
         raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
     flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
     if config.split == "test":
         require_test_scenes(flyable)
     folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
     flown_by |= input_digests(config, scenarios)
-    folder.claim(config, flown_by, shard)
+    folder.claim(config, flown_by)
     keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")
@@ -163,10 +159,6 @@ def run(
     flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
     with closing(flights):
         _keep(folder, flights, rows, len(specs))
-    if shard is not None:
-        print(f"Wrote the {len(specs)} flights of shard {shard} in {out}; join all shards with")
-        print("`splatpilot merge OUT SHARD...`")
-        return []
     return conclude(folder, config, [rows[spec.id] for spec in specs], absent, damaged)
 
 

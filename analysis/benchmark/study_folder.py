@@ -1,6 +1,6 @@
 """A study on disk.
 
-    study.yaml       the study, and the program that flies it; of a shard, which it is
+    study.yaml       the study, and the program that flies it
     scenarios/       with all fields
     scenes/          reconstructed scenes of the scenarios
     weights/         of policies that were given as files, by label
@@ -27,13 +27,13 @@ import numpy as np
 import yaml
 
 from splatpilot.analysis.benchmark.rollout import ARRAYS, INFEASIBLE, Fault, Rollout
-from splatpilot.analysis.benchmark.shard import Shard
 from splatpilot.analysis.benchmark.study import SCENARIO, RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.worlds.scene_folder import (
+    CAPTURE,
     ENVIRONMENT,
     FRONTIER,
     SceneSource,
@@ -70,16 +70,13 @@ class StudyFolder:
         """Returns the file of a flight."""
         return self.path / "rollouts" / f"{id}.npz"
 
-    def claim(
-        self, config: StudyConfig, program: dict[str, str], shard: Shard | None = None
-    ) -> None:
+    def claim(self, config: StudyConfig, program: dict[str, str]) -> None:
         """
         Creates the folder, or checks that it is of the same study.
 
         Args:
             config: of the study.
             program: `provenance.program()` and `foreign_code`.
-            shard: part of the study; all of it by default.
 
         Raises:
             ValueError: if the folder holds something else.
@@ -90,8 +87,6 @@ class StudyFolder:
             "study": yaml.safe_load(dump_config(config)),
             "program": program,
         }
-        if shard is not None:
-            described["shard"] = str(shard)
         if (self.path / "study.yaml").is_file():
             self._check_same(described)
         else:
@@ -124,11 +119,6 @@ class StudyFolder:
                     f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
                     "another folder, or the same study"
                 )
-        parts = [f"shard {d['shard']}" if "shard" in d else "all" for d in (there, described)]
-        if parts[0] != parts[1]:
-            raise ValueError(
-                f"{self.path} holds {parts[0]} of this study, not {parts[1]}; choose another folder"
-            )
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
@@ -148,7 +138,7 @@ class StudyFolder:
                 f"{file}: format version {version}, this program knows {FORMAT_VERSION}; use the "
                 "version of the program that made the study"
             )
-        for name, kind in (("study", dict), ("program", dict), ("shard", str | None)):
+        for name, kind in (("study", dict), ("program", dict)):
             if not isinstance(described.get(name), kind):
                 raise ValueError(
                     f"{file} is not a study: {name} is {described.get(name)!r:.80}; restore the "
@@ -174,11 +164,6 @@ class StudyFolder:
     def program(self) -> dict[str, str]:
         """Reads the program of `claim` or `keep_program`."""
         return self._described()["program"]
-
-    def shard(self) -> Shard | None:
-        """Reads which part of the study is flown here; None for all of it."""
-        text = self._described().get("shard")
-        return None if text is None else Shard.parse(text)
 
     def write(self, rollout: Rollout) -> None:
         """Writes a flight."""
@@ -405,7 +390,8 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
     if not kept.exists():
         if scene.is_dir():
             with folder_written_atomically(kept) as partial:
-                shutil.copytree(scene, partial, dirs_exist_ok=True)
+                own = shutil.ignore_patterns(CAPTURE)
+                shutil.copytree(scene, partial, dirs_exist_ok=True, ignore=own)
         else:
             with written_atomically(kept) as partial:
                 shutil.copyfile(scene, partial)

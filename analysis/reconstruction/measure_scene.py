@@ -343,7 +343,7 @@ def unseen_fraction(scene: Path) -> float | None:
     camera = MakeCamera(Scenario(), replace(world, gaussians=seen, background=(0.0, 0.0, 0.0)))
     # Points beyond the goal are the goal, without direction.
     reach = float(toa.value(world.p_WS))  # [m] at 1 m/s, at least the length of the route
-    points, directions = toa.way(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
+    points, directions = toa.path(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
     before = np.flatnonzero(np.linalg.norm(directions[:, :2], axis=1) > 0.0)
     chosen = before[np.linspace(0, len(before) - 1, _POSES).astype(int)]
     fractions = []

@@ -1,19 +1,60 @@
-"""`splatpilot reconstruct`: a capture becomes a scene folder with metrics."""
+"""From a capture, a mesh or a generated world to a measured scene folder."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction.measure_scene import VIEWS, SceneMetrics, measure_scene
-from splatpilot.diagrams.worlds.scene_folder import check_scene_target, read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import CAPTURE, check_scene_target, read_scene_metadata
 from splatpilot.systems.common.files import held_folder, require_unused
 from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
+from splatpilot.systems.common.validation import bounded
+from splatpilot.training.captures import render as render_capture
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.check import doubts
+from splatpilot.training.captures.render import RenderConfig
 from splatpilot.training.reconstruction.checkpoint import kept_work, work_folder
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, reconstruct
+
+
+@dataclass
+class RenderedSceneConfig(ReconstructConfig):
+    """How a mesh or a generated world is captured and reconstructed."""
+
+    render: RenderConfig = field(default_factory=lambda: RenderConfig(spacing=0.8, apart=4.0))
+    voxel_size: float = bounded(0.1, "[0, inf) m")
+    """[m], of the distance field; the planner searches a hall in seconds."""
+
+    def reconstruct(self) -> ReconstructConfig:
+        """Returns the part of the reconstruction."""
+        return ReconstructConfig(
+            **{each.name: getattr(self, each.name) for each in fields(ReconstructConfig)}
+        )
+
+
+def run_rendered(
+    *,
+    world: str | Path,
+    out: str | Path,
+    config: RenderedSceneConfig,
+    seed: int = 0,
+    restart: bool = False,
+    overwrite: bool = False,
+) -> tuple[ReconstructSummary, SceneMetrics]:
+    """Renders a mesh or a scenario's generated world to `out/capture` and makes the scene `out` of
+    it; see `render_capture.run` and `run`. A capture of the same settings is used again."""
+    check_scene_target(out)
+    capture = Path(out) / CAPTURE
+    render_capture.run(world=world, out=capture, config=config.render, seed=seed)
+    return run(
+        capture=capture,
+        out=out,
+        config=config.reconstruct(),
+        restart=restart,
+        overwrite=overwrite,
+    )
 
 
 def run(
@@ -38,7 +79,7 @@ def run(
     if (out / VIEWS).exists():
         require_unused(out, overwrite)
     opened = read_capture(capture, config.capture)
-    if not _is_unmeasured(out, opened):
+    if (out / "scene.yaml").is_file() and not _is_unmeasured(out, opened):
         require_unused(out, overwrite)
     doubted = doubts(opened)
     for doubt in doubted:  # at once, and again in the summary
@@ -56,7 +97,7 @@ def run(
 
 def _is_unmeasured(scene: Path, capture: Capture) -> bool:
     """Tells whether an interrupted run left this scene of the capture without metrics."""
-    if not (scene / "scene.yaml").is_file() or (scene / VIEWS).exists():
+    if (scene / VIEWS).exists():
         return False
     metadata = read_scene_metadata(scene)
     source = metadata.capture, metadata.capture_settings

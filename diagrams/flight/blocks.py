@@ -90,8 +90,8 @@ def AddPilot(
     builder.AddNamedSystem("controller", controller)
     require_ports("controller", controller, inputs=["state"], outputs=["command"])
 
-    builder.Connect(state, pose.state_input_port())
-    builder.Connect(state, collision.state_input_port())
+    builder.Connect(state, pose.GetInputPort("state"))
+    builder.Connect(state, collision.GetInputPort("state"))
     decision = _ConnectDecision(builder, scenario, state, policy, controller, guarded)
     builder.Connect(state, controller.GetInputPort("state"))
 
@@ -103,7 +103,7 @@ def AddPilot(
     for system, names in exported.items():
         for name in names:
             builder.ExportOutput(system.GetOutputPort(name), name)
-    return Pilot(policy, controller, pose.pose_output_port(), decision)
+    return Pilot(policy, controller, pose.GetOutputPort("pose"), decision)
 
 
 def ConnectObservation(
@@ -152,9 +152,9 @@ def _ConnectDecision(
         count = num_hypotheses_in(hypotheses.size())
         selector = HypothesisSelector(count, scenario.controller.lookahead)
         builder.AddNamedSystem("selector", selector)
-        builder.Connect(hypotheses, selector.hypotheses_input_port())
-        builder.Connect(state, selector.state_input_port())
-        decision = selector.waypoint_output_port()
+        builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
+        builder.Connect(state, selector.GetInputPort("state"))
+        decision = selector.GetOutputPort("waypoint")
     else:
         kinds = [
             kind for kind in ("acceleration", "velocity", "waypoint") if policy.HasOutputPort(kind)
@@ -169,15 +169,15 @@ def _ConnectDecision(
     if guarded:
         finite = FiniteVector(decision.size())
         builder.AddNamedSystem("finite_decision", finite)
-        builder.Connect(decision, finite.signal_input_port())
-        flown = finite.finite_output_port()
+        builder.Connect(decision, finite.GetInputPort("signal"))
+        flown = finite.GetOutputPort("finite")
     kind = decision.get_name()
     if decision.get_name() == "velocity":
         tracker = VelocityTracker()
         builder.AddNamedSystem("velocity_tracker", tracker)
-        builder.Connect(state, tracker.state_input_port())
-        connect(builder, flown, tracker.velocity_input_port())
-        flown = tracker.acceleration_output_port()
+        builder.Connect(state, tracker.GetInputPort("state"))
+        connect(builder, flown, tracker.GetInputPort("velocity"))
+        flown = tracker.GetOutputPort("acceleration")
         kind = "acceleration"
     require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
     connect(builder, flown, controller.GetInputPort(kind))
@@ -186,8 +186,8 @@ def _ConnectDecision(
         if guarded:
             finite = FiniteVector(heading.size(), substitute=math.nan)
             builder.AddNamedSystem("finite_heading", finite)
-            builder.Connect(heading, finite.signal_input_port())
-            heading = finite.finite_output_port()
+            builder.Connect(heading, finite.GetInputPort("signal"))
+            heading = finite.GetOutputPort("finite")
         connect(builder, heading, controller.GetInputPort("heading"))
     return decision
 
@@ -278,8 +278,8 @@ def AddObservation(
     if sees_grid:
         grid = TimeOfFlightGrid(sensor_of(config))
         builder.AddNamedSystem("time_of_flight_grid", grid)
-        builder.Connect(images["depth_image_32f"], grid.depth_image_32f_input_port())
-        images["depth_grid"] = grid.depth_grid_output_port()
+        builder.Connect(images["depth_image_32f"], grid.GetInputPort("depth_image_32f"))
+        images["depth_grid"] = grid.GetOutputPort("depth_grid")
     return images
 
 
@@ -297,8 +297,8 @@ def _connect_start_pose(
     readout = getattr(config, "readout", 0.0)
     start = DelayedPose(replace(frames, before=readout), period=min(0.02, readout))
     builder.AddNamedSystem(f"{name}_start_pose", start)
-    builder.Connect(state, start.state_input_port())
-    builder.Connect(start.pose_output_port(), camera.GetInputPort("start_pose"))
+    builder.Connect(state, start.GetInputPort("state"))
+    builder.Connect(start.GetOutputPort("pose"), camera.GetInputPort("start_pose"))
 
 
 def AddSensors(

@@ -154,7 +154,7 @@ def _check_simulator(simulator: SimulatorConfig) -> None:
         require(value == 0, f"simulator.{name}", "0", value, "flights start then and do not wait")
 
 
-_FOLDER = Path(__file__).parent / "scenarios"
+_FOLDER = Path(__file__).parents[1] / "scenarios"
 
 
 def benchmark_scenarios() -> dict[str, Path]:

@@ -169,7 +169,7 @@ def BuildHardwareDiagram(
         initial = {"state": hover_state(np.zeros(3)), "depth_grid": np.zeros(codec.size)}
         subscriber = MessageSubscriber(lcm, codec, config.tick, initial.get(codec.port))
         builder.AddNamedSystem(f"{codec.port}_subscriber", subscriber)
-        builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
+        builder.Connect(clock.get_output_port(), subscriber.GetInputPort("unix_time"))
         return subscriber
 
     def add_publisher(
@@ -182,26 +182,28 @@ def BuildHardwareDiagram(
         publisher = MessagePublisher(lcm, codec, period, config.tick if decided else None)
         builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
         builder.Connect(source, publisher.GetInputPort(codec.port))
-        builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+        builder.Connect(clock.get_output_port(), publisher.GetInputPort("unix_time"))
         if enabled is not None:
-            builder.Connect(enabled, publisher.enabled_input_port())
+            builder.Connect(enabled, publisher.GetInputPort("enabled"))
         if decided is not None:
-            builder.Connect(decided, publisher.decided_input_port())
+            builder.Connect(decided, publisher.GetInputPort("decided"))
 
     received: dict[str, MessageSubscriber | TimeOfFlightReceiver] = {
         "state": add_subscriber(StateCodec())
     }
     predictor = StatePredictor(config.failsafe.max_age)  # As long as states are flown by.
     builder.AddNamedSystem("state_predictor", predictor)
-    builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
-    builder.Connect(received["state"].age_output_port(), predictor.age_input_port())
-    state = predictor.state_output_port()
+    builder.Connect(
+        received["state"].GetOutputPort("state"), predictor.GetInputPort("measured_state")
+    )
+    builder.Connect(received["state"].GetOutputPort("age"), predictor.GetInputPort("age"))
+    state = predictor.GetOutputPort("state")
     policy = policy or make_policy(scenario, world)
     decided, decision = None, decision_period(scenario, policy)
     codecs = image_codecs(scenario, policy)
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
-        decided = policy.decided_output_port()
+        decided = policy.GetOutputPort("decided")
     pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
     for codec in codecs:
         if codec.port == "depth_grid" and config.time_of_flight is not None:
@@ -216,8 +218,8 @@ def BuildHardwareDiagram(
     status = BridgeStatus(list(received)[1:])
     builder.AddNamedSystem("status", status)
     # A policy that sees nothing decides by states.
-    oldest = status.observation_age_output_port()
-    age = {"observation_age": oldest if codecs else received["state"].age_output_port()}
+    oldest = status.GetOutputPort("observation_age")
+    age = {"observation_age": oldest if codecs else received["state"].GetOutputPort("age")}
     ConnectObservation(builder, observed | age, pilot.policy)
     failsafe = Failsafe(
         config.failsafe,
@@ -232,16 +234,18 @@ def BuildHardwareDiagram(
         for what in ("age", "gaps", "rejected"):
             port = status.GetInputPort(f"{signal}_{what}")
             builder.Connect(subscriber.GetOutputPort(what), port)
-    builder.ExportInput(status.overruns_input_port(), "overruns")
-    builder.ExportInput(failsafe.lag_input_port(), "lag")
+    builder.ExportInput(status.GetInputPort("overruns"), "overruns")
+    builder.ExportInput(failsafe.GetInputPort("lag"), "lag")
 
-    wanted = _AddVelocitySetpoint(builder, scenario, state, pilot).velocity_setpoint_output_port()
+    wanted = _AddVelocitySetpoint(builder, scenario, state, pilot).GetOutputPort(
+        "velocity_setpoint"
+    )
     collision = builder.GetSubsystemByName("collision")
     for source, name in (
         (state, "state"),
         (received["state"].GetOutputPort("state"), "measured_state"),
-        (received["state"].age_output_port(), "state_age"),
-        (status.observation_age_output_port(), "observation_age"),
+        (received["state"].GetOutputPort("age"), "state_age"),
+        (status.GetOutputPort("observation_age"), "observation_age"),
         (wanted, "velocity_setpoint"),
         (pilot.controller.GetOutputPort("command"), "command"),
         (collision.GetOutputPort("clearance"), "clearance"),
@@ -250,21 +254,28 @@ def BuildHardwareDiagram(
         builder.Connect(source, failsafe.GetInputPort(name))
     vehicle_status = add_subscriber(VehicleStatusCodec())
     builder.Connect(
-        vehicle_status.GetOutputPort("vehicle_status"), failsafe.vehicle_status_input_port()
+        vehicle_status.GetOutputPort("vehicle_status"), failsafe.GetInputPort("vehicle_status")
     )
-    builder.Connect(vehicle_status.age_output_port(), failsafe.vehicle_status_age_input_port())
+    builder.Connect(
+        vehicle_status.GetOutputPort("age"), failsafe.GetInputPort("vehicle_status_age")
+    )
     if pilot.policy.HasOutputPort("failed"):
-        builder.Connect(pilot.policy.GetOutputPort("failed"), failsafe.policy_failed_input_port())
+        builder.Connect(
+            pilot.policy.GetOutputPort("failed"), failsafe.GetInputPort("policy_failed")
+        )
     if config.body:
         body = add_subscriber(MotionCaptureCodec(config.body))
-        builder.Connect(body.age_output_port(), failsafe.body_age_input_port())
-    builder.Connect(failsafe.mode_output_port(), status.mode_input_port())
-    command, setpoint = failsafe.command_output_port(), failsafe.velocity_setpoint_output_port()
-    known, period = failsafe.state_is_known_output_port(), scenario.controller.period
+        builder.Connect(body.GetOutputPort("age"), failsafe.GetInputPort("body_age"))
+    builder.Connect(failsafe.GetOutputPort("mode"), status.GetInputPort("mode"))
+    command, setpoint = (
+        failsafe.GetOutputPort("command"),
+        failsafe.GetOutputPort("velocity_setpoint"),
+    )
+    known, period = failsafe.GetOutputPort("state_is_known"), scenario.controller.period
     add_publisher(CommandCodec(), command, period, known)
-    is_ready = failsafe.is_ready_output_port()
+    is_ready = failsafe.GetOutputPort("is_ready")
     add_publisher(VelocitySetpointCodec(), setpoint, period, is_ready, decided)
-    add_publisher(StatusCodec(), status.status_output_port(), 1 / config.status_rate)
+    add_publisher(StatusCodec(), status.GetOutputPort("status"), 1 / config.status_rate)
     if pilot.policy.HasOutputPort("hypotheses"):
         plans = pilot.policy.GetOutputPort("hypotheses")
         codec = HypothesesCodec(num_hypotheses_in(plans.size()))
@@ -274,8 +285,8 @@ def BuildHardwareDiagram(
         builder.ExportOutput(port, name)
     builder.ExportOutput(command, "command")
     builder.ExportOutput(setpoint, "velocity_setpoint")
-    builder.ExportOutput(status.status_output_port(), "status")
-    builder.ExportOutput(failsafe.in_charge_output_port(), "in_charge")
+    builder.ExportOutput(status.GetOutputPort("status"), "status")
+    builder.ExportOutput(failsafe.GetOutputPort("in_charge"), "in_charge")
     diagram = builder.Build()
     diagram.set_name("hardware")
     return diagram
@@ -314,10 +325,10 @@ def _AddVelocitySetpoint(
 ) -> VelocitySetpoint:
     setpoint = VelocitySetpoint(scenario.controller)
     builder.AddNamedSystem("velocity_setpoint", setpoint)
-    builder.Connect(state, setpoint.state_input_port())
+    builder.Connect(state, setpoint.GetInputPort("state"))
     builder.Connect(pilot.decision, setpoint.GetInputPort(pilot.decision.get_name()))
     if pilot.policy.HasOutputPort("heading"):
-        builder.Connect(pilot.policy.GetOutputPort("heading"), setpoint.heading_input_port())
+        builder.Connect(pilot.policy.GetOutputPort("heading"), setpoint.GetInputPort("heading"))
     return setpoint
 
 

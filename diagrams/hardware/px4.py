@@ -30,7 +30,7 @@ from splatpilot.systems.messaging.lcm_ports import (
     MessageSubscriber,
     open_lcm,
 )
-from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
 from splatpilot.systems.px4.mavlink import OFFBOARD, Mavlink
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
@@ -127,13 +127,13 @@ def BuildPx4Diagram(
     ):
         builder.AddNamedSystem(name, system)
 
-    builder.Connect(clock.get_output_port(), telemetry.unix_time_input_port())
+    builder.Connect(clock.get_output_port(), telemetry.GetInputPort("unix_time"))
 
     def add_subscriber(name: str, codec: Codec) -> tuple[OutputPort, OutputPort]:
         subscriber = MessageSubscriber(lcm, codec, config.tick)
         builder.AddNamedSystem(f"{name}_subscriber", subscriber)
-        builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
-        return subscriber.GetOutputPort(codec.port), subscriber.age_output_port()
+        builder.Connect(clock.get_output_port(), subscriber.GetInputPort("unix_time"))
+        return subscriber.GetOutputPort(codec.port), subscriber.GetOutputPort("age")
 
     velocity = config.commander.setpoints == "velocity"
     setpoint, age = add_subscriber(
@@ -161,23 +161,23 @@ def BuildPx4Diagram(
         else:
             eye = MotionCaptureReceiver(config.motion_capture, config.tick, now)
             builder.AddNamedSystem("motion_capture_receiver", eye)
-            pose, age = eye.motion_capture_pose_output_port(), eye.age_output_port()
+            pose, age = eye.GetOutputPort("motion_capture_pose"), eye.GetOutputPort("age")
             sender = MeasurementPublisher(lcm, codec, config.tick)
             builder.AddNamedSystem("motion_capture_publisher", sender)
             builder.Connect(pose, sender.GetInputPort(codec.port))
-            builder.Connect(age, sender.age_input_port())
-            builder.Connect(clock.get_output_port(), sender.unix_time_input_port())
-            builder.Connect(clock.get_output_port(), eye.unix_time_input_port())
-        builder.Connect(pose, commander.motion_capture_pose_input_port())
-        builder.Connect(age, commander.motion_capture_age_input_port())
+            builder.Connect(age, sender.GetInputPort("age"))
+            builder.Connect(clock.get_output_port(), sender.GetInputPort("unix_time"))
+            builder.Connect(clock.get_output_port(), eye.GetInputPort("unix_time"))
+        builder.Connect(pose, commander.GetInputPort("motion_capture_pose"))
+        builder.Connect(age, commander.GetInputPort("motion_capture_age"))
 
     vehicle_status = MessagePublisher(lcm, VehicleStatusCodec(), STATUS_PERIOD)
     builder.AddNamedSystem("vehicle_status_publisher", vehicle_status)
-    builder.Connect(telemetry.vehicle_status_output_port(), vehicle_status.get_input_port(0))
-    builder.Connect(clock.get_output_port(), vehicle_status.unix_time_input_port())
-    builder.Connect(telemetry.state_output_port(), publisher.GetInputPort("state"))
-    builder.Connect(telemetry.age_output_port(), publisher.age_input_port())
-    builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+    builder.Connect(telemetry.GetOutputPort("vehicle_status"), vehicle_status.get_input_port(0))
+    builder.Connect(clock.get_output_port(), vehicle_status.GetInputPort("unix_time"))
+    builder.Connect(telemetry.GetOutputPort("state"), publisher.GetInputPort("state"))
+    builder.Connect(telemetry.GetOutputPort("age"), publisher.GetInputPort("age"))
+    builder.Connect(clock.get_output_port(), publisher.GetInputPort("unix_time"))
     for port, name in (
         ("state", "state"),
         ("age", "state_age"),

@@ -144,32 +144,32 @@ def BuildVehicleDiagram(
         builder.AddNamedSystem(name, system)
 
     state, command = plant.GetOutputPort("state"), held.get_output_port()
-    builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
+    builder.Connect(clock.get_output_port(), subscriber.GetInputPort("unix_time"))
     told = subscriber.GetOutputPort(codec.port)
     commanded = told
     if velocities:
         commanded = _AddVelocityControl(builder, scenario, state, told)
-        builder.Connect(told, failsafe.velocity_setpoint_input_port())
-    builder.Connect(commanded, failsafe.command_input_port())
-    builder.Connect(subscriber.age_output_port(), failsafe.observation_age_input_port())
-    builder.Connect(state, failsafe.state_input_port())
-    builder.Connect(no_age.get_output_port(), failsafe.state_age_input_port())
-    builder.Connect(failsafe.command_output_port(), held.get_input_port())
+        builder.Connect(told, failsafe.GetInputPort("velocity_setpoint"))
+    builder.Connect(commanded, failsafe.GetInputPort("command"))
+    builder.Connect(subscriber.GetOutputPort("age"), failsafe.GetInputPort("observation_age"))
+    builder.Connect(state, failsafe.GetInputPort("state"))
+    builder.Connect(no_age.get_output_port(), failsafe.GetInputPort("state_age"))
+    builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
     builder.Connect(command, plant.GetInputPort("command"))
-    builder.Connect(state, pose.state_input_port())
-    builder.Connect(state, collision.state_input_port())
+    builder.Connect(state, pose.GetInputPort("state"))
+    builder.Connect(state, collision.GetInputPort("state"))
 
     def add_publisher(codec: Codec, source: OutputPort, period: float) -> None:
         publisher = MessagePublisher(lcm, codec, period)
         builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
         builder.Connect(source, publisher.GetInputPort(codec.port))
-        builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
+        builder.Connect(clock.get_output_port(), publisher.GetInputPort("unix_time"))
 
     policy = make_policy(scenario, world)  # Only to know what it sees, and how often.
     armed = builder.AddSystem(ConstantVectorSource(np.ones(1)))
     vehicle_status = builder.AddSystem(Multiplexer(2))
     builder.Connect(armed.get_output_port(), vehicle_status.get_input_port(0))
-    builder.Connect(failsafe.is_ready_output_port(), vehicle_status.get_input_port(1))
+    builder.Connect(failsafe.GetOutputPort("is_ready"), vehicle_status.get_input_port(1))
     add_publisher(VehicleStatusCodec(), vehicle_status.get_output_port(0), STATUS_PERIOD)
     noise = builder.AddSystem(Sine(np.repeat([_NOISE, 0.0], [3, 10]), np.ones(13), np.zeros(13)))
     estimate = builder.AddSystem(Adder(2, 13))
@@ -182,14 +182,14 @@ def BuildVehicleDiagram(
         add_publisher(
             MotionCaptureCodec(config.body), seen.get_output_port(), 1 / config.state_rate
         )
-    images = AddObservation(builder, scenario, world, state, pose.pose_output_port(), policy)
+    images = AddObservation(builder, scenario, world, state, pose.GetOutputPort("pose"), policy)
     for codec in image_codecs(scenario, policy):
         add_publisher(codec, images[codec.port], decision_period(scenario, policy))
 
     for name, port in (("state", state), ("command", command)):
         LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
-    builder.ExportOutput(subscriber.age_output_port(), "command_age")
+    builder.ExportOutput(subscriber.GetOutputPort("age"), "command_age")
     for name in ("clearance", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
     diagram = builder.Build()
@@ -210,12 +210,12 @@ def _AddVelocityControl(
     ):
         builder.AddNamedSystem(name, system)
     builder.Connect(setpoint, parts.get_input_port())
-    builder.Connect(parts.get_output_port(0), tracker.velocity_input_port())
-    builder.Connect(parts.get_output_port(1), controller.heading_input_port())
-    builder.Connect(tracker.acceleration_output_port(), controller.acceleration_input_port())
+    builder.Connect(parts.get_output_port(0), tracker.GetInputPort("velocity"))
+    builder.Connect(parts.get_output_port(1), controller.GetInputPort("heading"))
+    builder.Connect(tracker.GetOutputPort("acceleration"), controller.GetInputPort("acceleration"))
     for system in (tracker, controller):
         builder.Connect(state, system.GetInputPort("state"))
-    return controller.command_output_port()
+    return controller.GetOutputPort("command")
 
 
 @holds_folder("out")

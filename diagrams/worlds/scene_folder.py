@@ -9,6 +9,8 @@ where nobody looked any further: cameras of flights see it too, measures of the 
 import functools
 import logging
 import math
+import os
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -55,6 +57,7 @@ from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_p
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
+CAPTURE = "capture"  # folder of a capture that was rendered for the scene
 ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
 WORLD_FRAME = "z up"
@@ -264,7 +267,8 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
 
 
 def check_scene_target(path: str | Path) -> None:
-    """Checks that a scene may be written to `path`: nothing there, an empty folder, or a scene.
+    """Checks that a scene may be written to `path`: nothing there, an empty folder, a scene, or the
+    capture that it is made of, in `CAPTURE`.
 
     Raises:
         ValueError: if something else is there.
@@ -272,7 +276,8 @@ def check_scene_target(path: str | Path) -> None:
     """
     path = Path(path).absolute()
     if path.exists() and not (path / "scene.yaml").is_file():
-        if not path.is_dir() or any(path.iterdir()):
+        own = {CAPTURE, f".{CAPTURE}.partial"}
+        if not path.is_dir() or {entry.name for entry in path.iterdir()} - own:
             raise ValueError(
                 f"{path}: exists and is no scene, so it is not overwritten; choose another folder"
             )
@@ -344,6 +349,8 @@ def write_scene_folder(
         esdf.save(new / "esdf.npz")
         if isinstance(world.background, EnvironmentMap):
             world.background.save(new / ENVIRONMENT)
+        if (path / CAPTURE).is_dir():
+            shutil.copytree(path / CAPTURE, new / CAPTURE, copy_function=os.link)
         write_scene_metadata(new, metadata)
     return metadata
 

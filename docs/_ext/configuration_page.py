@@ -9,8 +9,7 @@ import yaml
 
 from splatpilot.analysis.faults.campaign import FaultsConfig
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
-from splatpilot.analysis.places import PlaceConfig
-from splatpilot.analysis.tour import TourConfig
+from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import WITHOUT_EFFECT, Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -50,11 +49,11 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
         "Of `splatpilot capture check` and `capture render`.",
         [CheckConfig, RenderConfig],
     ),
-    ("Reconstruction", "Of `splatpilot reconstruct` and `ablate`.", [ReconstructConfig]),
     (
-        "From meshes to flights",
-        "Of `splatpilot tour`, `splatpilot places` and `splatpilot fidelity`.",
-        [TourConfig, PlaceConfig, FidelityConfig],
+        "Reconstruction",
+        "Of `splatpilot reconstruct` and `scene ablate`; of meshes and generated worlds, for "
+        "`reconstruct` and `scene fetch`; and of `scene fidelity`.",
+        [ReconstructConfig, RenderedSceneConfig, FidelityConfig],
     ),
     ("Training", "Of `splatpilot train` and `recover`, for each policy.", TRAINERS),
     ("Corpora", "Of `splatpilot corpus make`.", [CorpusConfig]),

@@ -1,6 +1,7 @@
-// Python binding of ways down a time of arrival, in double precision: see
+// Python binding of paths down a time of arrival, in double precision: see
 // `splatpilot.systems.policies.time_of_arrival`.
 #include "bindings/bindings.hpp"
+#include "fields/grid_interpolation.hpp"
 
 namespace splatpilot {
 namespace {
@@ -22,63 +23,27 @@ struct Vector {
 
 Vector vector(const Point& p) { return {p.data()[0], p.data()[1], p.data()[2]}; }
 
-class TimeGrid {
- public:
-  TimeGrid(const Times& times, const Vector& lower_W, double voxel_size)
-      : times_(times.data()), lower_W_(lower_W), voxel_size_(voxel_size) {
-    for (int k = 0; k < 3; ++k) {
-      shape_[k] = static_cast<int64_t>(times.shape(k));
-      require(shape_[k] >= 2, "a grid needs at least 2 voxels along each axis");
-    }
+// The gradient at a point brought between the outermost voxel centers.
+Vector gradient(const VoxelGrid& grid, const Vector& p_WQ) {
+  double p[3] = {p_WQ.x, p_WQ.y, p_WQ.z};
+  for (int k = 0; k < 3; ++k) {
+    const double first = grid.lower_W[k] + 0.5 * grid.voxel_size;
+    const double last = first + static_cast<double>(grid.shape[k] - 1) * grid.voxel_size;
+    p[k] = std::min(std::max(first, p[k]), last);  // NaN becomes `first`
   }
-
-  // The gradient of the trilinear interpolation; differences are of single precision, as there.
-  Vector gradient(const Vector& p_WQ) const {
-    const double p[3] = {p_WQ.x, p_WQ.y, p_WQ.z};
-    const double lower[3] = {lower_W_.x, lower_W_.y, lower_W_.z};
-    int64_t cell[3];
-    double f[3];
-    for (int k = 0; k < 3; ++k) {
-      const double position = (p[k] - lower[k]) / voxel_size_ - 0.5;
-      // What is not a number stands at 0.
-      const double inside = std::min(std::max(0.0, position), static_cast<double>(shape_[k] - 1));
-      cell[k] = std::min(static_cast<int64_t>(inside), shape_[k] - 2);
-      f[k] = inside - static_cast<double>(cell[k]);
-    }
-    const int64_t row = shape_[2], layer = shape_[1] * shape_[2];
-    const float* near = times_ + cell[0] * layer + cell[1] * row + cell[2];
-    const float* far = near + layer;
-    float step[2][2];    // by y and z
-    double along[2][2];  // interpolated along x
-    for (int j = 0; j < 2; ++j) {
-      for (int k = 0; k < 2; ++k) {
-        const int64_t at = j * row + k;
-        step[j][k] = far[at] - near[at];
-        along[j][k] = near[at] + f[0] * step[j][k];
-      }
-    }
-    double along_x[2], along_y[2];  // slopes, by z
-    for (int k = 0; k < 2; ++k) {
-      along_x[k] = step[0][k] + f[1] * (step[1][k] - step[0][k]);
-      along_y[k] = along[1][k] - along[0][k];
-    }
-    const double along_z = (along[0][1] + f[1] * along_y[1]) - (along[0][0] + f[1] * along_y[0]);
-    const Vector slope = {along_x[0] + f[2] * (along_x[1] - along_x[0]),
-                          along_y[0] + f[2] * (along_y[1] - along_y[0]), along_z};
-    return slope / voxel_size_;
-  }
-
- private:
-  const float* times_;
-  int64_t shape_[3];
-  Vector lower_W_;
-  double voxel_size_;
-};
+  const Interpolant at = grid.interpolate(p);
+  return {at.gradient[0], at.gradient[1], at.gradient[2]};
+}
 
 size_t descend(const Times& times, const Point& lower_W, double voxel_size, const Point& p_WG,
                const Point& p_WQ, double step, double length, const WayPoints& way) {
   require(voxel_size > 0.0 && step > 0.0, "voxels and steps need a size");
-  const TimeGrid grid(times, vector(lower_W), voxel_size);
+  VoxelGrid grid{times.data(), {}, {}, voxel_size};
+  for (int k = 0; k < 3; ++k) {
+    grid.shape[k] = static_cast<int64_t>(times.shape(k));
+    require(grid.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
+    grid.lower_W[k] = lower_W.data()[k];
+  }
   const Vector goal = vector(p_WG);
   Vector p = vector(p_WQ), direction = {0.0, 0.0, 0.0};
   double covered = 0.0;
@@ -90,7 +55,7 @@ size_t descend(const Times& times, const Point& lower_W, double voxel_size, cons
     if (!(covered < length) || distance < 1e-9) return count + 1;
     // The mean with the last direction: plain steepest descent zigzags in a valley.
     direction =
-        distance < 2.0 * step ? to_goal / distance : (direction - grid.gradient(p).unit()).unit();
+        distance < 2.0 * step ? to_goal / distance : (direction - gradient(grid, p).unit()).unit();
     const double stride = std::min(step, distance);
     p = {p.x + stride * direction.x, p.y + stride * direction.y, p.z + stride * direction.z};
     covered += stride;

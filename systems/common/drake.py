@@ -35,6 +35,11 @@ def output_port(name: str) -> Callable[[System], OutputPort]:
     return port
 
 
+def vector_input(system: System, name: str, context: Context) -> np.ndarray:
+    """The vector at the input port of that name."""
+    return np.asarray(system.GetInputPort(name).Eval(context))
+
+
 def optional_input(system: System, name: str, context: Context) -> np.ndarray | None:
     """The vector at the input port of that name; None where nothing is connected."""
     port = system.GetInputPort(name)

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 
 _LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm", "torch", "onnx"
-_FOLDERS = "api", "native", "systems", "diagrams", "training", "analysis"
+_FOLDERS = "splatpilot", "native", "systems", "diagrams", "training", "analysis"
 _SUFFIXES = ".py", ".yaml", ".cpp", ".hpp", ".npz"  # the last are weights that ship
 
 
@@ -32,7 +32,7 @@ def revision() -> str:
 
     A checkout of something else around the installation says nothing about it.
     """
-    checkout = Path(__file__).resolve().parents[1]
+    checkout = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
         return subprocess.run(

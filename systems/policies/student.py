@@ -13,13 +13,13 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.policies.base import require_speed
 from splatpilot.systems.policies.checkpoint import (
     OnnxModel,
     PolicyCheckpoint,
     check_weights,
     shipped_weights,
 )
-from splatpilot.systems.policies.depth_policy_config import require_speed
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import BASIS, HORIZON, MARGIN, unobstructed_way
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

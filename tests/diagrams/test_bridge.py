@@ -31,8 +31,6 @@ def small_scenario() -> Scenario:
 
 
 def test_three_processes_fly(udp_url, tmp_path):
-    """A vehicle, who flies it and lcm-logger, three processes, reach the goal of a forest by
-    images; the log and the vehicle agree on the way, and every state is there."""
     log = tmp_path / "flight.lcm"
     words = ["--lcm-url", udp_url, "--patience", "60", "--policy", "diffaero", *SMALL]
     logger = subprocess.Popen(
@@ -64,8 +62,6 @@ def test_three_processes_fly(udp_url, tmp_path):
 
 
 def test_without_the_other_end_both_give_up(udp_url, tmp_path):
-    """A bridge without a vehicle and a vehicle without commands end with an error that names what
-    did not come and the remedy."""
     config = HardwareConfig(url=udp_url, patience=0.2)
     with pytest.raises(TimeoutError, match=r"nothing has come on QUADROTOR_STATE .*start the veh"):
         bridge.run(scenario=small_scenario(), config=config)
@@ -74,7 +70,6 @@ def test_without_the_other_end_both_give_up(udp_url, tmp_path):
 
 
 def test_bad_urls_are_errors_before_the_world_is_made(tmp_path):
-    """Where LCM does not work, that is the first thing to be said."""
     config = HardwareConfig(url="tcp://somewhere")
     with pytest.raises(OSError, match="must begin with udpm://"):
         bridge.run(scenario=small_scenario(), config=config)
@@ -83,7 +78,6 @@ def test_bad_urls_are_errors_before_the_world_is_made(tmp_path):
 
 
 def test_logs_are_not_overwritten(udp_url, tmp_path):
-    """A log that is there already is an error before anything is waited for, unless it may be."""
     log = tmp_path / "log"
     log.write_text("a flight")
     config = HardwareConfig(url=udp_url, patience=0.2)
@@ -125,7 +119,7 @@ class Watched:
                 sender, context = self.senders[port]
                 context.SetTime(now)
                 sender.GetInputPort(port).FixValue(context, value)
-                sender.unix_time_input_port().FixValue(context, [now])
+                sender.GetInputPort("unix_time").FixValue(context, [now])
                 if port != "state" or p_WB is not None:
                     sender.ForcedPublish(context)
             self.simulator.AdvanceTo(now + 1e-3)

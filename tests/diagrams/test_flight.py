@@ -30,9 +30,6 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 
 
 def test_flies_round_the_post_to_the_goal(post_world):
-    """The flight reaches the goal, clears the post by the recorded clearance, and its figures agree
-    with its samples.
-    """
     scenario = Scenario(timeout=20.0)
     seen = []
     flight = fly(
@@ -58,7 +55,6 @@ def test_flies_round_the_post_to_the_goal(post_world):
 
 
 def test_plans_are_recorded_as_flown(post_world):
-    """One second records the fifteen plans made in it, each from where the vehicle then was."""
     scenario = Scenario(timeout=1.0)
     flight = fly(BuildFlightDiagram(scenario, post_world), scenario, post_world)
     num_hypotheses = scenario.policy.lattice.num_hypotheses
@@ -121,9 +117,6 @@ def test_a_flight_that_becomes_infeasible_ends_with_an_error(post_world):
     ],
 )
 def test_outcome_at_an_instant(post_world, p_WB, outcome):
-    """Touching the post at the vehicle's radius, nearing the goal and leaving the box end a flight,
-    to the centimetre.
-    """
     scenario = Scenario()
     diagram = BuildFlightDiagram(scenario, post_world)
     context = diagram.CreateDefaultContext()
@@ -133,7 +126,6 @@ def test_outcome_at_an_instant(post_world, p_WB, outcome):
 
 
 def test_collision_ends_the_flight(post_world):
-    """A planner that is shown an empty hall flies into the post, and the flight ends there."""
     nothing = np.full_like(post_world.esdf.distances, 5.0)
     empty = dataclasses.replace(
         post_world.esdf, distances=nothing, states=np.zeros(nothing.shape, np.uint8)
@@ -147,7 +139,6 @@ def test_collision_ends_the_flight(post_world):
 
 
 def test_timeout_ends_the_flight(post_world):
-    """A flight that has not arrived ends at the timeout."""
     scenario = Scenario(timeout=0.5)
     flight = fly(BuildFlightDiagram(scenario, post_world), scenario, post_world)
     assert flight.outcome == Outcome.TIMEOUT
@@ -155,9 +146,6 @@ def test_timeout_ends_the_flight(post_world):
 
 
 def test_start_is_drawn_from_the_seed(post_world):
-    """The start is the same for one seed, differs for another, and stays within its radius, level
-    and facing the goal.
-    """
     states = [sample_initial_state(Scenario(seed=seed), post_world) for seed in (0, 0, 1)]
     np.testing.assert_array_equal(states[0], states[1])
     assert np.any(states[0] != states[2])
@@ -176,13 +164,11 @@ def test_start_is_drawn_from_the_seed(post_world):
     ],
 )
 def test_start_and_goal_need_room(post_world, field, point, message):
-    """A start or goal in an obstacle, too near to one or outside is refused with its position."""
     with pytest.raises(ValueError, match=message):
         sample_initial_state(Scenario(**{field: point}), post_world)
 
 
 def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
-    """Where start and goal are no farther apart than the goal's radius, nothing is flown."""
     start = [float(x) for x in post_world.p_WS]
     near = [start[0] + 0.25, *start[1:]]
     with pytest.raises(ValueError, match=r"cannot be flown: start and goal are 0\.25 m apart"):
@@ -191,7 +177,6 @@ def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
 
 
 def test_same_seed_gives_the_same_bits_in_two_processes():
-    """Two processes that fly the default scenario for three seconds leave identical samples."""
     script = (
         "import hashlib; from splatpilot.diagrams.flight.scenario import Scenario;"
         "from splatpilot.diagrams.flight.flight import fly;"
@@ -215,7 +200,6 @@ def test_same_seed_gives_the_same_bits_in_two_processes():
 
 
 def test_flight_path_does_not_import_torch():
-    """What `splatpilot fly` imports does not load torch, which would cost every user seconds."""
     script = (
         "import sys; import splatpilot.diagrams.flight.fly, splatpilot.analysis.commands.main;"
         "sys.exit('torch' in sys.modules)"
@@ -225,7 +209,6 @@ def test_flight_path_does_not_import_torch():
 
 @pytest.mark.parametrize("seed", [10, 11, 12])
 def test_forests_are_flown_through_at_nominal_speed(seed):
-    """The default scenario reaches its goal 33 m away at nearly 2 m/s without touching a tree."""
     scenario = Scenario(seed=seed)
     world = make_world(scenario.world, scenario.seed)
     flight = fly(BuildFlightDiagram(scenario, world), scenario, world)
@@ -237,9 +220,6 @@ def test_forests_are_flown_through_at_nominal_speed(seed):
 
 @pytest.mark.parametrize("name", ["planner", "reactive"])
 def test_flown_diagrams_are_freed(name, post_world):
-    """A diagram that has flown, with cameras, noise and delay, leaves memory when nobody holds it,
-    and so does all that it holds.
-    """
     noise = ObservationNoise(depth_additive=0.01, latency=0.02)
     scenario = Scenario(timeout=0.2, policy=policy_named(name), observation=noise)
     diagram = BuildFlightDiagram(scenario, post_world)

@@ -25,7 +25,6 @@ def flown(scenario: Scenario, world, **systems):
 
 
 def test_finished_systems_fly_as_configured_ones(post_world):
-    """The same policy, plant and controller, given as systems, fly the same flight bit for bit."""
     scenario = Scenario(timeout=1.5, policy=policy_named("reactive"))
     configured = flown(scenario, post_world)
     given = flown(
@@ -44,7 +43,6 @@ def test_finished_systems_fly_as_configured_ones(post_world):
 
 
 def test_a_policy_needs_only_its_outputs(post_world):
-    """A system without any input flies to the waypoint that it gives."""
     scenario = Scenario(timeout=8.0, start_radius=0.0, start=[1, 0, 2], goal=[3.0, 0, 2])
 
     class Waypoint(LeafSystem):
@@ -58,7 +56,6 @@ def test_a_policy_needs_only_its_outputs(post_world):
 
 
 def test_a_world_looks_otherwise_and_is_the_same(post_world):
-    """With another appearance colours are others, those of the seed, and depth and flight stay."""
 
     def seen(**fields):
         diagram = BuildFlightDiagram(Scenario(timeout=0.5, **fields), post_world)
@@ -78,8 +75,6 @@ def test_a_world_looks_otherwise_and_is_the_same(post_world):
 
 
 def test_systems_without_the_ports_they_need_are_named(post_world):
-    """A policy without outputs or with an input that nothing gives, and a plant that is none, are
-    errors that name the port."""
     scenario = Scenario(timeout=1.0)
     with pytest.raises(ValueError, match=r"policy ConstantVectorSource.* has none of the outputs"):
         flown(scenario, post_world, policy=ConstantVectorSource(np.zeros(3)))
@@ -97,8 +92,6 @@ def test_systems_without_the_ports_they_need_are_named(post_world):
 
 
 def test_ports_of_another_size_are_named(post_world):
-    """A policy whose outputs or inputs have another size than what they lead to is an error that
-    names both."""
 
     class Policy(LeafSystem):
         def __init__(self, output: str, size: int, goal: int = 3):
@@ -132,7 +125,6 @@ def test_ports_of_another_size_are_named(post_world):
 
 
 def test_scenarios_out_of_range_are_refused(post_world):
-    """By who builds the diagram, and by who flies it: Drake would end the process."""
     for wrong, message in (
         ({"timeout": -1.0}, "timeout .* got -1.0"),
         ({"timeout": np.nan}, "timeout .* got nan"),
@@ -154,7 +146,6 @@ def test_scenarios_out_of_range_are_refused(post_world):
     ],
 )
 def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, message):
-    """A registered sensor or world whose function returns nothing is an error that says so."""
     kind = next(iter(registry._kinds.values()))
     function = "make" if registry is WORLDS else "build"
     kind = dataclasses.replace(kind, **{function: lambda *_: None})
@@ -166,7 +157,6 @@ def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, m
 
 
 def test_what_builds_no_policy_is_named(post_world, monkeypatch):
-    """A registered policy whose function returns nothing is an error that says so."""
     config = policy_named("straight")
     kind = dataclasses.replace(POLICIES.kind_of(config), build=lambda *_: None)
     monkeypatch.setattr(POLICIES, "kind_of", lambda _: kind)
@@ -176,7 +166,6 @@ def test_what_builds_no_policy_is_named(post_world, monkeypatch):
 
 
 def test_configuration_that_nobody_knows_is_refused(post_world):
-    """A policy's or a world's configuration of an unknown type lists the known ones."""
 
     class MineConfig:
         rate = 10.0
@@ -187,14 +176,11 @@ def test_configuration_that_nobody_knows_is_refused(post_world):
 
 @pytest.mark.parametrize("shown", [{"video": True}, {"meshcat": object()}])
 def test_what_shows_the_camera_needs_it(post_world, shown):
-    """Video or Meshcat without the camera is an error that says so."""
     with pytest.raises(ValueError, match=r"camera is False, but (video|meshcat) shows its images"):
         BuildFlightDiagram(Scenario(), post_world, camera=False, **shown)
 
 
 def test_sensors_of_a_scenario_are_on_board(post_world):
-    """A scenario's sensors are systems whose outputs the diagram has; they survive YAML and
-    overrides, and change no flight."""
     text = "sensors: {down: !OnboardCamera {width: 8, height: 6, pitch: -90}}\ntimeout: 1.0\n"
     scenario = load_config(
         parse_config(Scenario(), text, "text"), overrides=["sensors.down.width=10"]
@@ -211,6 +197,5 @@ def test_sensors_of_a_scenario_are_on_board(post_world):
 
 
 def test_sensor_named_as_a_part_of_the_flight_is_refused(post_world):
-    """A name that the diagram uses is an error that says so."""
     with pytest.raises(ValueError, match=r"a sensor is named 'plant'"):
         flown(Scenario(sensors={"plant": OnboardCamera()}), post_world)

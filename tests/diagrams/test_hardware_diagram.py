@@ -29,8 +29,8 @@ from splatpilot.systems.messaging.tof_receiver import (
     TimeOfFlightStream,
     UdpConfig,
 )
+from splatpilot.systems.policies.base import LearnedPolicyConfig
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
@@ -78,9 +78,6 @@ def forest():
 
 @pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "diffaero", "diffaero_tof"])
 def test_the_two_halves_fly_as_the_whole(forest, name):
-    """Cut in two, and with limits beyond what it does, a flight is the same but for the 6 ms of
-    messages: within 10 cm after 3 s, for policies with plans, with accelerations, with velocities
-    and with headings, blind and seeing."""
     scenario = Scenario(timeout=3.0, policy=policy_named(name))
     whole = fly(BuildFlightDiagram(scenario, forest, camera=False), scenario, forest)
     limits = FlightLimits(max_speed=20.0, max_tilt=1.5, deceleration=100.0, min_clearance=0.0)
@@ -96,8 +93,6 @@ def test_the_two_halves_fly_as_the_whole(forest, name):
 
 
 def test_ports_are_those_of_the_flight_diagram(post_world):
-    """Each output of the flight diagram, but the onlooker's images of a policy that sees none, is
-    an output of the same size."""
     scenario = Scenario(policy=policy_named("planner"))
     flight = BuildFlightDiagram(scenario, post_world, camera=False)
     hardware = BuildHardwareDiagram(scenario, post_world, lcm.LCM("memq://"))
@@ -107,8 +102,6 @@ def test_ports_are_those_of_the_flight_diagram(post_world):
 
 
 def test_commands_stop_where_the_vehicle_falls_silent(post_world):
-    """Without states for longer than allowed no body rates are commanded, setpoints are those to
-    stop, and the status says why; with states again it flies on."""
     halves = Halves(Scenario(policy=policy_named("straight")), post_world)
     heard = []
     halves.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
@@ -129,15 +122,12 @@ def test_commands_stop_where_the_vehicle_falls_silent(post_world):
 
 
 def test_before_the_first_state_nothing_is_commanded(post_world):
-    """A pilot whose vehicle has said nothing waits."""
     hardware = BuildHardwareDiagram(Scenario(), post_world, lcm.LCM("memq://"))
     status = hardware.GetOutputPort("status").Eval(hardware.CreateDefaultContext())
     np.testing.assert_array_equal(status, [lcmt_bridge_status.WAITING, 0, np.inf, 0, 0, 0, 0])
 
 
 def test_a_vehicle_that_hears_no_more_holds_and_then_lands(post_world):
-    """A tenth of a second after the last command a vehicle in flight brakes by itself, hovers, and
-    after five seconds descends; before the first command it hovers for as long as it takes."""
     halves = Halves(Scenario(policy=policy_named("straight")), post_world)
     halves.simulators[0].AdvanceTo(0.3)
     np.testing.assert_allclose(halves.state()[3:6], np.zeros(3), atol=1e-6)
@@ -169,8 +159,6 @@ class Mad(LeafSystem):
 
 @pytest.mark.parametrize("port", ["acceleration", "velocity", "waypoint"])
 def test_a_policy_that_says_nonsense_ends_no_flight(post_world, port):
-    """What is no number stops the vehicle, whatever kind of decision it is, and no exception ends
-    the bridge; when the policy comes to its senses it flies on."""
     policy = Mad(port)
     halves = Halves(Scenario(policy=policy_named("straight")), post_world, policy=policy)
     halves.advance_to(0.1)
@@ -268,8 +256,6 @@ def test_the_vehicle_says_that_it_is_flown_by_the_bridge(post_world):
 
 @pytest.mark.parametrize("streamed", [False, True])
 def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
-    """The grid that a policy gets is the vehicle's, by LCM, or, where one is named, that of a
-    stream by UDP, and nothing is flown before it has come; its velocities are the setpoints."""
     policy = tmp_path / "weights.npz"
     random = np.random.default_rng(0)
     shapes = DIFFAERO_NETWORK.weight_shapes().items()
@@ -304,7 +290,6 @@ def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
 
 
 def test_plans_travel(post_world):
-    """The plans of a policy are sent as they are made, with the time of each."""
     halves = Halves(Scenario(policy=policy_named("planner")), post_world)
     heard = []
     decode = lcmt_trajectory_hypotheses.decode
@@ -319,7 +304,6 @@ def test_plans_travel(post_world):
 
 @pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
 def test_velocity_setpoint_leads_where_the_policy_wants(post_world, setpoints):
-    """An autopilot that is told velocities is told that of the straight policy's way."""
     scenario = Scenario(policy=policy_named("straight", speed=1.5))
     halves = Halves(scenario, post_world, config=HardwareConfig(setpoints=setpoints))
     halves.advance_to(1.2)
@@ -331,7 +315,6 @@ def test_velocity_setpoint_leads_where_the_policy_wants(post_world, setpoints):
 @pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
 @pytest.mark.parametrize("speed", [2.0, 6.0])
 def test_a_known_obstacle_is_not_flown_into(post_world, setpoints, speed):
-    """The straight policy, which flies into the post where it is let, is stopped before it."""
     scenario = Scenario(policy=policy_named("straight", speed), start_radius=0.0)
     halves = Halves(scenario, post_world, config=HardwareConfig(setpoints=setpoints))
     clearance, closest = halves.vehicle.GetOutputPort("clearance"), np.inf
@@ -344,7 +327,6 @@ def test_a_known_obstacle_is_not_flown_into(post_world, setpoints, speed):
 
 
 def test_what_no_message_carries_is_refused(post_world):
-    """Sensors, moving things, and a period that is none are errors that say so."""
     transport = lcm.LCM("memq://")
     with pytest.raises(ValueError, match="no message carries what the sensors down measure"):
         BuildHardwareDiagram(Scenario(sensors={"down": OnboardCamera()}), post_world, transport)
@@ -357,10 +339,9 @@ def test_what_no_message_carries_is_refused(post_world):
 
 
 def test_images_of_another_size_are_refused_by_the_other_half(post_world):
-    """A vehicle whose camera is not the policy's is noticed: nothing is flown by its images."""
     camera = OnboardCamera(width=32, height=18)
     policy = policy_named("diffaero")
-    assert isinstance(policy, DepthPolicyConfig)
+    assert isinstance(policy, LearnedPolicyConfig)
     other = Scenario(policy=dataclasses.replace(policy, camera=camera))
     halves = Halves(Scenario(policy=policy), post_world, vehicle=other)
     heard = []
@@ -373,7 +354,6 @@ def test_images_of_another_size_are_refused_by_the_other_half(post_world):
 
 
 def test_both_halves_are_freed(post_world):
-    """Whoever drops the diagrams gets their memory back, though they share an LCM that stays."""
     halves = Halves(Scenario(policy=policy_named("diffaero")), post_world)
     transport, freed = halves.lcm, [weakref.ref(d) for d in (halves.vehicle, halves.hardware)]
     halves.advance_to(0.1)

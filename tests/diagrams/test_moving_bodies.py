@@ -12,7 +12,7 @@ from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import MovingBodies, World
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.scene import GaussianScene
@@ -30,7 +30,7 @@ def with_ball(world: World, path: np.ndarray, radius: float = 0.5) -> World:
         np.full(300, 0.99),
         np.tile([1.0, 0.0, 0.0], (300, 1)),
     )
-    balls = MovingBalls([radius], [path], 0.02)
+    balls = MovingSpheres([radius], [path], 0.02)
     return replace(world, moving=MovingBodies(balls, MovingGaussians([ball], balls.centers)))
 
 
@@ -46,8 +46,6 @@ def hovering(**changes) -> Scenario:
 
 
 def test_a_ball_hits_at_its_time(post_world):
-    """A ball that falls at 3 m/s from 9 m on a vehicle that hovers at 2 m touches it when they are
-    as far apart as their radii, not earlier or later; nothing is hit where it falls aside."""
     hit_at = (9.0 - 2.0 - 0.5 - VEHICLE_RADIUS) / 3.0
     scenario = hovering()
     for aside, outcome in ((0.0, Outcome.COLLISION), (2.5, Outcome.TIMEOUT)):
@@ -67,8 +65,6 @@ def test_a_ball_hits_at_its_time(post_world):
 
 @pytest.mark.parametrize("policy", ["planner", "reactive"])
 def test_the_same_flight_bit_for_bit(post_world, policy):
-    """What moves is a function of the Context's time: a flight repeats, in a new diagram and in the
-    one that flew already."""
     scenario = Scenario(timeout=2.0, policy=policy_named(policy))
     world = with_ball(post_world, falling(3.0, 0.6, 2.0))
     diagram = BuildFlightDiagram(scenario, world, camera=False)
@@ -80,7 +76,6 @@ def test_the_same_flight_bit_for_bit(post_world, policy):
 
 
 def test_the_camera_of_a_flight_sees_the_ball_come(post_world):
-    """With time alone the picture changes: the ball fills more of it, and its depth is nearer."""
     scenario = hovering()
     approach = np.column_stack([4.0 - 0.02 * np.arange(100), np.zeros(100), np.full(100, 2.0)])
     world = with_ball(post_world, approach)
@@ -101,8 +96,6 @@ def test_the_camera_of_a_flight_sees_the_ball_come(post_world):
 
 
 def test_the_planner_leaves_room_to_a_ball(post_world):
-    """A ball that hangs where the planner would fly, on a path of one row, is passed like what
-    stands."""
     scenario = Scenario(timeout=15.0)
     blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
     in_the_way = blind.states[np.argmax(blind.states[:, 0] > 2.8), :3]
@@ -112,8 +105,6 @@ def test_the_planner_leaves_room_to_a_ball(post_world):
 
 
 def test_the_planner_looks_ahead(post_world):
-    """A ball that crosses the way at 4 m/s, just when the planner would be there, is let pass or
-    passed: what counts is where it will be, not where it is."""
     scenario = Scenario(timeout=15.0)
     blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
     meeting = np.argmax(blind.states[:, 0] > 3.0)
@@ -127,14 +118,12 @@ def test_the_planner_looks_ahead(post_world):
 
 
 def test_a_start_in_a_ball_is_refused(post_world):
-    """A ball on the start at time 0 leaves the vehicle no room, wherever it is later."""
     world = with_ball(post_world, falling(1.0, 0.0, 3.0) - [0.0, 0.0, 7.0])
     with pytest.raises(InfeasibleFlightError, match=r"start .* from the nearest surface"):
         sample_initial_state(hovering(), world)
 
 
 def test_meshcat_shows_the_ball_if_there_is_one(post_world):
-    """A flight drawn in Meshcat has the ball where it is; a world without balls has none."""
     scenario, meshcat = hovering(), Meshcat()
     world = with_ball(post_world, falling(1.0, 0.0, 3.0))
     for flown, shown in ((post_world, False), (world, True)):

@@ -27,9 +27,6 @@ def states(world, **noise) -> np.ndarray:
 
 
 def test_noise_and_latency_reach_the_policy_and_repeat(post_world):
-    """Depth noise and latency each change a flight that sees, the same way every time; colour noise
-    does not concern a policy of depth.
-    """
     clean = states(post_world)
     for noise in ({"depth_multiplicative": 0.2}, {"latency": 0.2}):
         first, second = states(post_world, **noise), states(post_world, **noise)
@@ -59,8 +56,6 @@ class Watcher(LeafSystem):
 
 
 def test_grid_of_a_policy_is_that_of_its_cameras_images(post_world):
-    """A policy that asks for it sees the proximities of what its camera sees; its velocities are
-    flown: told to be at rest it stays where it is."""
     scenario, policy = Scenario(timeout=1.0, start_radius=0.0), Watcher()
     diagram = BuildFlightDiagram(scenario, post_world, camera=False, policy=policy)
     simulator = Simulator(diagram)
@@ -82,7 +77,6 @@ def test_grid_of_a_policy_is_that_of_its_cameras_images(post_world):
 
 
 def test_frames_with_a_rate_reach_the_policy_and_repeat(post_world):
-    """Images of 10 to 30 Hz, some late and some lost, change a flight, the same way every time."""
     stream = {"latency": 0.03, "frame_rate": [10.0, 30.0], "jitter": 0.03, "frame_dropout": 0.2}
     first, second = states(post_world, **stream), states(post_world, **stream)
     np.testing.assert_array_equal(first, second)
@@ -90,7 +84,6 @@ def test_frames_with_a_rate_reach_the_policy_and_repeat(post_world):
 
 
 def test_diagram_has_only_what_the_scenario_asks_for(post_world):
-    """Noise and delay are systems of the diagram where asked for, and nowhere else."""
     scenario = Scenario(policy=policy_named("reactive"))
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     names = {"depth_noise", "color_noise", "delayed_pose"}
@@ -102,8 +95,6 @@ def test_diagram_has_only_what_the_scenario_asks_for(post_world):
 
 @pytest.mark.parametrize("latency", [0.0, 0.1])
 def test_rolling_shutter_starts_where_the_vehicle_was(post_world, latency):
-    """A camera with a readout is told the pose of its last row and, so long before, of its first,
-    both as late as its images."""
     policy = policy_named("reactive")
     policy.camera = replace(policy.camera, readout=0.03)
     scenario = Scenario(policy=policy, observation=ObservationNoise(latency=latency), timeout=3.0)

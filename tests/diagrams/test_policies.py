@@ -37,7 +37,6 @@ class _OneSpeedConfig:
     ("name", "outcome"), [("straight", Outcome.COLLISION), ("reactive", Outcome.GOAL)]
 )
 def test_policies_fly_with_a_post_in_the_way(name, outcome, post_world):
-    """The straight policy hits the post, the reactive one goes round; neither leaves plans."""
     scenario = Scenario(timeout=20.0, start_radius=0.0, policy=policy_named(name))
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     flight = fly(diagram, scenario, post_world)
@@ -48,7 +47,6 @@ def test_policies_fly_with_a_post_in_the_way(name, outcome, post_world):
 
 
 def test_onlooking_camera_changes_no_flight(post_world):
-    """With Meshcat and video the same flight results, bit for bit."""
     scenario = Scenario(timeout=1.0, policy=policy_named("reactive"))
     scenario.camera.width, scenario.camera.height = 32, 24
     bare = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
@@ -59,8 +57,6 @@ def test_onlooking_camera_changes_no_flight(post_world):
 
 @pytest.mark.parametrize("name", BENCHMARK_POLICIES)
 def test_name_gives_a_policy_of_that_speed(name, post_world):
-    """Told to fly twice as fast, as fast as all know, a policy gets well further; none flies much
-    faster than it is told."""
     reach = []
     for speed in (1.5, 3.0):
         scenario = Scenario(timeout=1.5, start_radius=0.0, policy=policy_named(name, speed))
@@ -72,7 +68,6 @@ def test_name_gives_a_policy_of_that_speed(name, post_world):
 
 
 def test_unknown_policy_and_speed_are_refused():
-    """An unknown name lists the known ones; a speed that cannot be flown is named."""
     with pytest.raises(ValueError, match=r"no policy 'Planner'; did you mean planner\?"):
         policy_named("Planner")
     with pytest.raises(ValueError, match=r"speed .* got -1"):
@@ -80,7 +75,6 @@ def test_unknown_policy_and_speed_are_refused():
 
 
 def test_types_that_can_be_no_configuration_are_refused():
-    """Where they are registered, not where they are flown."""
 
     @dataclass
     class BareConfig:
@@ -108,8 +102,6 @@ def test_types_that_can_be_no_configuration_are_refused():
 
 
 def test_file_of_weights_is_a_policy(tmp_path):
-    """A file of weights gives the policy it was trained for; one that is absent or holds something
-    else is named."""
     PolicyCheckpoint("depthnav", DEPTHNAV_NETWORK, {}, {}).save(tmp_path / "mine.npz")
     config = policy_named(str(tmp_path / "mine.npz"), 1.5)
     assert config == DepthNavConfig(speed=1.5, weights=str(tmp_path / "mine.npz"))
@@ -122,7 +114,6 @@ def test_file_of_weights_is_a_policy(tmp_path):
 
 @pytest.mark.parametrize("name", POLICIES.registered())
 def test_speed_is_set_where_the_configuration_keeps_it(name):
-    """Every policy says the speed that it was asked for, and nothing else of it changes."""
     config = policy_named(name)
     assert name_of(config) == name
     faster = at_speed(config, 3.0)
@@ -131,7 +122,6 @@ def test_speed_is_set_where_the_configuration_keeps_it(name):
 
 
 def test_policy_that_knows_one_speed_refuses_others(monkeypatch):
-    """Of what has no speed in its configuration nobody knows one, and none can be set."""
     monkeypatch.setattr(policies, "POLICIES", Registry("policy", "none", PolicyKind))
     register_policy(_OneSpeedConfig, lambda config, world, vehicle: ConstantVectorSource([0.0]))
     assert speed_of(_OneSpeedConfig()) is None

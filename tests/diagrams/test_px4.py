@@ -7,11 +7,10 @@ import pytest
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.hardware import px4
 from splatpilot.diagrams.hardware.px4 import Px4Config
-from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 
 
 def test_it_says_what_it_will_not_do(udp_url, capsys):
-    """Where nothing else is asked for, offboard mode and arming are the pilot's."""
     px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=0)), duration=0.1)
     said = capsys.readouterr().out
     assert "Offboard mode is left to the pilot." in said
@@ -38,13 +37,11 @@ def test_it_counts_how_long_there_is_no_heartbeat(udp_url, capsys, monkeypatch):
     ],
 )
 def test_bad_input_is_an_error_before_anything_is_sent(words, why, capsys):
-    """Each is one sentence on standard error."""
     assert main(["px4", *words]) == 1
     assert why in capsys.readouterr().err
 
 
 def test_a_port_that_is_taken_is_an_error(udp_url):
-    """Who else listens for PX4 there is noticed at once."""
     inbox = UdpInbox(UdpConfig(port=0))
     with pytest.raises(OSError, match="Address already in use"):
         px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=inbox.port)))

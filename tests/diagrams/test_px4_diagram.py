@@ -21,7 +21,7 @@ from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.lcm_ports import MessagePublisher
-from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4CommanderConfig
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -112,8 +112,6 @@ def chain(post_world):
 @pytest.mark.parametrize("version", ["1.16", "1.18"])
 @pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
 def test_px4_flies_where_the_policy_wants(chain, version, setpoints):
-    """Asked for explicitly, offboard mode and arming are granted by the rules of either version,
-    and the vehicle flies towards the goal, by velocities and by body rates."""
     flight = chain(version, dataclasses.replace(ENGAGED, setpoints=setpoints))
     flight.advance(7.0)
     assert (flight.px4.mode, flight.px4.armed) == (OFFBOARD, True)
@@ -126,7 +124,6 @@ def test_px4_flies_where_the_policy_wants(chain, version, setpoints):
 
 
 def test_nothing_arms_or_flies_by_default(chain):
-    """Without being told so, the link streams setpoints and asks for nothing, however long."""
     flight = chain(commander=Px4CommanderConfig())
     flight.advance(5.0)
     assert not flight.px4.answers
@@ -136,8 +133,6 @@ def test_nothing_arms_or_flies_by_default(chain):
 
 
 def test_a_stream_that_is_too_young_is_asked_with_again(chain):
-    """PX4 1.16 wants a second of setpoints: asked after half of one it refuses, and the link asks
-    again until it grants; 1.18 grants at once."""
     hasty = dataclasses.replace(ENGAGED, streaming=0.5)
     for version, refusals in (("1.16", 1), ("1.18", 0)):
         flight = chain(version, hasty)
@@ -147,8 +142,6 @@ def test_a_stream_that_is_too_young_is_asked_with_again(chain):
 
 
 def test_where_the_bridge_dies_the_vehicle_holds(chain):
-    """When setpoints cease the link stops the vehicle and leaves offboard mode for hold, before
-    PX4 has to, and does not enter it again when they come back."""
     flight = chain()
     flight.advance(6.0)
     flight.alive.remove("bridge")
@@ -164,7 +157,6 @@ def test_where_the_bridge_dies_the_vehicle_holds(chain):
 
 
 def test_where_the_link_dies_px4_holds_by_itself(chain):
-    """The stand-in's own failsafe takes over after COM_OF_LOSS_T, as PX4's does."""
     flight = chain()
     flight.advance(6.0)
     flight.alive.clear()
@@ -180,7 +172,6 @@ def test_where_the_link_dies_px4_holds_by_itself(chain):
     [("velocity", 0.05), ("velocity", 0.25), ("velocity", 0.6), ("body_rates", 0.35)],
 )
 def test_a_pilot_who_takes_over_keeps_the_vehicle(chain, setpoints, silent):
-    """Between two heartbeats, after the bridge has been silent for some time."""
     flight = chain(commander=dataclasses.replace(ENGAGED, setpoints=setpoints))
     flight.advance(6.05)
     asked = len(flight.px4.answers)
@@ -196,7 +187,6 @@ def test_a_pilot_who_takes_over_keeps_the_vehicle(chain, setpoints, silent):
 
 
 def test_a_pilot_who_leaves_offboard_mode_at_once_keeps_the_vehicle(chain):
-    """Before any heartbeat says that it was entered."""
     flight = chain()
     while (dialect.MAV_CMD_DO_SET_MODE, True) not in flight.px4.answers:
         flight.advance(0.01)
@@ -207,7 +197,6 @@ def test_a_pilot_who_leaves_offboard_mode_at_once_keeps_the_vehicle(chain):
 
 
 def test_a_pilot_who_takes_over_from_a_landing_keeps_the_vehicle(chain):
-    """The bridge lands and the pilot takes over, both between two heartbeats."""
     flight = chain()
     flight.advance(5.0)
     flight.px4.muted = STATES
@@ -229,8 +218,6 @@ STATES = {"LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"}
     ("muted", "mode"), [(STATES, LAND), (STATES | {"HEARTBEAT", "TIMESYNC"}, OFFBOARD)]
 )
 def test_where_px4_falls_silent_the_bridge_stops_and_lands(chain, muted, mode):
-    """It has PX4 land where PX4 still says its mode; else setpoints descend, which a pilot may
-    have taken the vehicle from."""
     flight = chain()
     flight.advance(6.0)
     flight.px4.muted = muted
@@ -245,7 +232,6 @@ def test_where_px4_falls_silent_the_bridge_stops_and_lands(chain, muted, mode):
 
 @pytest.mark.parametrize(("setpoints", "delay"), [("velocity", 0.1), ("body_rates", 0.06)])
 def test_states_that_are_late_are_brought_up_to_date(chain, setpoints, delay):
-    """To within 5 cm of the truth, at 2 m/s."""
     flight = chain(
         policy=Circle(2.0, "waypoint"), commander=dataclasses.replace(ENGAGED, setpoints=setpoints)
     )
@@ -260,8 +246,6 @@ def test_states_that_are_late_are_brought_up_to_date(chain, setpoints, delay):
 
 @pytest.mark.parametrize("sees", [None, {"body": 8}, {"body": 3, "tracked": False}])
 def test_where_motion_capture_dies_the_bridge_stops(chain, sees):
-    """Where its stream ends, or does not show the body, in flight: within `max_age` of the last
-    sight, and another two steps of this test."""
     flight = chain(body="starling", hardware=HardwareConfig(body="starling"), motion_capture=True)
     flight.advance(6.0)
     assert flight.status()[0] == lcmt_bridge_status.FLYING
@@ -282,7 +266,6 @@ def test_where_motion_capture_dies_the_bridge_stops(chain, sees):
 
 
 def test_px4_learns_our_clock_and_when_cameras_exposed(chain):
-    """The stamps of ODOMETRY are those of the exposures, and TIMESYNC gives PX4 our clock."""
     flight = chain(body="starling", motion_capture=True)
     flight.advance(3.0)
     assert np.abs(np.array(flight.px4.offsets) + BOOT + EPOCH).max() < 0.01
@@ -293,7 +276,6 @@ def test_px4_learns_our_clock_and_when_cameras_exposed(chain):
 
 
 def test_motion_capture_is_sent_on(chain):
-    """The pose of the body in motion capture goes to PX4 as ODOMETRY, north east down."""
     flight = chain(body="starling")
     codec = MotionCaptureCodec("starling")
     publisher = MessagePublisher(flight.lcm, codec, 1.0)
@@ -301,7 +283,7 @@ def test_motion_capture_is_sent_on(chain):
     publisher.GetInputPort(codec.port).FixValue(context, np.array([1.0, 2, 3, 1, 0, 0, 0]))
     flight.advance(0.1)
     assert not flight.px4.odometry
-    publisher.unix_time_input_port().FixValue(context, [EPOCH + flight.now])
+    publisher.GetInputPort("unix_time").FixValue(context, [EPOCH + flight.now])
     publisher.ForcedPublish(context)
     flight.advance(0.1)
     flight.advance(0.3)

@@ -33,7 +33,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
-from splatpilot.systems.messaging.tof_receiver import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4CommanderConfig
 
 START, GOAL = [1.0, 2.0, 2.0], [9.0, 6.0, 2.0]
@@ -96,8 +96,6 @@ def vehicle():
 
 
 def test_mavsdks_vehicle_is_engaged_armed_flown_and_landed(post_world, inbox, vehicle):
-    """It grants offboard mode and arming once each, reads setpoints that lead to the goal, and is
-    told to land where its state is no longer heard."""
     memory = lcm.LCM("memq://")
     scenario = Scenario(policy=policy_named("straight", 1.0), start=START, goal=GOAL)
     hardware = HardwareConfig(failsafe=FailsafeConfig(patience=2.0))

@@ -17,8 +17,6 @@ from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 
 
 def test_default_context_is_the_start_of_the_scenario(post_world):
-    """A simulator of the same seed flies what `fly` does, bit for bit; converted to other
-    scalars the plant starts there too."""
     scenario = Scenario(timeout=1.0, seed=MONTE_CARLO_SEEDS[3])
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     start = sample_initial_state(scenario, post_world)
@@ -36,8 +34,6 @@ def test_default_context_is_the_start_of_the_scenario(post_world):
 
 
 def test_monte_carlo_simulation_varies_what_the_scenario_varies(post_world):
-    """Starts differ from one simulation to the next, within the radius of the start; the same
-    generator gives the same flights, and a snapshot of it any one of them again."""
     scenario = Scenario(timeout=0.3, start_radius=0.3, policy=policy_named("straight"))
     make = random_flights(scenario, post_world)
 
@@ -58,7 +54,6 @@ def test_monte_carlo_simulation_varies_what_the_scenario_varies(post_world):
 
 
 def test_worlds_are_drawn_too_where_none_is_given():
-    """Each simulation then has the world of its own seed."""
     scenario = Scenario()
     scenario.world.length, scenario.world.width, scenario.world.voxel_size = 10.0, 6.0, 0.3
     make = random_flights(scenario)
@@ -71,7 +66,6 @@ def test_worlds_are_drawn_too_where_none_is_given():
 
 
 def test_a_simulation_ends_with_its_flight_and_is_freed(post_world):
-    """Time stops where the goal is reached; nothing of a simulation outlives it."""
     scenario = Scenario(timeout=20.0, policy=policy_named("straight"), goal=[4.0, 0.0, 1.5])
     scenario.start = [3.0, 0.0, 1.5]
     built = []

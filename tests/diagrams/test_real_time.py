@@ -61,7 +61,6 @@ def ran(needs: float, until: float = 0.2):
 
 
 def test_no_tick_begins_early():
-    """Time passes as on the wall clock, or more slowly, and every update happens."""
     missing, overruns, told, took, _ = ran(needs=0.0)
     assert missing == 0
     assert took >= 0.2
@@ -70,8 +69,6 @@ def test_no_tick_begins_early():
 
 @pytest.mark.parametrize("needs", [0.03, 0.4])
 def test_overruns_are_counted_and_leave_nothing_out(needs):
-    """A tick that takes too long is an overrun, every update happens all the same, and the clock is
-    behind by no more than allowed even where time was lost."""
     missing, overruns, told, took, behind = ran(needs)
     assert missing == 0
     assert overruns == told >= 1

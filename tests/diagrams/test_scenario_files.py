@@ -12,7 +12,6 @@ from splatpilot.systems.common.config import dump_config, load_config, parse_con
 
 
 def test_names_and_paths_are_found(tmp_path):
-    """The benchmark's names give its files; what looks like a file is one."""
     assert scenario_file("P01") == benchmark_scenarios()["P01"]
     assert scenario_file("P01").is_file()
     other = tmp_path / "other"
@@ -22,7 +21,6 @@ def test_names_and_paths_are_found(tmp_path):
 
 
 def test_scenarios_outside_the_benchmark_have_names_too():
-    """The benchmark has seventeen; others come with the program and are found by name."""
     assert len(benchmark_scenarios()) == 17
     assert not set(benchmark_scenarios()) & set(other_scenarios())
     assert scenario_file("alley_splat").is_file()
@@ -35,7 +33,6 @@ def test_unknown_scenario_lists_those_there_are():
 
 @pytest.mark.parametrize("name", benchmark_scenarios() | other_scenarios())
 def test_scenario_that_was_written_is_the_same(name):
-    """Written to YAML and read again, a scenario has the same world, of the same type."""
     scenario = load_config(Scenario(), scenario_file(name))
     again = parse_config(Scenario(), dump_config(scenario), name)
     assert type(again.world) is type(scenario.world)

@@ -32,7 +32,7 @@ from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios
 from splatpilot.diagrams.worlds.feasibility import grid_graph
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
-from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_blueprint
+from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_spec
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.occupancy import grid_shape
@@ -369,7 +369,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
 
 
 def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: int) -> None:
-    blueprint = None
+    spec = None
     if world.suffix in (".yaml", ".yml"):
         scenario = load_config(Scenario(), world)
         if not is_procedural(scenario.world):
@@ -377,7 +377,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
                 f"{world}: its world is a {type(scenario.world).__name__}; a generated one is "
                 "needed"
             )
-        blueprint = make_blueprint(scenario.world, seed)
+        spec = make_spec(scenario.world, seed)
         recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config, version=_VERSION)
         described = f"{type(scenario.world).__name__} {seed}\n{dump_config(scenario.world)}"
         digests, found = part_digests([described.encode()]), _generated_split(scenario.world, seed)
@@ -399,16 +399,16 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
         raise ValueError(
             f"{partial}: holds a part of another capture; remove it, or repeat what was begun"
         )
-    if blueprint is None:
+    if spec is None:
         esdf = mesh_distance(world, config.up, config.voxel_size)
     else:
-        esdf = esdf_from_distance_field(blueprint.distance_field, config.voxel_size)
+        esdf = esdf_from_distance_field(spec.distance_field, config.voxel_size)
     X_WCs = _poses(esdf, config)
     with written_atomically(partial / RECIPE) as file:
         file.write_text(text)
     mesh = partial / recipe.mesh
-    if blueprint is not None and not mesh.is_file():
-        write_gltf(blueprint, mesh)
+    if spec is not None and not mesh.is_file():
+        write_gltf(spec, mesh)
     renderer = _renderer(mesh, config)
     K = intrinsics(config.width, config.height)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.library import require_untested
 from splatpilot.training.corpus.samples import RECOVERY

@@ -24,12 +24,12 @@ from torch import Tensor
 
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.seeds import first_training_seed
-from splatpilot.systems.policies.agile_autonomy_inference import (
+from splatpilot.systems.policies.agile_autonomy import (
     AGILE_NETWORK,
-    FARTHEST,
     FOV_X,
+    MAX_DEPTH,
+    MIN_DEPTH,
     MODES,
-    NEAREST,
     PROGRESS,
     RATE,
 )
@@ -95,7 +95,7 @@ class AgileAutonomyAgent:
     def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
         """Images (N, 24, 32) and states (N, 18)."""
         spec, vehicle, R_WB = self.network.spec, seen.vehicle, seen.vehicle.attitude()
-        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
+        image = 1.0 / seen.depth.clamp(MIN_DEPTH, MAX_DEPTH)
         rates = (
             QuadrotorState.of(vehicle.state).w_WB_B
             if isinstance(vehicle, BodyRate)
@@ -208,7 +208,7 @@ class AgileAutonomyTrainer:
         sample = {name: values[chosen] for name, values in data.items()}
         spec = self.spec
         depth = noisy_depth(sample["depth"].float(), config.noise, self._generator)
-        image = (1.0 / depth.clamp(NEAREST, FARTHEST)).reshape(
+        image = (1.0 / depth.clamp(MIN_DEPTH, MAX_DEPTH)).reshape(
             -1, spec.image_height, spec.image_width
         )
         waypoints, costs = self.network(image, sample["state"])

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, FARTHEST, NEAREST
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     HEIGHT,
@@ -30,7 +30,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
 )
 from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.student_data import StudentData
@@ -228,7 +228,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         rows = list(self._judged_validation())
         found, target = (torch.cat(part) for part in zip(*rows, strict=True))
         z = 3.0 / (target + 0.6)
-        judged = 3.0 / (found + 0.6).clamp(3.0 / FARTHEST, 3.0 / NEAREST)
+        judged = 3.0 / (found + 0.6).clamp(3.0 / MAX_DEPTH, 3.0 / MIN_DEPTH)
         near, very_near = z < _NEAR, z < 3.0
         return {
             "success": float(((judged / z - 1.0).abs() < _CLOSE)[near].float().mean()),
@@ -264,7 +264,7 @@ part judged within {_CLOSE:.0%}; `missed` the part nearer than 3 m that is taken
         R_WB = rotation_matrices(self._data.labels(numbers).X_WB[:, :4])
         R_WH = heading_frame(torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0]))
         rays = ((R_WH.mT @ R_WB) @ self._rays_B.mT).unflatten(2, (HEIGHT, WIDTH))
-        target = inverse_depth(self._targets[torch.from_numpy(numbers)], NEAREST, FARTHEST)
+        target = inverse_depth(self._targets[torch.from_numpy(numbers)], MIN_DEPTH, MAX_DEPTH)
         return torch.from_numpy(color).to(device).float(), rays, target
 
     def _nearest(self) -> np.ndarray:

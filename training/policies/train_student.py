@@ -27,8 +27,8 @@ from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.hypotheses import WAYPOINT_PERIOD
 from splatpilot.systems.policies.student import StudentSpec
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import rotation_matrices
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.student_config import StudentTraining
 from splatpilot.training.policies.student_data import StudentData

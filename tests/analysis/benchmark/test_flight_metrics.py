@@ -9,7 +9,7 @@ from splatpilot.analysis.benchmark.rollout import flight_metrics, jerk_metrics, 
 from splatpilot.diagrams.flight.flight import Flight, Outcome
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder
-from splatpilot.systems.policies.time_of_arrival import way_lengths
+from splatpilot.systems.policies.time_of_arrival import path_lengths
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
@@ -63,7 +63,7 @@ def test_shortest_way_goes_round_a_post():
     post = Cylinder(p_WA=[5.0, 0.0, -2.0], p_WB=[5.0, 0.0, 6.0], radius=0.5)
     exact = AnalyticDistanceField([post], [0.0, -3.0, 0.0], [10.0, 3.0, 4.0])
     field = esdf_from_distance_field(exact, 0.1).conservative()
-    lengths = way_lengths(field, np.array([9.0, 0.0, 2.0]))
+    lengths = path_lengths(field, np.array([9.0, 0.0, 2.0]))
     shortest = shortest_length(lengths, np.array([1.0, 0.0, 2.0]), goal_radius=0.3)
     r = 0.5 + VEHICLE_RADIUS
     tangents, arc = 2 * np.sqrt(16 - r**2), r * (np.pi - 2 * np.arccos(r / 4.0))

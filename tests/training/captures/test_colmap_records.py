@@ -1,5 +1,3 @@
-"""COLMAP's binary files, cut short and with counts that are not true."""
-
 import os
 import signal
 import struct
@@ -37,7 +35,6 @@ def num_params(number: int) -> int:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_pycolmap_writes_passes(model, kind):
-    """All files of a model are gone through to their ends, whatever its cameras are."""
     written = pycolmap.Reconstruction()
     written.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, kind, 9.0, 8, 8))
     written.write(model / "..")
@@ -47,8 +44,6 @@ def test_what_pycolmap_writes_passes(model, kind):
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
 def test_files_cut_short_anywhere_are_refused(model, name):
-    """A file that ends too early, at any byte, or too late, is named; so are counts that are not
-    true. pycolmap never sees it."""
     file = model / f"{name}.bin"
     whole = file.read_bytes()
     for end in range(len(whole)):
@@ -67,7 +62,6 @@ def test_files_cut_short_anywhere_are_refused(model, name):
 
 
 def test_lengths_of_lists_are_compared_with_the_file(model):
-    """A point that claims a track of terabytes is refused before it is made."""
     file = model / "points3D.bin"
     whole = file.read_bytes()
     file.write_bytes(whole[:51] + struct.pack("<Q", 2**40) + whole[59:])
@@ -76,7 +70,6 @@ def test_lengths_of_lists_are_compared_with_the_file(model):
 
 
 def test_unknown_cameras_are_refused(model):
-    """A kind of camera that pycolmap does not know is named with its file."""
     file = model / "cameras.bin"
     whole = file.read_bytes()
     file.write_bytes(whole[:12] + struct.pack("<i", 99) + whole[16:])
@@ -85,8 +78,6 @@ def test_unknown_cameras_are_refused(model):
 
 
 def test_sigterm_stays_the_programs(tmp_path):
-    """pycolmap takes SIGTERM for itself; after it was imported the program's own handler is called,
-    and nothing prints a stack."""
     script = (
         "import os, signal, sys\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
