@@ -27,7 +27,7 @@ from splatpilot.analysis.benchmark.tables import (
     select,
     success_summary,
 )
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -171,7 +171,7 @@ def trajectories_section(
     p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
     figure = draw_trajectories(
-        world, flights, p_WS, goal_of(scenario, world), config.policy_names, title
+        world, flights, p_WS, goal_position(scenario, world), config.policy_names, title
     )
     png = save_png(figure, folder.path / "trajectories.png")
     note = (
