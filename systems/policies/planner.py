@@ -9,13 +9,8 @@ from pydrake.systems.framework import Context, DiscreteValues, ValueProducer
 
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
-<<<<<<< HEAD
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.drake import input_port, output_port
-=======
-from splatpilot.systems.collision.shapes import MovingBalls
 from splatpilot.systems.common.drake import output_port, weakly
->>>>>>> r-policies
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.policies.base import Policy

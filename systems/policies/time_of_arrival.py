@@ -58,24 +58,12 @@ class TimeOfArrival:
         return self  # Copies of a Drake Context share it.
 
     def value(self, p_WQ: np.ndarray) -> np.ndarray:
-<<<<<<< HEAD
-        """Time of arrival (...,) [s] from p_WQ (..., 3) [m]."""
+        """Interpolates the time of arrival (...,) [s] at p_WQ (..., 3) [m]."""
         return self._interpolate(p_WQ)[0]
 
     def gradient(self, p_WQ: np.ndarray) -> np.ndarray:
-        """Its gradient (..., 3) [s/m] at p_WQ (..., 3) [m]; downhill is the way to the goal."""
-        return self._interpolate(p_WQ)[1]
-=======
-        """Interpolates the time of arrival (...,) [s] at p_WQ (..., 3) [m]."""
-        corners, fractions = self._cell(p_WQ)
-        return trilinear(corners, *fractions).reshape(np.shape(p_WQ)[:-1])
-
-    def gradient(self, p_WQ: np.ndarray) -> np.ndarray:
         """Computes the gradient (..., 3) [s/m] of `value` at p_WQ (..., 3) [m]."""
-        corners, fractions = self._cell(p_WQ)
-        slopes = trilinear_with_gradient(corners, *fractions)[1:]
-        return np.stack(slopes, axis=-1).reshape(np.shape(p_WQ)) / self.voxel_size
->>>>>>> r-policies
+        return self._interpolate(p_WQ)[1]
 
     def is_reachable(self, p_WQ: np.ndarray, within: float = 0.0) -> bool:
         """Checks that a path leads to the goal from the voxel of p_WQ (3,) [m], or from one that
@@ -118,24 +106,12 @@ class TimeOfArrival:
         chords[lengths > covered[-1]] = 0.0
         return ends, np.array([_unit(chord) for chord in chords])
 
-<<<<<<< HEAD
     def _interpolate(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns values and gradients at the points, brought between the voxel centers."""
         first = self.lower_W + 0.5 * self.voxel_size
         last = first + self.voxel_size * (np.array(self.times.shape) - 1.0)
         p_WQ = np.minimum(np.maximum(p_WQ, first), last)
         return interpolate_grid(self.times, self.lower_W, self.voxel_size, p_WQ)
-=======
-    def _cell(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns corner values (2, 2, 2, N) and fractions (3, N) of the cells of the points."""
-        shape = self.times.shape
-        position = (np.reshape(p_WQ, (-1, 3)) - self.lower_W).T / self.voxel_size - 0.5  # (3, N)
-        last = np.array(shape, dtype=float)[:, None] - 1.0
-        position = np.minimum(np.maximum(position, 0.0), last)
-        cell = np.minimum(np.floor(position), last - 1.0)
-        base = grid_strides(shape) @ cell.astype(np.intp)
-        return self.times.take(corner_offsets(shape) + base), position - cell
->>>>>>> r-policies
 
 
 def path_lengths(field: Esdf, p_WG: np.ndarray) -> TimeOfArrival:

@@ -10,12 +10,13 @@ from torch import Tensor
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.training.policies.image_noise import noisy_depth
 from splatpilot.training.policies.ray_casting import Geometry, PixelRays
-from splatpilot.training.policies.torch_observations import Observation, noisy_depth
 from splatpilot.training.policies.training_worlds import WorldBatch
 from splatpilot.training.policies.vehicles import (
     BodyRate,
     Frames,
+    Observation,
     PointMass,
     Vehicle,
     delayed,

@@ -18,14 +18,13 @@ from splatpilot.training.policies.evaluation import (
     evaluate_agent,
     render_depth,
 )
-from splatpilot.training.policies.networks import TrainableNetwork
-from splatpilot.training.policies.ray_casting import Geometry
-from splatpilot.training.policies.torch_observations import (
-    Observation,
+from splatpilot.training.policies.image_noise import (
     noisy_depth,
     training_noise,
     validate_training_noise,
 )
+from splatpilot.training.policies.networks import TrainableNetwork
+from splatpilot.training.policies.ray_casting import Geometry
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import (
     STARTS,
@@ -36,6 +35,7 @@ from splatpilot.training.policies.training_worlds import (
 )
 from splatpilot.training.policies.vehicles import (
     Frames,
+    Observation,
     PointMass,
     choose_rows,
     delayed,

@@ -5,9 +5,9 @@ from typing import ClassVar
 
 from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.training.policies.image_noise import validate_training_noise
 from splatpilot.training.policies.student_images import Appearance
 from splatpilot.training.policies.student_network import IMAGE_MODULES
-from splatpilot.training.policies.torch_observations import validate_training_noise
 from splatpilot.training.policies.trainer import Schedule
 
 

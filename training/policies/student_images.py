@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.sensing.noise import ObservationNoise, turned_hue
+from splatpilot.training.policies.image_noise import noisy_color, noisy_depth
 from splatpilot.training.policies.student_network import encode_color, encode_depth
-from splatpilot.training.policies.torch_observations import noisy_color, noisy_depth
 
 
 @dataclass

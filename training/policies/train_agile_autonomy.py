@@ -32,9 +32,11 @@ from splatpilot.systems.policies.agile_autonomy import (
     MODES,
     PROGRESS,
     RATE,
+    state_observation,
 )
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.planner import plan
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
@@ -46,15 +48,13 @@ from splatpilot.training.policies.evaluation import (
     render_depth,
     validate_speeds,
 )
-from splatpilot.training.policies.networks import TrajectoryModule
-from splatpilot.training.policies.ray_casting import PixelRays
-from splatpilot.training.policies.torch_observations import (
-    Observation,
+from splatpilot.training.policies.image_noise import (
     noisy_depth,
-    target_velocity,
     training_noise,
     validate_training_noise,
 )
+from splatpilot.training.policies.networks import TrajectoryModule
+from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import (
     STARTS,
@@ -65,6 +65,7 @@ from splatpilot.training.policies.training_worlds import (
 )
 from splatpilot.training.policies.vehicles import (
     BodyRate,
+    Observation,
     choose_rows,
     delayed,
     draw_frames,
@@ -102,8 +103,7 @@ class AgileAutonomyAgent:
             else 0.0 * vehicle.v
         )
         v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
-        rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
-        state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
+        state = state_observation(R_WB, vehicle.v, rates, v_target)
         return image.reshape(-1, spec.image_height, spec.image_width), state
 
     def hypotheses(self, seen: Observation) -> tuple[Tensor, Tensor]:

@@ -28,20 +28,16 @@ from splatpilot.systems.policies.diffaero_rgb import (
     rays_B,
     require_view,
 )
+from splatpilot.systems.policies.observations import heading_frame, inverse_depth
 from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
+from splatpilot.training.policies.image_noise import noisy_color, validate_training_noise
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.student_images import Appearance, relit
 from splatpilot.training.policies.student_network import encode_color
-from splatpilot.training.policies.torch_observations import (
-    heading_frame,
-    inverse_depth,
-    noisy_color,
-    validate_training_noise,
-)
 from splatpilot.training.policies.trainer import Schedule
 
 

@@ -142,6 +142,15 @@ class BodyRate(NamedTuple):
 Vehicle = PointMass | BodyRate
 
 
+class Observation(NamedTuple):
+    """Inputs of a policy for N vehicles at one step."""
+
+    depth: Tensor  # (N, R) [m], planar, inf beyond
+    vehicle: Vehicle
+    p_WG: Tensor  # (N, 3) [m]
+    speed: Tensor  # (N,) [m/s], nominal
+
+
 def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
     """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
     T = FlatnessControllerConfig.lookahead
