@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.analysis.reconstruction.scene_measures import SceneViews
+from splatpilot.analysis.reconstruction.measure_scene import SceneViews
 from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RigidTransform
@@ -43,14 +42,13 @@ from splatpilot.systems.collision.frontier import (
     reachable_space,
     with_obstacles,
 )
-from splatpilot.systems.common.config import yaml_problem
 from splatpilot.systems.common.files import (
     folder_written_atomically,
     require_scene,
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_text, reason_of, require_shallow
+from splatpilot.systems.common.readers import read_text, reason_of, yaml_errors
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
@@ -134,12 +132,12 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     """
     file = Path(path) / "scene.yaml"
     text = read_text(file)
-    require_shallow(text, str(file))
     try:
-        metadata = yaml_load_typed(schema=SceneMetadata, data=text)
-    except Exception as error:  # Drake's reader raises anything of values of other types
-        wrong = yaml_problem(error) if isinstance(error, yaml.YAMLError) else reason_of(error)
-        raise ValueError(f"{file}: {wrong}; reconstruct the scene again or repair it") from None
+        with yaml_errors("the text"):
+            metadata = yaml_load_typed(schema=SceneMetadata, data=text)
+    except Exception as error:  # Drake's reader raises any type.
+        remedy = "reconstruct the scene again or repair it"
+        raise ValueError(f"{file}: {reason_of(error)}; {remedy}") from None
     if metadata.format_version < FORMAT_VERSION:
         raise ValueError(
             f"{file}: format version {metadata.format_version}, from when scenes had no background "

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.readers import require_readable_size, require_whole_chunks
+from splatpilot.systems.common.readers import require_readable_size
 from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
@@ -39,7 +39,6 @@ class EnvironmentMap:
             raise FileNotFoundError(f"No such file: {file}; reconstruct the scene again")
         require_readable_size(file, file.stat().st_size)
         content = file.read_bytes()
-        require_whole_chunks(file, content)
         try:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         except cv2.error:  # more pixels than OpenCV decodes

@@ -9,7 +9,7 @@ import pytest
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction import ablation
 from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
-from splatpilot.analysis.reconstruction.scene_measures import SceneMetrics
+from splatpilot.analysis.reconstruction.measure_scene import SceneMetrics
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.metrics import ViewMetrics
@@ -152,7 +152,11 @@ def test_means_and_spreads():
 
 @pytest.mark.parametrize(
     ("setting", "message"),
-    [("hold_out=0", "hold_out is 0"), ("iterations=0", "iterations 0"), ("hold_out=1", "hold_out")],
+    [
+        ("hold_out=0", "hold_out must be not 0"),
+        ("iterations=0", "iterations must be not 0"),
+        ("hold_out=1", "hold_out must be 0 or"),
+    ],
 )
 def test_bad_settings(place, capsys, setting, message):
     """Without held-out frames or steps there is nothing to compare."""

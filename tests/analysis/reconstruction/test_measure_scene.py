@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import SceneViews, read_metrics
+from splatpilot.analysis.reconstruction.measure_scene import SceneViews, measure_scene, read_metrics
 from splatpilot.systems.splats.scene import GaussianScene
 
 

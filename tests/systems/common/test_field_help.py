@@ -1,11 +1,10 @@
-"""What the fields of configurations mean, read from where they are written."""
-
 from dataclasses import dataclass, field
 
 import pytest
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.systems.common.config import describe_fields, open_field
+from splatpilot.systems.common.config import open_field
+from splatpilot.systems.common.field_help import describe_fields
 from splatpilot.systems.common.registry import Registry
 
 ENGINES = Registry("engine", "tests.engines", object)
@@ -63,7 +62,6 @@ def test_comments_and_strings_describe_fields():
 
 
 def test_inherited_fields_keep_their_descriptions():
-    """Fields of base classes come first, and what the derived class says of one holds."""
     fields = describe_fields(Car(doors=2))
     assert [(f.name, f.value) for f in fields[:2]] == [("mass", 900.0), ("name", "größe # nothing")]
     texts = {field.name: field.text for field in fields}
@@ -79,7 +77,6 @@ def test_open_fields_name_their_registry():
 
 
 def test_drakes_own_are_described_by_drake():
-    """Drake's configurations have the first paragraph of their documentation."""
     texts = {field.name: field.text for field in describe_fields(CameraConfig())}
     assert texts["width"] == "Image width (in pixels)."
     assert texts["X_PB"].startswith("The pose of the body camera relative to a parent frame P.")
@@ -96,5 +93,4 @@ def test_a_class_without_source_has_bare_fields():
 
 @pytest.mark.parametrize("value", [1, "text", None, [1.0], {}])
 def test_plain_values_have_no_fields(value):
-    """Only configurations have fields."""
     assert describe_fields(value) == []

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark.rollout import flight_measures, jerk_measures, shortest_length
+from splatpilot.analysis.benchmark.rollout import flight_metrics, jerk_metrics, shortest_length
 from splatpilot.diagrams.flight.flight import Flight, Outcome
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder
@@ -25,17 +25,17 @@ def straight_flight(outcome=Outcome.GOAL, clearance=0.5) -> Flight:
 
 def test_success_needs_goal_and_clearance():
     """Arriving with a negative clearance, and any other end, is no success."""
-    assert flight_measures(straight_flight(), 6.0)["success"]
-    assert not flight_measures(straight_flight(clearance=-0.001), 6.0)["success"]
+    assert flight_metrics(straight_flight(), 6.0)["success"]
+    assert not flight_metrics(straight_flight(clearance=-0.001), 6.0)["success"]
     for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME):
-        measures = flight_measures(straight_flight(outcome), 6.0)
+        measures = flight_metrics(straight_flight(outcome), 6.0)
         assert not measures["success"]
         assert math.isnan(measures["path_excess"])
 
 
 def test_figures_of_a_straight_flight():
     """Speed, length and excess are those of the line; constant velocity has no jerk."""
-    measures = flight_measures(straight_flight(), shortest=5.0)
+    measures = flight_metrics(straight_flight(), shortest=5.0)
     assert measures["path_length_m"] == pytest.approx(6.014)
     assert measures["mean_speed_m_s"] == pytest.approx(2.0)
     assert measures["path_excess"] == pytest.approx(6.014 / 5.0 - 1)
@@ -50,7 +50,7 @@ def test_jerk_of_a_sine():
     times = np.append(np.arange(0, 801) * 0.02, 16.013)  # Four periods.
     velocities = np.zeros((802, 3))
     velocities[:, 1] = amplitude * np.sin(w * times)
-    jerk, smoothness = jerk_measures(velocities, times)
+    jerk, smoothness = jerk_metrics(velocities, times)
     assert jerk == pytest.approx(amplitude * w**2 / np.sqrt(2), rel=0.01)
     expected = -np.log(16.0**3 / amplitude**2 * (amplitude * w**2) ** 2 / 2 * 16.0)
     assert smoothness == pytest.approx(expected, abs=0.02)

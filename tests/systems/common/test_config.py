@@ -1,5 +1,3 @@
-"""Configurations from YAML and from the command line."""
-
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -31,7 +29,6 @@ def test_file_and_overrides_set_only_what_they_name(tmp_path):
 
 
 def test_dumped_scenario_loads_as_itself(tmp_path):
-    """A dumped scenario, of another kind of world too, loads into an equal scenario."""
     scenario = Scenario(seed=7, world=SceneConfig(path="some/where"), start=[1.0, 2.0, 3.0])
     path = tmp_path / "scenario.yaml"
     path.write_text(dump_config(scenario))
@@ -50,19 +47,19 @@ def test_dumped_scenario_loads_as_itself(tmp_path):
         ("speed=3", r"no field speed; did you mean policy.lattice.speed\?"),
         ("camera.lattice=3", r"no field camera.lattice; the fields are camera\."),
         ("qqqqqq=3", r"no field qqqqqq; the fields are .*timeout"),
-        ("policy=3", "'policy=3': policy is 3; it must be fields"),
-        ("world=foo", "'world=foo': world is foo; it must be fields"),
-        ("camera=null", "'camera=null': camera is null where fields belong"),
-        ("world=null", "'world=null': world is null where fields belong"),
-        ("policy=null", "'policy=null': policy is null where fields belong"),
-        ("sensors=null", "'sensors=null': sensors is null where fields belong"),
-        ("sensors={a: null}", "null}': sensors.a is null where fields belong"),
+        ("policy=3", "'policy=3': policy must be fields, NAME: VALUE each, got 3"),
+        ("world=foo", "'world=foo': world must be fields, .* got foo"),
+        ("camera=null", "'camera=null': camera must be fields, .* got null"),
+        ("world=null", "'world=null': world must be fields, .* got null"),
+        ("policy=null", "'policy=null': policy must be fields, .* got null"),
+        ("sensors=null", "'sensors=null': sensors must be fields, .* got null"),
+        ("sensors={a: null}", "null}': sensors.a must be fields, .* got null"),
         ("start=5", "'start=5': "),
         ("camera.X_PB.translation=[1, 2]", "'camera.X_PB.translation=.1, 2.': "),
         ("timeout=soon", "'timeout=soon': timeout must be a number, got soon"),
         ("seed=1.5", "seed must be a whole number, got 1.5"),
         ("goal=[1, x, 2]", r"goal\[1\] must be a number, got x"),
-        ("timeout", "'timeout' has no value; write FIELD=VALUE"),
+        ("timeout", "an override must be FIELD=VALUE, got 'timeout'"),
         ("goal=[1, 2", "'goal=.1, 2' is not YAML"),
     ],
 )
@@ -73,8 +70,7 @@ def test_bad_override_is_named(override, message):
 
 
 def test_letters_are_no_list():
-    """A string where a list belongs is not taken apart."""
-    with pytest.raises(ValueError, match=r"kinds is P02; write it as a list, \[P02\]"):
+    with pytest.raises(ValueError, match=r"kinds must be a list, got P02; write \[P02\]"):
         load_config(LibraryConfig(), overrides=["kinds=P02"])
     assert load_config(LibraryConfig(), overrides=["kinds=[P02]"]).kinds == ["P02"]
 
@@ -95,9 +91,8 @@ def test_a_field_of_the_type_that_is_there_first_of_all():
 
 
 def test_bad_file_is_named(tmp_path):
-    """Errors in a file name the file; so does its absence."""
     path = tmp_path / "scenario.yaml"
-    with pytest.raises(FileNotFoundError, match=r"scenario.yaml: there is no such file"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*scenario.yaml"):
         load_config(Scenario(), path)
     path.write_text("timout: 3\n")
     with pytest.raises(ValueError, match=r"scenario.yaml: there is no field timout; did"):
@@ -108,7 +103,7 @@ def test_bad_file_is_named(tmp_path):
     assert "\n" not in str(said.value)
     for nothing in ("", "# seed: 3\n", "---\n"):
         path.write_text(nothing)
-        with pytest.raises(ValueError, match=r"scenario.yaml: holds no field; write NAME: VALUE"):
+        with pytest.raises(ValueError, match=r"scenario.yaml: the text must be fields"):
             load_config(Scenario(), path)
 
 
@@ -117,28 +112,29 @@ def test_files_are_not_repeated_in_errors(tmp_path):
     that is too large, no text, or nested without end is not read at all."""
     path = tmp_path / "secret.yaml"
     path.write_text("password\n" * 1000)
-    with pytest.raises(ValueError, match=r"secret.yaml: the file is password password") as said:
+    with pytest.raises(
+        ValueError, match=r"secret.yaml: the text must be .* got password p"
+    ) as said:
         load_config(Scenario(), path)
     assert len(str(said.value)) < 200 + len(str(path))
     path.write_bytes(b"seed: \xff")
-    with pytest.raises(ValueError, match=r"secret.yaml is no text: byte 6 is 0xff"):
+    with pytest.raises(ValueError, match=r"secret.yaml must be a text .* 0xff at byte 6"):
         load_config(Scenario(), path)
     path.write_text("start: " + "[" * 5000 + "]" * 5000)
-    with pytest.raises(ValueError, match=r"secret.yaml: fields are nested too deeply"):
+    with pytest.raises(ValueError, match=r"secret.yaml is not YAML: .* nested too deeply"):
         load_config(Scenario(), path)
     path.write_text("start: &a [1, *a]")
-    with pytest.raises(ValueError, match=r"secret.yaml: line 1: \*a is within itself"):
+    with pytest.raises(ValueError, match=r"secret.yaml: start\[1\] must be a number, got \[1"):
         load_config(Scenario(), path)
     path.write_text("start: &a [1, 2, 3]\ngoal: *a")
     assert load_config(Scenario(), path).goal == [1, 2, 3]
     with path.open("wb") as file:
         file.truncate(100_000_000)
-    with pytest.raises(ValueError, match=r"secret.yaml has 100 MB; .* at most 64 MB"):
+    with pytest.raises(ValueError, match=r"secret.yaml must have at most 64 MB, got 100 MB"):
         load_config(Scenario(), path)
 
 
 def test_fields_that_may_be_empty_may_be_null(tmp_path):
-    """A field whose type allows for nothing takes null, whatever it holds."""
     config = load_config(HardwareConfig(), overrides=["time_of_flight={latency: 0.1}"])
     assert config.time_of_flight is not None and config.time_of_flight.latency == 0.1
     assert load_config(config, overrides=["time_of_flight=null"]).time_of_flight is None
@@ -185,8 +181,6 @@ def test_scenario_refuses_what_cannot_be_flown(override, message):
 
 
 def test_nothing_named_gives_the_defaults_and_they_are_valid(tmp_path):
-    """A file of one default, as good as none, gives all the defaults; those can be flown, but not
-    with a clock that stands."""
     path = tmp_path / "scenario.yaml"
     path.write_text("seed: 0\n")
     scenario = load_config(Scenario(), path)
@@ -208,14 +202,14 @@ def test_override_keeps_the_type_that_a_file_chose(tmp_path):
 
 
 def test_unknown_type_is_refused_with_those_there_are():
-    """A tag that nobody knows is an error that lists the tags that are known."""
-    with pytest.raises(ValueError, match=r"policy is !NobodyConfig, which .*!StraightConfig, !Rea"):
+    with pytest.raises(
+        ValueError,
+        match=r"policy must be one of .*!StraightC.* got !Nobody.*--import",
+    ):
         load_config(Scenario(), overrides=["policy=!NobodyConfig {}"])
 
 
 def test_type_of_another_package_is_read_and_written():
-    """A configuration that is registered later is read by its tag and written with it, also where
-    its type derives from one that is written without."""
 
     @dataclass
     class DerivedForestConfig(ForestConfig):
@@ -230,3 +224,26 @@ def test_type_of_another_package_is_read_and_written():
     assert "world: !DerivedForestConfig" in text
     assert parse_config(Scenario(), text, "dump").world == scenario.world
     assert "!ForestConfig" not in dump_config(Scenario())
+
+
+def test_drakes_functions_read_and_write_open_fields():
+    program = (
+        "from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed\n"
+        "import splatpilot as sp\n"
+        "text = 'policy: !ReactiveConfig {margin: 0.3}\\nworld: {spacing: 2.5}'\n"
+        "scenario = yaml_load_typed(schema=sp.Scenario, data=text)\n"
+        "assert type(scenario.policy).__name__ == 'ReactiveConfig', scenario\n"
+        "assert type(scenario.world).__name__ == 'ForestConfig', scenario\n"
+        "assert yaml_dump_typed(scenario) == sp.dump_config(scenario)\n"
+        "again = yaml_load_typed(schema=sp.Scenario, data=yaml_dump_typed(scenario))\n"
+        "assert again.policy == scenario.policy\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_override_reaches_a_configuration_that_is_not_there_yet():
+    config = load_config(HardwareConfig(), overrides=["time_of_flight.latency=0.1"])
+    assert config.time_of_flight is not None and config.time_of_flight.latency == 0.1
+    sensors = ["sensors={down: !OnboardCamera {width: 20}}", "sensors.down.height=10"]
+    camera = load_config(Scenario(), overrides=sensors).sensors["down"]
+    assert (camera.width, camera.height) == (20, 10)
