@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/student.py [CORPUS]
 
-Samples per second, with and without frozen modules, need a corpus. Times are CPU time, the minimum of
-a few repeats.
+Samples per second, with and without frozen modules, need a corpus. Times are CPU time, the minimum
+of a few repeats.
 """
 
 import sys
