@@ -28,8 +28,12 @@ from splatpilot.systems.policies.checkpoint import (
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import BASIS, HORIZON, unobstructed_way
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.flatness import array_namespace, lengths
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+from splatpilot.systems.vehicle.state import (
+    QuadrotorState,
+    array_namespace,
+    lengths,
+    pose_from_state,
+)
 
 RATE = 15.0  # [Hz]
 MIN_DEPTH, MAX_DEPTH = 0.3, 20.0  # [m]

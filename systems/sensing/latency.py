@@ -11,8 +11,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import array_namespace
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import array_namespace, pose_from_state
 
 CYCLE = 64
 """Frames whose delays differ; those of the frames that follow are the same again."""

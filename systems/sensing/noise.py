@@ -18,7 +18,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from splatpilot.systems.common.drake import input_port, output_port, weakly
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.flatness import array_namespace
+from splatpilot.systems.vehicle.state import array_namespace
 
 _GAMMA = 2.2  # of colors over light
 

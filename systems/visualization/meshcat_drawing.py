@@ -15,7 +15,7 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.drake import input_port
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.splats.scene import GaussianScene
@@ -232,9 +232,9 @@ class FlightVisualizer(LeafSystem):
         count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
         visualizer = FlightVisualizer(meshcat, count)
         builder.AddNamedSystem("flight_visualizer", visualizer)
-        builder.Connect(state_port, visualizer.state_input_port())
+        builder.Connect(state_port, visualizer.GetInputPort("state"))
         if hypotheses_port is not None:
-            builder.Connect(hypotheses_port, visualizer.hypotheses_input_port())
+            builder.Connect(hypotheses_port, visualizer.GetInputPort("hypotheses"))
         return visualizer
 
     def _eval(self, port: str, context: Context) -> np.ndarray:
@@ -353,7 +353,7 @@ class CameraVisualizer(LeafSystem):
         """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
         visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
         builder.AddNamedSystem("camera_visualizer", visualizer)
-        builder.Connect(camera.color_image_output_port(), visualizer.color_image_input_port())
+        builder.Connect(camera.GetOutputPort("color_image"), visualizer.GetInputPort("color_image"))
         return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
@@ -412,7 +412,7 @@ class BallsVisualizer(LeafSystem):
     def __init__(
         self,
         meshcat: Meshcat,
-        balls: MovingBalls,
+        balls: MovingSpheres,
         period: float = 1 / 15,
         path: str = "/splatpilot/balls",
     ):
@@ -431,7 +431,7 @@ class BallsVisualizer(LeafSystem):
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, balls: MovingBalls, meshcat: Meshcat
+        builder: DiagramBuilder, balls: MovingSpheres, meshcat: Meshcat
     ) -> "BallsVisualizer":
         """Adds a visualizer of balls, named `balls_visualizer`."""
         visualizer = BallsVisualizer(meshcat, balls)

@@ -17,7 +17,7 @@ from splatpilot.systems.common.files import require_writable_folder, written_ato
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.systems.common.readers import reason_of
 from splatpilot.systems.policies.student import encode_color, encode_depth
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.library import require_untested
 from splatpilot.training.corpus.samples import RECOVERY, Shard

@@ -23,12 +23,12 @@ from torch import Tensor
 
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded, require_field
-from splatpilot.systems.policies.agile_autonomy_inference import (
+from splatpilot.systems.policies.agile_autonomy import (
     AGILE_NETWORK,
-    FARTHEST,
     FOV_X,
+    MAX_DEPTH,
+    MIN_DEPTH,
     MODES,
-    NEAREST,
     PROGRESS,
     RATE,
 )
@@ -91,7 +91,7 @@ class AgileAutonomyAgent:
 
     def encode_depth(self, depth: Tensor) -> Tensor:
         """Computes images (N, 24, 32) of depth (N, R) [m]."""
-        spec, image = self.network.spec, 1.0 / depth.clamp(NEAREST, FARTHEST)
+        spec, image = self.network.spec, 1.0 / depth.clamp(MIN_DEPTH, MAX_DEPTH)
         return image.reshape(-1, spec.image_height, spec.image_width)
 
     def hypotheses(self, seen: Observation) -> tuple[Tensor, Tensor]:

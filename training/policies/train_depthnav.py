@@ -21,11 +21,11 @@ from torch import Tensor
 
 from splatpilot.systems.policies.depthnav import (
     ACCELERATION_LIMITS,
+    CAMERA_SIZE,
     DEPTHNAV_NETWORK,
-    FARTHEST,
     FOV_X,
-    IMAGE_SIZE,
-    NEAREST,
+    MAX_DEPTH,
+    MIN_DEPTH,
     RATE,
 )
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
@@ -81,7 +81,7 @@ class DepthNavLearner:
             spec.image_width,
             spec.image_height,
             FOV_X,
-            cell_aspect=(IMAGE_SIZE[1] / spec.image_height) / (IMAGE_SIZE[0] / spec.image_width),
+            cell_aspect=(CAMERA_SIZE[1] / spec.image_height) / (CAMERA_SIZE[0] / spec.image_width),
         )
         self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
         self._loss = loss
@@ -97,7 +97,7 @@ class DepthNavLearner:
         spec, vehicle, speed = self.network.spec, seen.vehicle, seen.speed
         start_yaw = torch.where(memory[:, -1].isnan(), vehicle.yaw, memory[:, -1]).detach()
         R_WS = observation.heading_frame(start_yaw)
-        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
+        image = 1.0 / seen.depth.clamp(MIN_DEPTH, MAX_DEPTH)
         v_target = observation.target_velocity(vehicle.p, seen.p_WG, speed)
         q_SB = quaternion_from_rotation(R_WS.mT @ vehicle.attitude())
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)

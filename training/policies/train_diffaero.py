@@ -22,9 +22,9 @@ from torch import Tensor
 from splatpilot.systems.policies.diffaero import (
     ACCELERATION_LIMITS,
     DIFFAERO_NETWORK,
-    FARTHEST,
     FOV_X,
-    NEAREST,
+    MAX_DEPTH,
+    MIN_DEPTH,
     RATE,
     VELOCITY_LIMITS,
     DiffAeroTofConfig,
@@ -83,7 +83,7 @@ class DiffAeroLearner:
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         spec = self.network.spec
         R_WH = observation.heading_frame(seen.vehicle.yaw)
-        image = observation.inverse_depth(seen.depth, NEAREST, FARTHEST)
+        image = observation.inverse_depth(seen.depth, MIN_DEPTH, MAX_DEPTH)
         state = observation.heading_observation(seen, R_WH)
         output, memory = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory

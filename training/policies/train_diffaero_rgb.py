@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, FARTHEST, NEAREST
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     HEIGHT,
@@ -29,7 +29,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
 from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import check_noise, noisy_color, relit
 from splatpilot.training.policies.networks import TrainableNetwork
@@ -193,7 +193,7 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
             rows.append((self._predict(torch.cat([encode_color(color), rays], 1))[0], target))
         predicted, target = (torch.cat(part) for part in zip(*rows, strict=True))
         z = 3.0 / (target + 0.6)
-        z_predicted = 3.0 / (predicted + 0.6).clamp(3.0 / FARTHEST, 3.0 / NEAREST)
+        z_predicted = 3.0 / (predicted + 0.6).clamp(3.0 / MAX_DEPTH, 3.0 / MIN_DEPTH)
         close = (z_predicted / z - 1.0).abs() < _CLOSE
         return {
             "success": float(close[z < _NEAR].float().mean()),
@@ -217,7 +217,7 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
         R_WB = rotation_matrices(self._data.labels(indices).X_WB[:, :4])
         R_WH = heading_frame(torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0]))
         rays = ((R_WH.mT @ R_WB) @ self._rays_B.mT).unflatten(2, (HEIGHT, WIDTH))
-        target = inverse_depth(self._targets[torch.from_numpy(indices)], NEAREST, FARTHEST)
+        target = inverse_depth(self._targets[torch.from_numpy(indices)], MIN_DEPTH, MAX_DEPTH)
         return torch.from_numpy(color).to(device).float(), rays, target
 
     def _min_depths(self) -> np.ndarray:

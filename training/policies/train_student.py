@@ -25,8 +25,8 @@ from splatpilot.systems.policies.student import (
     encode_state,
 )
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import rotation_matrices
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import (
     Appearance,

@@ -20,7 +20,7 @@ from torch import Tensor
 from splatpilot.diagrams.worlds.feasibility import draw_start_and_goal
 from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
-    make_blueprint,
+    make_spec,
     make_world,
     place_config,
 )
@@ -68,7 +68,7 @@ _SHAPES = {shape.__name__: shape for shape in (Sphere, Capsule, Cylinder, Box, H
 """Shapes that can be kept."""
 
 _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
-"""Of a `Blueprint`, each (3,) [m]."""
+"""Of a `WorldSpec`, each (3,) [m]."""
 
 ShapesAndPoints = tuple[list[Shape], *tuple[np.ndarray, ...]]
 
@@ -86,18 +86,18 @@ class WorldCache:
         with contextlib.suppress(OSError):
             require_writable_folder(self._folder)
 
-    def blueprint(self, config: WorldConfig, seed: int) -> ShapesAndPoints:
+    def spec(self, config: WorldConfig, seed: int) -> ShapesAndPoints:
         """Returns the shapes of a generated world, and its `lower_W`, `upper_W`, `p_WS` and `p_WG`.
 
         Raises:
-            ValueError: see `make_blueprint`.
+            ValueError: see `make_spec`.
         """
         file = self._file("json", f"{dump_config(config)}{seed}".encode())
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             kept = json.loads(file.read_text())
             os.utime(file)
             return [_shape(one) for one in kept["shapes"]], *(np.array(kept[p]) for p in _POINTS)
-        plan = make_blueprint(config, seed)
+        plan = make_spec(config, seed)
         shapes = [solid.shape for solid in plan.solids]
         if all(type(shape) in _SHAPES.values() for shape in shapes):
             content = {"shapes": [_described(shape) for shape in shapes]}
@@ -356,7 +356,7 @@ class WorldSelection(Config):
 def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
     """Makes the world of a scenario and seed as the benchmark flies it, without what cameras
     see."""
-    return TrainingWorld(*cache.blueprint(world_of(kind), seed))
+    return TrainingWorld(*cache.spec(world_of(kind), seed))
 
 
 def training_worlds(

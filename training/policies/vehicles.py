@@ -16,14 +16,12 @@ from splatpilot.systems.sensing.latency import CYCLE, frame_ages, frame_delays, 
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import (
     FlatnessControllerConfig,
-    attitudes_from_thrust,
-    flatness_commands,
-    headings_and_pulls,
-    rotation_matrices,
-    unit_vectors,
+    attitude_from_thrust,
+    flatness_command,
+    heading_along_motion,
 )
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, rk4_step
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState, rotation_matrices, unit_vectors
 
 _SUBSTEP = 0.02  # [s], at most, of integration and control
 
@@ -39,7 +37,7 @@ class PointMass(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3): z along the thrust that this acceleration takes, x where yaw points."""
-        return attitudes_from_thrust(self._thrust(), self.yaw)
+        return attitude_from_thrust(self._thrust(), self.yaw)
 
     def body_z(self) -> Tensor:
         """The z axes (N, 3) of the body in W."""
@@ -133,7 +131,8 @@ class BodyRate(NamedTuple):
         state, before = self.state, self.state
         for _ in range(count):
             before = state
-            command = flatness_commands(state, a_cmd, control, params, heading)
+            v_WB = QuadrotorState.of(state).v_WB
+            command = flatness_command(state, a_cmd, v_WB, heading, control, params)
             state = rk4_step(state, command, params, dt / count)
         change = QuadrotorState.of(state).v_WB - QuadrotorState.of(before).v_WB
         return BodyRate(state, change * (count / dt))
@@ -152,9 +151,11 @@ def yaw_rate(
     yaw: Tensor, v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
 ) -> Tensor:
     """Computes the controller's yaw rates (N,) [rad/s] of level vehicles at `yaw` (N,) [rad]."""
-    towards, pull = headings_and_pulls(v, control, heading)
-    error = torch.remainder(towards - yaw + torch.pi, 2 * torch.pi) - torch.pi
-    return (control.yaw_gain * pull * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
+    along, strength = heading_along_motion(v, control.yaw_speed)
+    if heading is not None:
+        along, strength = heading, torch.ones_like(strength)
+    error = torch.remainder(along - yaw + torch.pi, 2 * torch.pi) - torch.pi
+    return (control.yaw_gain * strength * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
 
 
 def _up(like: Tensor, size: float) -> Tensor:
