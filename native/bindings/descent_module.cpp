@@ -31,7 +31,7 @@ Vector gradient(const VoxelGrid& grid, const Vector& p_WQ) {
     const double last = first + static_cast<double>(grid.shape[k] - 1) * grid.voxel_size;
     p[k] = std::min(std::max(first, p[k]), last);  // NaN becomes `first`
   }
-  const Interpolant at = grid.interpolate(p);
+  const Interpolant at = grid.interpolate(p, true);
   return {at.gradient[0], at.gradient[1], at.gradient[2]};
 }
 

@@ -46,7 +46,7 @@ void grid_distances(const Grid& grid, const Corner& lower_W, const Corner& upper
       if (gradient) std::fill_n(gradient, 3, 0.0);
       continue;
     }
-    Interpolant at = voxels.interpolate(in_box);
+    Interpolant at = voxels.interpolate(in_box, gradient != nullptr);
     if (!inside) {
       const double away =
           std::sqrt(beyond[0] * beyond[0] + beyond[1] * beyond[1] + beyond[2] * beyond[2]);

@@ -21,7 +21,7 @@ using QueryPoints = Doubles<nb::shape<-1, 3>>;
 using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 constexpr size_t kNone = SIZE_MAX;  // in place of a shape
-constexpr size_t kBatch = 512;  // of points, which share their candidates for the nearest shape
+constexpr size_t kBatch = 512;      // of points, which share their candidates for the nearest shape
 
 // Generated worlds of given seeds depend on this order of additions.
 double dot(const double* a, const double* b) { return (a[0] * b[0] + a[2] * b[2]) + a[1] * b[1]; }

@@ -18,7 +18,7 @@ struct VoxelGrid {
   double voxel_size;
 
   // Beyond the outermost voxel centers the cell's polynomial is extrapolated.
-  Interpolant interpolate(const double* p) const {
+  Interpolant interpolate(const double* p, bool with_gradient) const {
     double f[3];
     int64_t at = 0;
     const int64_t strides[3] = {shape[1] * shape[2], shape[2], 1};
@@ -41,10 +41,15 @@ struct VoxelGrid {
     const auto mix = [](double a, double b, double part) { return a + part * (b - a); };
     const double low = mix(along_x[0][0], along_x[1][0], f[1]);
     const double high = mix(along_x[0][1], along_x[1][1], f[1]);
-    const double x = mix(mix(slope_x[0][0], slope_x[1][0], f[1]),
-                         mix(slope_x[0][1], slope_x[1][1], f[1]), f[2]);
-    const double y = mix(along_x[1][0] - along_x[0][0], along_x[1][1] - along_x[0][1], f[2]);
-    return {mix(low, high, f[2]), {x / voxel_size, y / voxel_size, (high - low) / voxel_size}};
+    Interpolant result{mix(low, high, f[2]), {}};
+    if (with_gradient) {
+      const double x = mix(mix(slope_x[0][0], slope_x[1][0], f[1]),
+                           mix(slope_x[0][1], slope_x[1][1], f[1]), f[2]);
+      const double y = mix(along_x[1][0] - along_x[0][0], along_x[1][1] - along_x[0][1], f[2]);
+      const double slopes[3] = {x, y, high - low};
+      for (int k = 0; k < 3; ++k) result.gradient[k] = slopes[k] / voxel_size;
+    }
+    return result;
   }
 };
 
