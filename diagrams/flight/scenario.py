@@ -116,7 +116,10 @@ class Scenario:
                 part.validate()
             except FieldError as error:
                 raise error.within(self) from None
-        self.observation.validate()
+        try:
+            self.observation.validate()
+        except FieldError as error:
+            raise error.within(self) from None
         _check_camera(self.camera)
         _check_simulator(self.simulator)
 
@@ -154,7 +157,7 @@ def _check_simulator(simulator: SimulatorConfig) -> None:
         require(value == 0, f"simulator.{name}", "0", value, "flights start then and do not wait")
 
 
-_FOLDER = Path(__file__).parent / "scenarios"
+_FOLDER = Path(__file__).parents[1] / "scenarios"
 
 
 def benchmark_scenarios() -> dict[str, Path]:

@@ -8,13 +8,14 @@ cameras of flights see it, metrics of the scene do not.
 
 import functools
 import logging
+import os
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RigidTransform
@@ -41,14 +42,13 @@ from splatpilot.systems.collision.frontier import (
     reachable_space,
     with_obstacles,
 )
-from splatpilot.systems.common.config import yaml_problem
 from splatpilot.systems.common.files import (
     folder_written_atomically,
     require_scene,
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_text, reason_of, require_shallow
+from splatpilot.systems.common.readers import read_text, reason_of, yaml_errors
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene
@@ -56,6 +56,7 @@ from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_p
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
+CAPTURE = "capture"  # folder of a capture that was rendered for the scene
 ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
 REPRESENTATIONS = "3dgs", "2dgs"
@@ -130,19 +131,17 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     """Reads `scene.yaml` of the scene folder `path`."""
     file = Path(path) / "scene.yaml"
     text = read_text(file)
-    require_shallow(text, str(file))
     try:
-        metadata = yaml_load_typed(schema=SceneMetadata, data=text)
-    except Exception as error:  # Drake's reader raises anything for values of other types
-        wrong = yaml_problem(error) if isinstance(error, yaml.YAMLError) else reason_of(error)
-        raise ValueError(f"{file}: {wrong}; reconstruct the scene again or repair it") from None
+        with yaml_errors("the text"):
+            metadata = yaml_load_typed(schema=SceneMetadata, data=text)
+    except Exception as error:  # Drake's reader raises any type.
+        remedy = "reconstruct the scene again or repair it"
+        raise ValueError(f"{file}: {reason_of(error)}; {remedy}") from None
     version = metadata.format_version
-    remedy = (
-        "reconstruct the scene again"
-        if version < FORMAT_VERSION
-        else "use the version of the program that wrote the scene"
-    )
-    require(version == FORMAT_VERSION, f"{file}: format_version", str(FORMAT_VERSION), version, remedy)
+    old = version < FORMAT_VERSION
+    remedy = "reconstruct the scene again" if old else "use a newer version of the program"
+    what = f"{file}: format_version"
+    require(version == FORMAT_VERSION, what, str(FORMAT_VERSION), version, remedy)
     try:
         metadata.validate()
     except ValueError as error:
@@ -210,11 +209,32 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
 
 
 def check_scene_target(path: str | Path) -> None:
-    """Checks that a scene may be written to `path`: nothing, an empty folder or a scene."""
+<<<<<<< HEAD
+    """Checks that a scene may be written to `path`.
+
+    It must be absent, an empty folder, a scene, or a folder with the scene's own `CAPTURE`.
+    """
     path = Path(path).absolute()
     if path.exists() and not (path / "scene.yaml").is_file():
-        empty = path.is_dir() and not any(path.iterdir())
+        own = {CAPTURE, f".{CAPTURE}.partial"}
+        empty = path.is_dir() and {entry.name for entry in path.iterdir()} <= own
         require(empty, "scene folder", "new, empty or a scene", path, "choose another folder")
+=======
+    """Checks that a scene may be written to `path`: nothing there, an empty folder, a scene, or the
+    capture that it is made of, in `CAPTURE`.
+
+    Raises:
+        ValueError: if something else is there.
+        OSError: if the folder in which it would stand cannot be made or written to.
+    """
+    path = Path(path).absolute()
+    if path.exists() and not (path / "scene.yaml").is_file():
+        own = {CAPTURE, f".{CAPTURE}.partial"}
+        if not path.is_dir() or {entry.name for entry in path.iterdir()} - own:
+            raise ValueError(
+                f"{path}: exists and is no scene, so it is not overwritten; choose another folder"
+            )
+>>>>>>> house
     parent = next(parent for parent in path.parents if parent.exists())
     if not parent.is_dir():
         raise NotADirectoryError(f"{parent}: is a file, not a folder for {path.name}")
@@ -258,6 +278,8 @@ def write_scene_folder(
         esdf.save(new / "esdf.npz")
         if isinstance(world.background, EnvironmentMap):
             world.background.save(new / ENVIRONMENT)
+        if (path / CAPTURE).is_dir():
+            shutil.copytree(path / CAPTURE, new / CAPTURE, copy_function=os.link)
         write_scene_metadata(new, metadata)
     return metadata
 

@@ -232,9 +232,9 @@ class FlightVisualizer(LeafSystem):
         count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
         visualizer = FlightVisualizer(meshcat, count)
         builder.AddNamedSystem("flight_visualizer", visualizer)
-        builder.Connect(state_port, visualizer.state_input_port())
+        builder.Connect(state_port, visualizer.GetInputPort("state"))
         if hypotheses_port is not None:
-            builder.Connect(hypotheses_port, visualizer.hypotheses_input_port())
+            builder.Connect(hypotheses_port, visualizer.GetInputPort("hypotheses"))
         return visualizer
 
     def _eval(self, port: str, context: Context) -> np.ndarray:
@@ -353,7 +353,7 @@ class CameraVisualizer(LeafSystem):
         """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
         visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
         builder.AddNamedSystem("camera_visualizer", visualizer)
-        builder.Connect(camera.color_image_output_port(), visualizer.color_image_input_port())
+        builder.Connect(camera.GetOutputPort("color_image"), visualizer.GetInputPort("color_image"))
         return visualizer
 
     def _publish(self, context: Context) -> EventStatus:

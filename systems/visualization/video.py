@@ -62,8 +62,10 @@ class VideoRecorder(LeafSystem):
         info = camera.camera_info()
         recorder = VideoRecorder(info.width(), info.height(), fps)
         builder.AddNamedSystem("video", recorder)
-        builder.Connect(camera.color_image_output_port(), recorder.color_image_input_port())
-        builder.Connect(camera.depth_image_16u_output_port(), recorder.depth_image_16u_input_port())
+        builder.Connect(camera.GetOutputPort("color_image"), recorder.GetInputPort("color_image"))
+        builder.Connect(
+            camera.GetOutputPort("depth_image_16u"), recorder.GetInputPort("depth_image_16u")
+        )
         return recorder
 
     def _clear(self, context: Context) -> EventStatus:

@@ -46,8 +46,6 @@ def meshcat(shared_meshcat):
 
 
 def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
-    """At 10 Hz, 0.35 s of flight draws the vehicle, a trail through the four places it was shown
-    at, and one fan."""
     waypoints_B = np.cumsum(np.full((3, 10, 3), 0.1), axis=1)
     plan = Hypotheses(0.0, RigidTransform([1, 0, 2]), waypoints_B, np.array([1.0, 2.0, 3.0]))
     ends = [hover_state([x, 0, 2]) for x in (1, 3)]
@@ -68,8 +66,6 @@ def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
 
 
 def test_fan_is_ribbons_along_the_plans_in_the_colours_of_their_costs():
-    """Each ribbon is as wide as asked for, level, and centred on its plan; the cheapest is green,
-    the dearest red; every triangle is of one ribbon."""
     generator = np.random.default_rng(0)
     waypoints_B = np.cumsum(generator.uniform(-0.1, 0.4, (4, 10, 3)), axis=1)
     X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1, 2, 3])
@@ -89,8 +85,6 @@ def test_fan_is_ribbons_along_the_plans_in_the_colours_of_their_costs():
 
 
 def test_balls_are_drawn_where_they_are(meshcat):
-    """Each ball has its radius, stands where it is at the time of the last picture, and far below
-    while it is nowhere."""
     paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
     balls = MovingSpheres([0.5, 0.25], paths, period=0.1)
     builder = DiagramBuilder()
@@ -116,7 +110,6 @@ def vertices(drawing: dict, attribute: str) -> np.ndarray:
 
 
 def test_gaussians_are_drawn_as_points_of_their_size(meshcat):
-    """Those inside the box are points at their means, in their colours as linear light."""
     scene = GaussianScene.from_colors(
         means=[[1, 0, 1], [2, 0.5, 1], [100, 0, 1]],
         quats=np.tile([1.0, 0, 0, 0], (3, 1)),
@@ -134,7 +127,6 @@ def test_gaussians_are_drawn_as_points_of_their_size(meshcat):
 
 
 def test_many_gaussians_are_thinned_evenly(meshcat):
-    """A third of the points are every third one, from the first to the last."""
     x = np.arange(301.0)
     scene = GaussianScene.from_colors(
         means=np.column_stack([x, 0 * x, 0 * x]),
@@ -150,7 +142,6 @@ def test_many_gaussians_are_thinned_evenly(meshcat):
 
 
 def test_goal_is_a_ball_at_its_place(meshcat):
-    """A translucent sphere of the goal's radius about the goal."""
     draw_goal(meshcat, "/splatpilot/goal", np.array([3.0, -1.0, 2.0]), radius=0.3)
     drawing = drawn(meshcat, "/splatpilot/goal")
     assert drawing["geometries"][0]["radius"] == 0.3
@@ -160,8 +151,6 @@ def test_goal_is_a_ball_at_its_place(meshcat):
 
 
 def test_distance_slice_is_coloured_by_distance(meshcat):
-    """The slice fills the box at its height: red on and in surfaces, yellow at 1 m, blue from 2 m,
-    grey where the distance is unknown."""
     field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
     draw_distance_slice(meshcat, "/splatpilot/slice", field, height=1.0)
     drawing = drawn(meshcat, "/splatpilot/slice")
@@ -191,8 +180,6 @@ def test_distance_slice_is_coloured_by_distance(meshcat):
 
 
 def test_camera_picture_is_hung_at_its_rate(meshcat):
-    """Every second of 10 images a second is hung into the frustum: after half a second that of
-    0.4 s."""
     info = CameraInfo(width=32, height=24, fov_y=1.0)
     builder = DiagramBuilder()
     shown_at = []
@@ -215,7 +202,6 @@ def test_camera_picture_is_hung_at_its_rate(meshcat):
 
 
 def test_picture_document_is_the_picture():
-    """The glTF document carries the image itself and the rectangle's corners, turned to y up."""
     rgb = np.zeros((24, 32, 3), np.uint8)
     rgb[:12, :, 0] = 250
     corners = np.array([[-1.0, -2, 3], [1, -2, 3], [1, 2, 3], [-1, 2, 3]])

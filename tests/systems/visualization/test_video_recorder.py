@@ -39,8 +39,6 @@ def recorder_after_one_second() -> VideoRecorder:
 
 
 def test_video_that_its_writer_broke_is_not_kept(recorder_after_one_second, tmp_path, monkeypatch):
-    """A video that lacks pictures, of which its writer said nothing, is an error with the file, and
-    does not take the place of the one before."""
     path = tmp_path / "video.mp4"
     recorder_after_one_second.save(path, max_depth=20.0)
     before, frames = path.read_bytes(), recorder_after_one_second.frames
@@ -58,7 +56,6 @@ def test_video_that_its_writer_broke_is_not_kept(recorder_after_one_second, tmp_
 
 
 def test_video_holds_every_frame_in_order(recorder_after_one_second, tmp_path):
-    """One second at 10 Hz is ten frames: growing red on the left, depth on the right."""
     path = tmp_path / "video.mp4"
     recorder_after_one_second.save(path, max_depth=20.0)
     video = cv2.VideoCapture(str(path))
@@ -77,13 +74,11 @@ def test_video_holds_every_frame_in_order(recorder_after_one_second, tmp_path):
 
 
 def test_unwritable_video_is_an_error(recorder_after_one_second, tmp_path):
-    """A folder that is not there is an error that names the file."""
     with pytest.raises(OSError, match=r"nowhere/video\.mp4"):
         recorder_after_one_second.save(tmp_path / "nowhere" / "video.mp4", max_depth=20.0)
 
 
 def test_depth_colours_fade_with_distance():
-    """Nearer is brighter; out of range, on either side, is black."""
     picture = colorize_depth(np.array([[0.0, 0.5, 2.0, 8.0, 65.535]]), max_depth=20.0)
     brightness = picture[0].astype(int).sum(axis=1)
     assert brightness[0] == brightness[4] == 0
