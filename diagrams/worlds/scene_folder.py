@@ -209,7 +209,6 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
 
 
 def check_scene_target(path: str | Path) -> None:
-<<<<<<< HEAD
     """Checks that a scene may be written to `path`.
 
     It must be absent, an empty folder, a scene, or a folder with the scene's own `CAPTURE`.
@@ -219,22 +218,6 @@ def check_scene_target(path: str | Path) -> None:
         own = {CAPTURE, f".{CAPTURE}.partial"}
         empty = path.is_dir() and {entry.name for entry in path.iterdir()} <= own
         require(empty, "scene folder", "new, empty or a scene", path, "choose another folder")
-=======
-    """Checks that a scene may be written to `path`: nothing there, an empty folder, a scene, or the
-    capture that it is made of, in `CAPTURE`.
-
-    Raises:
-        ValueError: if something else is there.
-        OSError: if the folder in which it would stand cannot be made or written to.
-    """
-    path = Path(path).absolute()
-    if path.exists() and not (path / "scene.yaml").is_file():
-        own = {CAPTURE, f".{CAPTURE}.partial"}
-        if not path.is_dir() or {entry.name for entry in path.iterdir()} - own:
-            raise ValueError(
-                f"{path}: exists and is no scene, so it is not overwritten; choose another folder"
-            )
->>>>>>> house
     parent = next(parent for parent in path.parents if parent.exists())
     if not parent.is_dir():
         raise NotADirectoryError(f"{parent}: is a file, not a folder for {path.name}")
