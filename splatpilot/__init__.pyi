@@ -28,7 +28,7 @@ from .systems.vehicle.quadrotor_plant import QuadrotorPlant
 from .systems.vehicle.quadrotor_state import QuadrotorState
 from .systems.vehicle.state_to_pose import StateToPose
 from .training.captures.capture import Capture
-from .training.captures.read_capture import read_capture, register_capture
+from .training.captures.capture_registry import read_capture, register_capture
 from .training.policies.registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
