@@ -116,7 +116,7 @@ def test_refusals(tmp_path, config, capsys):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="exists and is no scene"):
         run(capture=tmp_path / "nowhere", out=tmp_path, config=config)
-    with pytest.raises(ValueError, match="no capture of a known kind; known are TartanAir V1"):
+    with pytest.raises(ValueError, match="unknown capture format; known are TartanAir V1"):
         run(capture=tmp_path, out=tmp_path / "scene", config=config)
     with pytest.raises(FileNotFoundError, match="nowhere: there is no such folder"):
         run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=config)
