@@ -83,7 +83,10 @@ def test_length_in_a_file_of_gaussians(seen_room, tmp_path, capsys):
         (["room.ply", "--out", "out.spz", "--factor", "2"], "written as PLY; name it so, out.ply"),
         (["room.ply", "--out", "room.ply", "--factor", "2"], "room.ply: exists already"),
         (["room.ply", "--out", "out.ply", "--height", "2"], "a file has no cameras"),
-        (["room.ply", "--out", "out.ply", "--factor", "0"], "factor is 0.0; it must be positive"),
+        (
+            ["room.ply", "--out", "out.ply", "--factor", "0"],
+            "factor must be finite and > 0, got 0.0",
+        ),
         (["unscaled", "--out", "out", "--up", "-y"], "z is up in scene folders; leave --up"),
         (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0,0", "2,0,0"], "lie in a line"),
         (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0,0", "0,0,1"], "at 90 degrees"),
