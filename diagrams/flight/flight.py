@@ -110,7 +110,7 @@ class Flight:
     reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
 
     def summary(self) -> dict[str, float | str]:
-        """Returns metrics; path length is along the samples, mean speed is path length over time."""
+        """Returns metrics; mean speed is the path length, along the samples, over time."""
         p_WB = QuadrotorState.of(self.states).p_WB
         path_length = float(np.linalg.norm(np.diff(p_WB, axis=0), axis=1).sum())
         duration = float(self.times[-1])
@@ -271,8 +271,8 @@ def has_landed(diagram: Diagram, context: Context) -> bool:
 def record_flight(
     diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
 ) -> Flight:
-    """Collects the logs of a flight, which took `wall_time` [s]. After an error it evaluates no port,
-    which could raise it again."""
+    """Collects the logs of a flight, which took `wall_time` [s]. After an error it evaluates no
+    port, which could raise it again."""
     logs = {
         name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
         for name in ("state", "command")
