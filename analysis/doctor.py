@@ -26,7 +26,6 @@ _SERVED = {
     "train": "training, reconstruction and measures of scenes",
     "ros": "captures in ROS bags",
     "spz": "Gaussians in SPZ of version 4",
-    "viser": "`splatpilot view --viser`",
 }
 """What each extra is for."""
 
@@ -168,7 +167,7 @@ def _is_installed(package: str) -> bool:
 
 
 def _data() -> list[Finding]:
-    folder, serves = data_folder(), "`splatpilot places`, and tests on real captures"
+    folder, serves = data_folder(), "`splatpilot scene fetch`, and tests on real captures"
     if folder is None or not folder.is_dir():
         found = f"{DATA} is not set" if folder is None else f"{folder} is no folder"
         return [Finding("data", found, f"export {DATA}=FOLDER of captures and meshes", serves)]
@@ -192,5 +191,5 @@ def _scenes() -> list[Finding]:
     found = f"{scenes_folder()} has those of {there or 'no scenario'}"
     if not absent:
         return [Finding("scenes", found)]
-    remedy = f"splatpilot places, or export {SCENES}=FOLDER of scenes"
+    remedy = f"splatpilot scene fetch, or export {SCENES}=FOLDER of scenes"
     return [Finding("scenes", found, remedy, f"the scenarios {', '.join(absent)}")]

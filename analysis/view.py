@@ -37,7 +37,6 @@ from splatpilot.systems.visualization.meshcat_drawing import (
     draw_goal,
 )
 from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
-from splatpilot.systems.visualization.viser_place import serve_place
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
@@ -294,19 +293,3 @@ def run(
         partial.write_text(place_page(meshcat.StaticHtml(), place))
     print(f"Wrote {out}, a page for any browser")
     return out
-
-
-def serve(*, what: str, seed: int | None = None, overrides: Sequence[str] = ()) -> None:
-    """Serves a place with viser until it is interrupted, and prints where; for the arguments see
-    `run`.
-
-    Raises:
-        ModuleNotFoundError: if viser is not installed; the message says what to install.
-        FileNotFoundError, ValueError, OSError: see `shown_place`.
-    """
-    server = serve_place(shown_place(what, seed, overrides))
-    print(f"Look at http://localhost:{server.get_port()}; Ctrl-C ends it", flush=True)
-    try:
-        server.sleep_forever()
-    finally:
-        server.stop()

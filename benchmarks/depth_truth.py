@@ -15,14 +15,14 @@ field is free, more than 0.3 m from all that it knows.
 import argparse
 from pathlib import Path
 
+from depth_errors import DepthFrame, depth_errors
 from harness import header, row
-
-from splatpilot.analysis.depth_errors import DepthFrame, depth_errors
-from splatpilot.analysis.depth_truth import (
+from true_depth import (
     frames_along_flight,
     frames_of_capture,
     ghosts_along_flight,
 )
+
 from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

@@ -1,4 +1,4 @@
-"""Learned drone flight inside Gaussian-splat reconstructions of real places, as Drake systems.
+"""Learned drone flight inside Gaussian-splat reconstructions, as Drake systems.
 
     import splatpilot as sp
 
@@ -6,17 +6,14 @@
     world = sp.make_world(scenario.world, scenario.seed)
     flight = sp.fly(sp.BuildFlightDiagram(scenario, world), scenario, world)
 
-The public names are those of `__init__.pyi`, each loaded when it is first used: flying imports
-neither torch nor what reads captures.
+The public names are listed in `__init__.pyi`. Each is imported on first use, so flying imports
+neither torch nor the capture readers.
 """
 
 from typing import Any
 
 import lazy_loader
 
-from splatpilot.systems.common.numpy_kernels import fix_numpy_kernels
-
-fix_numpy_kernels()
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
@@ -30,7 +27,6 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         from splatpilot.systems.common.extras import missing_extra
 
-        missing = missing_extra(error, f"splatpilot.{name}")
-        if missing is None:
-            raise
-        raise ModuleNotFoundError(missing, name=error.name) from error
+        if missing := missing_extra(error, f"splatpilot.{name}"):
+            raise ModuleNotFoundError(missing, name=error.name) from error
+        raise

@@ -18,15 +18,15 @@ from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.commands.options import SCENARIOS
 from splatpilot.analysis.faults.campaign import FaultsConfig
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
-from splatpilot.analysis.places import PlaceConfig
-from splatpilot.analysis.tour import TourConfig
+from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
-from splatpilot.systems.common.config import describe_fields, load_config
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.field_help import describe_fields
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.check import CheckConfig
 from splatpilot.training.captures.render import RenderConfig
@@ -41,8 +41,7 @@ IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 CONFIGS: dict[str, Any] = {
     "reconstruct": ReconstructConfig,
     "ablate": ReconstructConfig,
-    "tour": TourConfig,
-    "places": PlaceConfig,
+    "places": RenderedSceneConfig,
     "fidelity": FidelityConfig,
     "px4": Px4Config,
     "faults": FaultsConfig,

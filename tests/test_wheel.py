@@ -116,7 +116,6 @@ def test_benchmarks(run, tmp_path):
         (["measure", "."], "torch", "train"),
         (["ablate", "."], "torch", "train"),
         (["fidelity", "."], "torch", "train"),
-        (["tour", "P02", "--out", "tour"], "torch", "train"),
         (["train", "diffaero", "--out", "trained"], "torch", "train"),
         (["capture", "check", "photographs"], "pycolmap", "photos"),
     ],

@@ -1,5 +1,4 @@
-"""What a study is: the same flights for every policy, each with a name by which it can be flown
-again."""
+"""Studies: the same flights for every policy, with a unique name each."""
 
 import re
 from collections.abc import Iterator
@@ -10,18 +9,19 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, MAX_SPEED, speed_of
+from splatpilot.diagrams.flight.policies import (
+    BENCHMARK_POLICIES,
+    MAX_SPEED,
+    policy_named,
+    speed_of,
+)
 from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.seeds import study_seeds
 from splatpilot.systems.common.validation import require
 
-# Policies of a study: registered ones, files of weights and classes of others, each with some of
-# its fields set, and a label that its flights are named by.
-
-
 SCENARIO = "scenario"
-"""The policy that is the scenario's own: what stands in its `policy` block."""
+"""The policy of the scenario itself, its `policy` block."""
 
 _LABEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
 _FIELD = r"[A-Za-z_][\w.]*="
@@ -29,36 +29,31 @@ _OUTSIDE_BRACKETS = r"(?![^\[{(]*[\]})])"
 
 
 class Variant(NamedTuple):
-    """A policy, and what of its configuration differs from how it ships."""
+    """A policy, with a label and changed fields of its configuration."""
 
     label: str
-    """What its flights are named by: good as the name of a file."""
+    """Names its flights, and files."""
     policy: str
     """A registered name, a file of weights (.npz), "module:Class", or `SCENARIO`."""
     overrides: tuple[str, ...] = ()
-    """"dotted.field=YAML value" each, of the policy's configuration."""
+    """"dotted.field=YAML value" of its configuration."""
 
     @property
     def weights(self) -> Path | None:
-        """The file of weights that it flies by, if it is given as one."""
+        """The file of weights, if it is given as one."""
         return Path(self.policy) if self.policy.endswith(".npz") else None
 
     def config(self, speed: float, own: Any) -> Any:
         """
-        The configuration that flies.
+        Returns the configuration of the policy.
 
         Args:
             speed: nominal [m/s].
-            own: the scenario's own policy, flown by `SCENARIO`.
+            own: the scenario's policy, for `SCENARIO`.
 
         Raises:
-            FileNotFoundError, ValueError: see `policy_named`; or for unknown fields and values out
-                of range.
+            FileNotFoundError, ValueError: see `policy_named`; or for invalid overrides.
         """
-        # Here, because the command line reads policies before anything slow is imported.
-        from splatpilot.diagrams.flight.policies import policy_named
-        from splatpilot.systems.common.config import load_config
-
         config = own if self.policy == SCENARIO else policy_named(self.policy, speed)
         if not self.overrides:
             return config
@@ -74,11 +69,11 @@ def parse_variant(text: str) -> Variant:
     """
     Reads `[LABEL=]POLICY[:FIELD=VALUE[:FIELD=VALUE...]]`.
 
-    The label is the name of the policy, of its class or of its file where none is given, followed
-    by the fields that are set: `reactive:margin=0.2` is labelled `reactive-margin-0.2`.
+    The default label is the name of the policy, class or file with the fields that are set:
+    `reactive:margin=0.2` is labeled `reactive-margin-0.2`.
 
     Raises:
-        ValueError: if the label is none that a file can bear, or a field has another place.
+        ValueError: if the label cannot name a file, or the study sets the field.
     """
     label, _, rest = text.partition("=")
     if text.startswith("="):
@@ -107,20 +102,20 @@ def parse_variant(text: str) -> Variant:
         label = "-".join([name, *(override.replace("=", "-", 1) for override in overrides)])
     if not _LABEL.fullmatch(label):
         raise ValueError(
-            f"the policy {text[:100]!r} would be labelled {label[:100]!r}, but labels name files: "
+            f"the policy {text[:100]!r} would be labeled {label[:100]!r}, but labels name files: "
             "give it one of at most 80 letters, digits and _ . + - in front, LABEL=POLICY"
         )
     return Variant(label, policy, tuple(overrides))
 
 
 def split_policies(text: str) -> list[str]:
-    """The policies of a list with commas; those in brackets belong to values."""
+    """Splits a list at commas outside of brackets."""
     return [part.strip() for part in re.split("," + _OUTSIDE_BRACKETS, text) if part.strip()]
 
 
 def sweep(text: str) -> Iterator[str]:
     """
-    The variants of a sweep, `POLICY:FIELD=VALUE,VALUE,...[:FIELD=VALUE,...]`, one for each
+    Yields the variants of a sweep, `POLICY:FIELD=VALUE,VALUE,...[:FIELD=VALUE,...]`, one for each
     combination of values.
 
     Raises:
@@ -147,12 +142,12 @@ class RolloutSpec(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Its name: unique in a study, and good as the name of a file."""
+        """Its name: unique in a study, and valid as the name of a file."""
         return flight_name(self.scenario, self.policy, self.speed, self.seed)
 
 
 def flight_name(scenario: str, policy: str, speed: float | None, seed: int) -> str:
-    """What a flight is called; `speed` [m/s] is None where the policy flies at its own."""
+    """Returns the name of a flight; `speed` [m/s] is None if the policy has its own."""
     parts = [scenario, policy, *([] if speed is None else [f"{speed:g}"]), f"{seed:03d}"]
     return "-".join(parts)
 
@@ -171,27 +166,26 @@ class StudyConfig:
     seeds: int = 20
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
-    # Whose seeds: "dev", those by which things are chosen, or "test", see
-    # `systems/common/seeds.py`.
+    # Seeds: "dev", for choosing, or "test", see `systems/common/seeds.py`.
     split: str = "dev"
 
     @property
     def variants(self) -> list[Variant]:
-        """The policies, read."""
+        """The policies, parsed."""
         return [parse_variant(policy) for policy in self.policies]
 
     @property
     def policy_names(self) -> list[str]:
-        """The policies by the labels that their flights bear."""
+        """The labels of the policies."""
         return [variant.label for variant in self.variants]
 
     @property
     def flies_own_policies(self) -> bool:
-        """Whether the scenarios' own policies fly."""
+        """True if the scenarios' own policies fly."""
         return any(variant.policy == SCENARIO for variant in self.variants)
 
     def rollouts(self) -> list[RolloutSpec]:
-        """All flights; those through the same place stand together."""
+        """Returns all flights; those through the same world are neighbors."""
         policies = self.policy_names
         return [
             RolloutSpec(Path(scenario).stem, policy, speed, seed)
@@ -203,11 +197,10 @@ class StudyConfig:
 
     def load_scenarios(self) -> dict[str, Scenario]:
         """
-        The scenarios by name, with the overrides.
+        Loads the scenarios, by name, with the overrides.
 
         Raises:
-            ValueError: for an unknown scenario, policy or speed, anything given twice, and values
-                that cannot be flown; the message names it and what there is.
+            ValueError: for an invalid study or scenario, or an unknown policy.
         """
         self.validate()
         for override in self.overrides:
@@ -227,17 +220,10 @@ class StudyConfig:
         return scenarios
 
     def validate(self) -> None:
-        """
-        Raises:
-            ValueError: for numbers out of range, anything given twice or not at all.
-        """
+        """Raises ValueError for numbers out of range, and missing or repeated names."""
         study_seeds(self.split, self.seeds)
         for speed in self.speeds:
             require(0.0 < speed <= MAX_SPEED, "speeds", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
-        self._check_names()
-
-    def _check_names(self) -> None:
-        """Raises ValueError unless everything is given, once, and all flights differ in name."""
         given: dict[str, list[Any]] = {
             "scenario": [Path(scenario).stem for scenario in self.scenarios],
             "policy": self.policy_names,
@@ -247,17 +233,15 @@ class StudyConfig:
         for what, names in given.items():
             if not names:
                 raise ValueError(f"the study has no {what}; name at least one")
-            seen = set()
-            for name in names:
-                if name in seen:
-                    raise ValueError(
-                        f"the {what} {name} is given twice; give it once, or another name: "
-                        "policies take one as LABEL=POLICY, scenarios that of their file"
-                    )
-                seen.add(name)
+            repeated = [name for k, name in enumerate(names) if name in names[:k]]
+            if repeated:
+                raise ValueError(
+                    f"the {what} {repeated[0]} is given twice; give it once, or another name: "
+                    "policies take one as LABEL=POLICY, scenarios that of their file"
+                )
 
     def _check_own_policy(self, file: Path, policy: Any) -> None:
-        """Raises ValueError if the scenarios' own policies fly and this one's cannot."""
+        """Raises ValueError if a scenario's own policy should fly and cannot."""
         own = [variant for variant in self.variants if variant.policy == SCENARIO]
         if not own:
             return
@@ -273,14 +257,14 @@ class StudyConfig:
             variant.config(self.speeds[0], policy)
 
     def unflown_policies(self) -> list[Path]:
-        """Files of scenarios with a policy of their own that this study does not fly."""
+        """Returns the files of scenarios with a policy of their own that the study does not fly."""
         if self.flies_own_policies:
             return []
         return [file for file in map(scenario_file, self.scenarios) if has_own_policy(file)]
 
 
 def has_own_policy(file: Path) -> bool:
-    """Whether a scenario file says which policy flies it; False of what is no such file."""
+    """Tells whether a file is a scenario with a `policy`."""
     try:
         root = yaml.compose(file.read_text(), yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -290,24 +274,23 @@ def has_own_policy(file: Path) -> bool:
 
 
 def default_policies(scenarios: list[str]) -> list[str]:
-    """Who flies where nobody is named: the scenarios' own policies, if all of them have one, or all
-    of ours."""
+    """Returns the default policies: the scenarios' own, if all have one, or the benchmark's."""
     own = all(has_own_policy(scenario_file(scenario)) for scenario in scenarios)
     return [SCENARIO] if own else list(BENCHMARK_POLICIES)
 
 
 def _check_override(override: str) -> None:
-    """Raises ValueError for what differs between the flights of a study."""
+    """Raises ValueError for fields that differ between the flights of a study."""
     field, _, value = override.partition("=")
     section, _, inner = field.partition(".")
     if section == "policy":
         example = f"NAME:{inner}={value}" if inner else "NAME"
         raise ValueError(
-            f"the override {override!r} has no place in a study, whose flights have their own "
-            f"policies: write it as one of them, --policies {example}"
+            f"a study must not override {field}, got {override!r}; its flights have their own "
+            f"policies, write --policies {example}"
         )
     if section == "seed":
         raise ValueError(
-            f"the override {override!r} has no place in a study, whose flights have their own "
-            "seeds; say how many with --seeds"
+            f"a study must not override {field}, got {override!r}; its flights have their own "
+            "seeds, give their number with --seeds"
         )

@@ -2,9 +2,9 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from splatpilot.analysis.commands.options import add_overrides, add_overwrite, add_verb, find_place
-from splatpilot.analysis.commands.reconstruct import reconstruction_defaults
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -28,7 +28,13 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         "--out", type=Path, default=Path("out/ablation"), help="output folder (%(default)s)"
     )
     add_overwrite(ablate)
-    add_overrides(ablate, ("iterations=3000", "image_width=320"), reconstruction_defaults)
+    add_overrides(ablate, ("iterations=3000", "image_width=320"), _defaults)
+
+
+def _defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.training.reconstruction.config import ReconstructConfig
+
+    return ReconstructConfig()
 
 
 def _ablate(options: argparse.Namespace) -> None:
@@ -39,5 +45,5 @@ def _ablate(options: argparse.Namespace) -> None:
     from splatpilot.analysis.reconstruction import ablation
     from splatpilot.systems.common.config import load_config
 
-    config = load_config(reconstruction_defaults(), overrides=options.overrides)
+    config = load_config(_defaults(options), overrides=options.overrides)
     ablation.run(options.captures, options.out, config, options.overwrite)

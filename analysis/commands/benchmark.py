@@ -74,11 +74,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     benchmark.add_argument(
         "--cluster", metavar="ADDRESS", help="fly on the workers of this dask scheduler instead"
     )
-    benchmark.add_argument(
-        "--shard",
-        metavar="I/N",
-        help="fly the I-th of N parts, in a folder of its own; `splatpilot merge` joins them",
-    )
     add_overrides(
         benchmark, ("observation.depth_multiplicative=0.03", "timeout=90"), _scenario_defaults
     )
@@ -109,7 +104,6 @@ def _benchmark(options: argparse.Namespace) -> Any:
     say(f"flying a study in {options.out}")
     from splatpilot.analysis.benchmark import run_study as benchmark
     from splatpilot.analysis.benchmark.external import DODGEDRONE, DODGEDRONE_SPEEDS
-    from splatpilot.analysis.benchmark.shard import Shard
     from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
 
     config = StudyConfig(overrides=options.overrides)
@@ -133,7 +127,6 @@ def _benchmark(options: argparse.Namespace) -> Any:
         out=options.out,
         jobs=options.jobs,
         cluster=options.cluster,
-        shard=None if options.shard is None else Shard.parse(options.shard),
     )
     require_flown(table)
     return table

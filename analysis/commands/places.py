@@ -1,4 +1,4 @@
-"""`splatpilot places`."""
+"""`splatpilot scene fetch`."""
 
 import argparse
 from pathlib import Path
@@ -27,13 +27,13 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     places.add_argument(
         "--out", type=Path, help="folder of scenes (default: $SPLATPILOT_SCENES, or scenes)"
     )
-    add_overrides(places, ("reconstruct.iterations=3000", "render.spacing=1"), _defaults)
+    add_overrides(places, ("iterations=3000", "render.spacing=1"), _defaults)
 
 
 def _defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.analysis.places import PlaceConfig
+    from splatpilot.analysis.scenes import default_config
 
-    return PlaceConfig()
+    return default_config()
 
 
 def _places(options: argparse.Namespace) -> None:
@@ -44,10 +44,10 @@ def _places(options: argparse.Namespace) -> None:
 
     scenes = options.out or scenes_folder()
     say(f"making {', '.join(options.names) or 'the scenes of the benchmark'} in {scenes}")
-    from splatpilot.analysis import places
+    from splatpilot.analysis import scenes as recipes
 
     with resumable(lambda: f"scenes that are finished are in {scenes}; the same command resumes"):
-        places.run(
+        recipes.run(
             names=options.names,
             data=data,
             scenes=scenes,

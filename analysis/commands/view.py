@@ -12,7 +12,6 @@ from splatpilot.analysis.commands.options import (
     find_place,
 )
 from splatpilot.diagrams.flight.scenario import scenario_file
-from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import require_unused
 
 
@@ -27,7 +26,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         examples=(
             "view scenes/hospital",
             "view P02 --seed 3 --set world.spacing=2.4",
-            "view scenes/hospital --viser",
         ),
     )
     view.add_argument(
@@ -38,9 +36,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
     view.add_argument("--out", type=Path, help="page to write (default: out/view/NAME.html)")
     view.add_argument("--seed", type=int, help="seed of a generated world")
     add_overwrite(view)
-    view.add_argument(
-        "--viser", action="store_true", help="serve it with viser instead of writing a page"
-    )
     add_overrides(view, ("world.spacing=2.4", "world.height=8"), scenario_defaults)
 
 
@@ -56,17 +51,10 @@ def scenario_defaults(options: argparse.Namespace) -> Any:
 def _view(options: argparse.Namespace) -> None:
     kinds = "scene", "gaussians", "map", "capture", "scenario"
     options.what = str(find_place(Path(options.what), *kinds))
-    if options.viser and options.out is not None:
-        raise ValueError(f"--out {options.out} and --viser: viser writes no page; keep one of them")
-    if options.viser:
-        import_extra("viser", "viser")
-    elif options.out is not None:
+    if options.out is not None:
         require_unused(options.out, options.overwrite)
     from splatpilot.analysis import view
 
-    if options.viser:
-        view.serve(what=options.what, seed=options.seed, overrides=list(options.overrides))
-        return
     view.run(
         what=options.what,
         out=options.out,

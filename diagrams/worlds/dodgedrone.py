@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from splatpilot.diagrams.worlds.building_blocks import daylight, ground
 from splatpilot.diagrams.worlds.forest.scenery import trees_around
 from splatpilot.diagrams.worlds.solids.shading import Illumination
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.surfels import build, draw
 from splatpilot.diagrams.worlds.world import MovingBodies, World
-from splatpilot.systems.collision.shapes import MovingBalls, Sphere
+from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.scene import GaussianScene
 
@@ -111,7 +111,7 @@ def _draw(group: Group, rng: np.random.RandomState) -> Obstacle:
     return Obstacle(diameter / 2, path)
 
 
-_PLOT = Plot(np.array([-5.0, -10.0, 0.0]), np.array([65.0, 10.0, 10.0]))
+_PLOT = FloorPlan(np.array([-5.0, -10.0, 0.0]), np.array([65.0, 10.0, 10.0]))
 """The volume that must not be left."""
 
 # The vehicle takes off to 1 m, and must fly 60 m along x. The goal lies 3 m behind, in the middle
@@ -154,7 +154,7 @@ def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
     standing = [o for o in obstacles if len(o.path) == 1 and np.isfinite(o.path).all()]
     moving = [o for o in obstacles if len(o.path) > 1]
     hour, light = daylight(rng)
-    blueprint = Blueprint(
+    spec = WorldSpec(
         name=f"dodgedrone_{config.level}",
         lower_W=_PLOT.lower,
         upper_W=_PLOT.upper,
@@ -170,14 +170,14 @@ def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
         seed=seed,
         voxel_size=config.voxel_size,
     )
-    world = build(blueprint)
-    balls = MovingBalls([o.radius for o in moving], [o.path for o in moving], PERIOD)
+    world = build(spec)
+    balls = MovingSpheres([o.radius for o in moving], [o.path for o in moving], PERIOD)
     sun = light(world.esdf)
-    bodies = [_draw_body(o, blueprint, sun) for o in moving]
+    bodies = [_draw_body(o, spec, sun) for o in moving]
     return replace(world, moving=MovingBodies(balls, MovingGaussians(bodies, balls.centers)))
 
 
-def _draw_body(obstacle: Obstacle, course: Blueprint, light: Illumination) -> GaussianScene:
+def _draw_body(obstacle: Obstacle, course: WorldSpec, light: Illumination) -> GaussianScene:
     """The Gaussians of a ball that moves, about its centre, lit as where it first is."""
     present = obstacle.path[np.isfinite(obstacle.path).all(axis=1)]
     center = present[0] if len(present) else course.p_WS

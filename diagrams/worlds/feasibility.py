@@ -9,7 +9,7 @@ from scipy.ndimage import label
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import cubes_of_points
@@ -24,7 +24,7 @@ TRIES = 60
 """Draws of an instance before its parameters are refused."""
 
 
-def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Blueprint:
+def draw_feasible(draw: Callable[[np.random.Generator], WorldSpec], seed: int) -> WorldSpec:
     """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
 
     Raises:
@@ -34,25 +34,25 @@ def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -
     check_seed(seed)
     name = "world"
     for attempt in range(TRIES):
-        blueprint = draw(np.random.default_rng([seed, attempt]))
-        name = blueprint.name
-        if is_feasible(blueprint):
-            return blueprint
+        spec = draw(np.random.default_rng([seed, attempt]))
+        name = spec.name
+        if is_feasible(spec):
+            return spec
     raise InfeasibleFlightError(
         f"{name}: none of {TRIES} instances drawn from seed {seed} leaves a vehicle of radius "
         f"{VEHICLE_RADIUS} m a way from start to goal; use fewer or smaller obstacles, or more room"
     )
 
 
-def is_feasible(blueprint: Blueprint) -> bool:
+def is_feasible(spec: WorldSpec) -> bool:
     """Whether start and goal are clear and a way between them is proven: on a coarse grid, which
     shows most ways, or else on finer ones, the last of which shows ways through gaps of 1 m."""
-    field = blueprint.distance_field
-    ends = np.stack([blueprint.p_WS, blueprint.p_WG])
+    field = spec.distance_field
+    ends = np.stack([spec.p_WS, spec.p_WG])
     if not (conservative_distance(field, ends) >= CLEARANCE).all():
         return False
     return any(
-        connects(field, blueprint.p_WS, blueprint.p_WG, VEHICLE_RADIUS, spacing)
+        connects(field, spec.p_WS, spec.p_WG, VEHICLE_RADIUS, spacing)
         for spacing in (0.3, 0.15, 0.12)
     )
 

@@ -11,12 +11,19 @@ from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, check_ran
 from splatpilot.diagrams.worlds.feasibility import TRIES, draw_start_and_goal
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
 from splatpilot.diagrams.worlds.solids.shading import Lamplight
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid, faces_of
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, faces_of
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Shape, Sphere
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Box,
+    Capsule,
+    Shape,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -116,7 +123,7 @@ def _shape(config: InsertedConfig, p: NDArray, rng: np.random.Generator) -> Shap
 
 
 def _distances(shape: Shape, p_W: NDArray) -> NDArray:
-    return type(shape).distances(p_W, *shape.parameters())
+    return ShapeUnion.of([shape]).distance(p_W)
 
 
 def _surface(shape: Shape) -> NDArray:
@@ -161,7 +168,7 @@ def _with(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
     middle = (world.p_WS + world.p_WG) / 2
     lamps = np.stack([world.p_WS, middle, world.p_WG]) + np.array([0, 0, 1.5])
     light = Lamplight(lamps, np.ones(3), esdf)
-    blueprint = Blueprint(
+    spec = WorldSpec(
         name=f"{world.name}_inserted",
         lower_W=lower,
         upper_W=upper,
@@ -172,8 +179,8 @@ def _with(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
         seed=seed,
     )
     return World(
-        name=blueprint.name,
-        gaussians=world.gaussians.merged_with(draw(blueprint, solids, light)),
+        name=spec.name,
+        gaussians=world.gaussians.merged_with(draw(spec, solids, light)),
         distance_field=esdf,
         esdf=esdf,
         background=world.background,

@@ -9,12 +9,13 @@ where nobody looked any further: cameras of flights see it too, measures of the 
 import functools
 import logging
 import math
+import os
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RigidTransform
@@ -41,20 +42,20 @@ from splatpilot.systems.collision.frontier import (
     reachable_space,
     with_obstacles,
 )
-from splatpilot.systems.common.config import yaml_problem
 from splatpilot.systems.common.files import (
     folder_written_atomically,
     require_scene,
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_text, reason_of, require_shallow
+from splatpilot.systems.common.readers import read_text, reason_of, yaml_errors
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
+CAPTURE = "capture"  # folder of a capture that was rendered for the scene
 ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
 WORLD_FRAME = "z up"
@@ -131,12 +132,12 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     """
     file = Path(path) / "scene.yaml"
     text = read_text(file)
-    require_shallow(text, str(file))
     try:
-        metadata = yaml_load_typed(schema=SceneMetadata, data=text)
-    except Exception as error:  # Drake's reader raises anything of values of other types
-        wrong = yaml_problem(error) if isinstance(error, yaml.YAMLError) else reason_of(error)
-        raise ValueError(f"{file}: {wrong}; reconstruct the scene again or repair it") from None
+        with yaml_errors("the text"):
+            metadata = yaml_load_typed(schema=SceneMetadata, data=text)
+    except Exception as error:  # Drake's reader raises any type.
+        remedy = "reconstruct the scene again or repair it"
+        raise ValueError(f"{file}: {reason_of(error)}; {remedy}") from None
     if metadata.format_version < FORMAT_VERSION:
         raise ValueError(
             f"{file}: format version {metadata.format_version}, from when scenes had no background "
@@ -264,7 +265,8 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
 
 
 def check_scene_target(path: str | Path) -> None:
-    """Checks that a scene may be written to `path`: nothing there, an empty folder, or a scene.
+    """Checks that a scene may be written to `path`: nothing there, an empty folder, a scene, or the
+    capture that it is made of, in `CAPTURE`.
 
     Raises:
         ValueError: if something else is there.
@@ -272,7 +274,8 @@ def check_scene_target(path: str | Path) -> None:
     """
     path = Path(path).absolute()
     if path.exists() and not (path / "scene.yaml").is_file():
-        if not path.is_dir() or any(path.iterdir()):
+        own = {CAPTURE, f".{CAPTURE}.partial"}
+        if not path.is_dir() or {entry.name for entry in path.iterdir()} - own:
             raise ValueError(
                 f"{path}: exists and is no scene, so it is not overwritten; choose another folder"
             )
@@ -344,6 +347,8 @@ def write_scene_folder(
         esdf.save(new / "esdf.npz")
         if isinstance(world.background, EnvironmentMap):
             world.background.save(new / ENVIRONMENT)
+        if (path / CAPTURE).is_dir():
+            shutil.copytree(path / CAPTURE, new / CAPTURE, copy_function=os.link)
         write_scene_metadata(new, metadata)
     return metadata
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
 from splatpilot.systems.splats.scene import GaussianScene
@@ -18,7 +18,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 class MovingBodies:
     """What moves in a world, as functions of time alone."""
 
-    balls: MovingBalls  # what is hit
+    balls: MovingSpheres  # what is hit
     gaussians: MovingGaussians  # what cameras see of it
 
 

@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.distance_field import DistanceField, in_collision, soft_barrier
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -60,7 +60,7 @@ class EsdfCollision(LeafSystem):
     def __init__(
         self,
         field: DistanceField,
-        moving: MovingBalls | None = None,
+        moving: MovingSpheres | None = None,
         radius: float = VEHICLE_RADIUS,
         beta: float = 4.0,
         margin: float = 1.0,

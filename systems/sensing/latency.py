@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -10,7 +11,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import array_namespace, pose_from_state
 
 CYCLE = 64
 """Frames whose delays differ; those of the frames that follow are the same again."""
@@ -51,13 +52,9 @@ class FrameTimes:
         """[s], at a time [s], of the last frame that has come, or of what happened `before`."""
         if self.rate is None:
             return float(self.delays[0]) + self.before
-        newest = math.floor(time * self.rate - self.phase)
-        age = 0.0
-        for number in range(newest, newest - self.lookback, -1):
-            age = time - (number + self.phase) / self.rate
-            if self.delays[number % CYCLE] <= age:
-                break
-        return age + self.before
+        rate, phase, now = (np.array([x]) for x in (self.rate, self.phase, time))
+        [age] = frame_ages(self.delays[None], rate, phase, self.lookback, now)
+        return float(age) + self.before
 
     @property
     def oldest(self) -> float:
@@ -66,9 +63,34 @@ class FrameTimes:
         return oldest + self.before
 
 
-def frame_delays(noise: ObservationNoise, late: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """How late frames come [s], infinite if never: of numbers drawn from U(0, 1), of any shape."""
-    return np.where(lost < noise.frame_dropout, np.inf, noise.latency + noise.jitter * late)
+def frame_delays(noise: ObservationNoise, late: Any, lost: Any) -> Any:
+    """Computes delays of frames [s], infinite if they never come.
+
+    Args:
+        late, lost: arrays or tensors of one shape, drawn from U(0, 1).
+    """
+    delays = noise.latency + noise.jitter * late
+    return array_namespace(lost).where(lost < noise.frame_dropout, math.inf, delays)
+
+
+def frame_ages(delays: Any, rate: Any, phase: Any, lookback: int, time: Any) -> Any:
+    """Computes the ages (N,) [s] at a time of the last frames that have come, of N streams.
+
+    Args:
+        delays: (N, CYCLE) [s], see `FrameTimes`; arrays or tensors.
+        rate: (N,) [Hz].
+        phase: (N,) [-].
+        lookback: number of frames to look through; if none of them has come, the last is seen.
+        time: (N,) [s].
+    """
+    xp = array_namespace(time)
+    streams = xp.arange(len(time), device=time.device)
+    back = xp.arange(lookback, device=time.device)
+    number = xp.floor(time * rate - phase)[:, None] - back  # newest first
+    ages = time[:, None] - (number + phase[:, None]) / rate[:, None]
+    came = delays[streams[:, None], xp.asarray(number % CYCLE, dtype=xp.int64)] <= ages
+    came[:, -1] = True
+    return ages[streams, xp.asarray(came, dtype=xp.int64).argmax(1)]
 
 
 def lookback(noise: ObservationNoise) -> int:

@@ -1,12 +1,12 @@
 """What real cameras add to images: noise, missing depth, changing brightness, delay.
 
 The noise of an image is a function of a seed and of the image's number alone. It can be drawn again
-for any image, in any order, and a flight with it repeats bit for bit. Policies train with the same
-noise; training repeats the formulas in torch (`training/policies/torch_observations.py`).
+for any image, in any order, and a flight with it repeats bit for bit. The formulas take arrays and
+tensors; `training/policies/augmentation.py` draws the noise of training.
 """
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any, cast
 
 import cv2
@@ -16,89 +16,60 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state import array_namespace
 
-_LARGEST_LATENCY = 1.0  # [s]
-_LARGEST_EXPOSURE_ERROR = 6.0  # [EV]
-_LARGEST_BLUR = 50.0  # [px]
-_GAMMA = 2.2  # of colours over light
+_GAMMA = 2.2  # of colors over light
 
 
 @dataclass
-class ObservationNoise:
+class ObservationNoise(Config):
     """How much of each there is; none by default. The noise is Gaussian, its sizes are standard
     deviations."""
 
     # [-] Error of each depth pixel relative to its depth.
-    depth_multiplicative: float = 0.0
+    depth_multiplicative: float = bounded(0.0, "[0, 1]")
     # [m] Error of each depth pixel that does not grow with depth.
-    depth_additive: float = 0.0
+    depth_additive: float = bounded(0.0, "[0, inf) m")
     # [-] Probability of each depth pixel to read nothing, which is infinity, as if nothing were
     # within range: so the Starling's time-of-flight streamer gives a pixel without an echo.
-    depth_dropout: float = 0.0
+    depth_dropout: float = bounded(0.0, "[0, 1]")
     # [-] Noise of each colour pixel and channel, in parts of full scale.
-    color_noise: float = 0.0
+    color_noise: float = bounded(0.0, "[0, 1]")
     # [-] Largest change in brightness of a whole image; uniform up to it, up and down.
-    brightness_jitter: float = 0.0
+    brightness_jitter: float = bounded(0.0, "[0, 1]")
     # [deg] Largest turn of an image's colours about grey; uniform up to it, both ways.
-    hue_jitter: float = 0.0
+    hue_jitter: float = bounded(0.0, "[0, 180] deg")
     # [px] Blur of colour images, as of a lens out of focus: the standard deviation of a Gaussian.
-    blur: float = 0.0
+    blur: float = bounded(0.0, "[0, 50] px")
     # [EV] Largest error of an image's exposure: light doubles with each; uniform up to it, up and
     # down. What becomes brighter than white is lost.
-    exposure_error: float = 0.0
+    exposure_error: float = bounded(0.0, "[0, 6] EV")
     # [electrons] That fill a colour pixel at white, whose number varies as photons do: by its root.
     # 0 counts without noise; phones and small machine vision have 5,000 to 10,000.
-    full_well: float = 0.0
+    full_well: float = bounded(0.0, "[0, inf) electrons")
     # [electrons] Noise of reading a colour pixel out; 2 to 10 are usual.
-    read_noise: float = 0.0
+    read_noise: float = bounded(0.0, "[0, inf) electrons")
     # [s] How old images are when they come; the policy's state is up to date.
-    latency: float = 0.0
+    latency: float = bounded(0.0, "[0, 1] s")
     # [Hz] Range that a flight's rate of images is drawn from; where left out, an image is taken
     # whenever the policy looks. What follows is of images with a rate, see `frame_times.py`.
-    frame_rate: list[float] = field(default_factory=list)
+    frame_rate: list[float] = bounded(list, "[0.1, 1000] Hz")
     # [s] How much later than the latency an image may come; uniform up to it.
-    jitter: float = 0.0
+    jitter: float = bounded(0.0, "[0, 1] s")
     # [-] Probability of an image never to come.
-    frame_dropout: float = 0.0
+    frame_dropout: float = bounded(0.0, "[0, 1]")
 
-    def validate(self, name: str = "observation") -> None:
-        """Raises ValueError on a value out of range, naming it as a field of `name`, its limit and
-        the remedy."""
-        limits = {
-            "depth_additive": math.inf,
-            "hue_jitter": 180.0,
-            "blur": _LARGEST_BLUR,
-            "exposure_error": _LARGEST_EXPOSURE_ERROR,
-            "full_well": math.inf,
-            "read_noise": math.inf,
-            "latency": _LARGEST_LATENCY,
-            "jitter": _LARGEST_LATENCY,
-        }
-        for number in fields(self):
-            if number.name == "frame_rate":
-                continue
-            value, limit = getattr(self, number.name), limits.get(number.name, 1.0)
-            if not (0.0 <= value <= limit and value < math.inf):
-                most = f" and at most {limit:g}" if limit < math.inf else " and finite"
-                raise ValueError(f"{name}.{number.name} is {value}; it must be at least 0{most}")
-        if self.read_noise > 0.0 and self.full_well == 0.0:
-            raise ValueError(
-                f"{name}.read_noise is {self.read_noise} electrons, but how many make white is not "
-                f"said; give {name}.full_well too, as 8000"
-            )
+    def check(self) -> None:
+        well = self.read_noise == 0.0 or self.full_well > 0.0
+        require_field(self, "read_noise", well, "0 without full_well")
         rates = self.frame_rate
-        if rates and not (len(rates) == 2 and 0.1 <= rates[0] <= rates[1] <= 1000.0):
-            raise ValueError(
-                f"{name}.frame_rate is {rates}; it must be two numbers of 0.1 to 1000 Hz, the "
-                "lesser first, or nothing"
-            )
-        for of_frames in ("jitter", "frame_dropout"):
-            if not rates and getattr(self, of_frames) > 0.0:
-                raise ValueError(
-                    f"{name}.{of_frames} is {getattr(self, of_frames)}, but images without a rate "
-                    f"have none; give {name}.frame_rate too, as [10, 30]"
-                )
+        valid = not rates or (len(rates) == 2 and rates[0] <= rates[1])
+        require_field(self, "frame_rate", valid, "two numbers in ascending order, or empty")
+        for name in ("jitter", "frame_dropout"):
+            valid = bool(rates) or getattr(self, name) == 0.0
+            require_field(self, name, valid, "0 without frame_rate")
 
     @property
     def changes_depth(self) -> bool:
@@ -129,59 +100,62 @@ def noisy_depth(
     min_depth: float,
     max_depth: float,
 ) -> np.ndarray:
-    """The depth image (H, W) float32 [m] with errors and holes; see `disturb_depth`."""
+    """Adds errors and holes to a depth image (H, W) float32 [m]; see `corrupt_depth`."""
     relative, absolute = generator.standard_normal((2, *depth.shape))
     drop = generator.random(depth.shape)
-    return disturb_depth(depth, noise, relative, absolute, drop, min_depth, max_depth)
+    z = corrupt_depth(depth, noise, relative, absolute, drop, min_depth, max_depth)
+    return z.astype(np.float32)
 
 
-def disturb_depth(
-    depth: np.ndarray,
+def corrupt_depth(
+    depth: Any,
     noise: ObservationNoise,
-    relative: np.ndarray,
-    absolute: np.ndarray,
-    drop: np.ndarray,
-    min_depth: float,
-    max_depth: float,
-) -> np.ndarray:
+    relative: Any,
+    absolute: Any,
+    drop: Any,
+    min_depth: float = 0.0,
+    max_depth: float = math.inf,
+) -> Any:
     """
-    Planar depth [m] as a worse camera measures it, float32.
+    Adds errors and holes to planar depth [m]; arrays or tensors, of floats.
 
         z' = z (1 + depth_multiplicative n_1) + depth_additive n_2
 
-    Pixels that read 0 or infinity keep that, and what an error takes out of the camera's range
-    reads as Drake's cameras do: 0 below `min_depth`, infinity above `max_depth` [m]. Where
-    u < depth_dropout a pixel reads infinity whatever it saw.
+    Pixels of 0 or infinity keep that. Beyond the range of the camera the result is as of Drake's
+    cameras: 0 below `min_depth`, infinity above `max_depth` [m]. Where u < depth_dropout it is
+    infinity.
 
     Args:
         relative, absolute: n_1 and n_2, of the depth's shape, drawn from N(0, 1).
         drop: u, of the depth's shape, drawn from U(0, 1).
     """
-    measured = np.isfinite(depth) & (depth > 0.0)
-    z = np.where(measured, depth, 1.0).astype(float)
+    xp = array_namespace(depth)
+    measured = xp.isfinite(depth) & (depth > 0.0)
+    z = xp.where(measured, depth, 1.0)
     z = z * (1.0 + noise.depth_multiplicative * relative) + noise.depth_additive * absolute
-    z = np.where(z < min_depth, 0.0, np.where(z > max_depth, np.inf, z))
-    dropped = drop < noise.depth_dropout
-    return np.where(dropped, np.inf, np.where(measured, z, depth)).astype(np.float32)
+    z = xp.where(z < min_depth, 0.0, xp.where(z > max_depth, math.inf, z))
+    z = xp.where(measured, z, depth)
+    return xp.where(drop < noise.depth_dropout, math.inf, z)
 
 
 def noisy_color(
     color: np.ndarray, noise: ObservationNoise, generator: np.random.Generator
 ) -> np.ndarray:
-    """The colour image (H, W, 3) uint8, of other hue, blurred, brighter or darker as a whole, with
-    noise at each pixel; see `turned_hue`, `expose` and `disturb_color`."""
+    """Changes hue, blur, exposure and brightness of an RGB image (H, W, 3) uint8, and adds noise to
+    each pixel; see `turned_hue`, `expose` and `corrupt_color`."""
     brighter = generator.uniform(-1.0, 1.0)
     grain = generator.standard_normal(color.shape, dtype=np.float32)
+    color = color.astype(np.float32)
     if noise.hue_jitter > 0.0:
         turn = math.radians(noise.hue_jitter * generator.uniform(-1.0, 1.0))
-        color = turned_hue(color.astype(np.float32), math.cos(turn), math.sin(turn))
+        color = turned_hue(color, math.cos(turn), math.sin(turn))
     if noise.blur > 0.0:
-        color = cv2.GaussianBlur(color.astype(np.float32), (0, 0), noise.blur)
+        color = cv2.GaussianBlur(color, (0, 0), noise.blur)
     if noise.changes_light:
         error = np.float32(generator.uniform(-1.0, 1.0))
         photons = generator.standard_normal(color.shape, dtype=np.float32)
-        color = expose(color.astype(np.float32), noise, error, photons)
-    return disturb_color(color, noise, brighter, grain)
+        color = expose(color, noise, error, photons)
+    return (corrupt_color(color, noise, brighter, grain) + np.float32(0.5)).astype(np.uint8)
 
 
 def turned_hue(color: Any, cos: Any, sin: Any) -> Any:
@@ -217,21 +191,18 @@ def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any
     return 255.0 * light.clip(0.0, 1.0) ** (1.0 / _GAMMA)
 
 
-def disturb_color(
-    color: np.ndarray, noise: ObservationNoise, brighter: float, grain: np.ndarray
-) -> np.ndarray:
+def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any) -> Any:
     """
-    Colours (..., 3), 0 to 255, as a worse camera measures them, uint8.
+    Changes the brightness of colors (..., 3), 0 to 255, and adds noise; arrays or tensors.
 
-        c' = c (1 + brightness_jitter u) + 255 color_noise n
+        c' = clip(c (1 + brightness_jitter u) + 255 color_noise n)
 
     Args:
-        brighter: u, drawn from U(-1, 1) for each image.
-        grain: n, of the colours' shape, drawn from N(0, 1).
+        brighter: u, drawn from U(-1, 1) for each image, of a shape that broadcasts.
+        grain: n, of the colors' shape, drawn from N(0, 1).
     """
-    gain = np.float32(1.0 + noise.brightness_jitter * brighter)
-    noisy = gain * color + np.float32(255.0 * noise.color_noise) * grain
-    return np.clip(noisy + np.float32(0.5), 0.0, 255.0).astype(np.uint8)
+    gain = 1.0 + noise.brightness_jitter * brighter
+    return (gain * color + 255.0 * noise.color_noise * grain).clip(0.0, 255.0)
 
 
 def image_generator(seed: int, number: int) -> np.random.Generator:

@@ -15,7 +15,7 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.drake import input_port
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.splats.scene import GaussianScene
@@ -412,7 +412,7 @@ class BallsVisualizer(LeafSystem):
     def __init__(
         self,
         meshcat: Meshcat,
-        balls: MovingBalls,
+        balls: MovingSpheres,
         period: float = 1 / 15,
         path: str = "/splatpilot/balls",
     ):
@@ -431,7 +431,7 @@ class BallsVisualizer(LeafSystem):
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, balls: MovingBalls, meshcat: Meshcat
+        builder: DiagramBuilder, balls: MovingSpheres, meshcat: Meshcat
     ) -> "BallsVisualizer":
         """Adds a visualizer of balls, named `balls_visualizer`."""
         visualizer = BallsVisualizer(meshcat, balls)

@@ -16,7 +16,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
@@ -273,7 +273,7 @@ def replay_page(
     background: Background,
     view: ReplayView,
     flights: Sequence[ReplayedFlight],
-    balls: MovingBalls | None = None,
+    balls: MovingSpheres | None = None,
 ) -> str:
     """
     The HTML of a page that needs nothing else, not even a network.
@@ -342,7 +342,7 @@ def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
     }
 
 
-def _balls_data(balls: MovingBalls, duration: float) -> dict[str, Any]:
+def _balls_data(balls: MovingSpheres, duration: float) -> dict[str, Any]:
     times = np.arange(0.0, duration + 2 * _BALLS_PERIOD, _BALLS_PERIOD)
     centers = [np.round(balls.centers(time), 3).tolist() for time in times]
     return {

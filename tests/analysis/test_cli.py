@@ -94,7 +94,6 @@ def test_written_scenario_gives_the_same_flight_again(tmp_path):
         ("reconstruct nowhere --out scene", 1),
         ("capture check nowhere", 1),
         ("capture render nowhere.gltf --out capture", 1),
-        ("tour nowhere.gltf --out tour", 1),
         ("measure nowhere", 1),
         ("train nobody --out run", 1),
         ("corpus inspect nowhere --out sheet.png", 1),

@@ -20,8 +20,7 @@ from splatpilot.systems.policies.planner import plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.vehicle.flatness import (
     FlatnessControllerConfig,
-    flatness_commands,
-    lengths,
+    flatness_command,
     reaching_acceleration,
 )
 from splatpilot.systems.vehicle.quadrotor import (
@@ -30,7 +29,7 @@ from splatpilot.systems.vehicle.quadrotor import (
     hover_state,
     rk4_step,
 )
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState, lengths
 
 PLANNER = "planner"
 
@@ -191,7 +190,7 @@ def fly_planner(
             p_WR = _along(ways, step * dt + control.lookahead)
             a_WB = reaching_acceleration(p_WR, p_WB, v_WB, control.lookahead)
             heading = np.arctan2(p_WR[:, 1] - p_WB[:, 1], p_WR[:, 0] - p_WB[:, 0])
-            command = flatness_commands(states, a_WB, control, params, heading)
+            command = flatness_command(states, a_WB, v_WB, heading, control, params)
             states = rk4_step(states, command, params, dt)
             p_WB = QuadrotorState.of(states).p_WB
             for n, p in zip(flying, p_WB, strict=True):

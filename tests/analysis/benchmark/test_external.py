@@ -6,10 +6,10 @@ from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.external import (
     DODGEDRONE,
     DODGEDRONE_SPEEDS,
-    external_section,
     external_table,
     format_external,
 )
+from splatpilot.analysis.benchmark.report import external_section
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, policy_named
@@ -37,7 +37,7 @@ def test_published_figures_stand_before_our_own():
     )
     assert (fast["successes"], fast["mean_speed_m_s"]) == (0, 2.5)
     assert fast["wilson_lower"] == pytest.approx(0.0) and 0 < fast["wilson_upper"] < 1
-    for text in (format_external(table), external_section(table, "test seeds")):
+    for text in (format_external(table), external_section(ROWS, CONFIG)):
         assert text.index("187/303") < text.index("1/2") and "arseniid/agile_flight" in text
 
 
@@ -46,7 +46,7 @@ def test_only_scenarios_as_they_are_are_compared():
     assert external_table(ROWS, StudyConfig(scenarios=["P01"], policies=["straight"])) == []
     CONFIG_CHANGED = StudyConfig(**(vars(CONFIG) | {"overrides": ["timeout=100"]}))
     assert external_table(ROWS, CONFIG_CHANGED) == []
-    assert external_section([], "test seeds") == ""
+    assert external_section(ROWS, CONFIG_CHANGED) == ""
 
 
 def test_one_command_flies_the_challenge(monkeypatch, tmp_path):

@@ -70,7 +70,7 @@ def test_a_study_is_flown_by_one_version_of_the_code_of_others(package, tmp_path
     first.unlink()
     capsys.readouterr()
     assert main(words) == 1
-    assert "was begun with source of straying" in capsys.readouterr().err
+    assert "was started with source of straying" in capsys.readouterr().err
     row = second.stem
     # By the code that was imported: this process has what flew.
     assert main(["--import", "straying.policy", "replay", "study", row]) == 0

@@ -99,7 +99,7 @@ def test_exception_stops_the_study(short_scenario, tmp_path, capsys, rows_of):
     out = tmp_path / "out"
     words = ["benchmark", "--out", str(out), "--scenarios", str(short_scenario), "--seeds", "2"]
     words += ["--policies", "straight,straight:rate=7", "--jobs", "2"]
-    measures = "splatpilot.analysis.benchmark.rollout.flight_measures"
+    measures = "splatpilot.analysis.benchmark.rollout.flight_metrics"
 
     def refuse(flight, shortest):
         raise ZeroDivisionError("of the policy\nwith a second line")

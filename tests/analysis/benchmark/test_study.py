@@ -58,8 +58,8 @@ def test_chunks_are_flights_through_one_place(short_scenario):
         ({"seeds": 101}, r"seeds of split dev must be in \[1, 100\], got 101"),
         ({"split": "fresh"}, "split must be one of dev, test, got 'fresh'"),
         ({"overrides": ["world.spacing=0.1"]}, "scenario short: .*spacing"),
-        ({"overrides": ["policy.rate=3"]}, "write it as one of them, --policies NAME:rate=3"),
-        ({"overrides": ["seed=3"]}, "say how many with --seeds"),
+        ({"overrides": ["policy.rate=3"]}, "write --policies NAME:rate=3"),
+        ({"overrides": ["seed=3"]}, "give their number with --seeds"),
         ({"overrides": ["wrld.spacing=1"]}, "did you mean world"),
     ],
 )

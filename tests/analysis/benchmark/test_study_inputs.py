@@ -94,7 +94,7 @@ def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, ca
     assert replay.run(study=moved, id="short-scenario-2-000").exact
 
     assert main([*words, "--out", str(tmp_path / "other"), "--policies", "straight"]) == 0
-    assert f"The policy that {short_scenario} names is not flown" in capsys.readouterr().out
+    assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
 
 
 def test_study_is_not_continued_with_other_shipped_weights(short_scenario, tmp_path, monkeypatch):
@@ -111,7 +111,7 @@ def test_study_is_not_continued_with_other_shipped_weights(short_scenario, tmp_p
     zeros = {name: 0.0 * array for name, array in shipped.weights.items()}
     PolicyCheckpoint("diffaero", shipped.spec, zeros, {}).save(tmp_path / "diffaero.npz")
     folder.trajectory("short-diffaero-2-001").unlink()
-    with pytest.raises(ValueError, match="was begun with weights of diffaero"):
+    with pytest.raises(ValueError, match="was started with weights of diffaero"):
         benchmark.run(config=config, out=folder.path, jobs=1)
 
 

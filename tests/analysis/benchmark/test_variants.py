@@ -34,8 +34,8 @@ def test_variants_are_read(text, variant):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a/b=reactive", "labelled 'a/b', but labels name files"),
-        (".=reactive", "labelled '.'"),
+        ("a/b=reactive", "labeled 'a/b', but labels name files"),
+        (".=reactive", "labeled '.'"),
         ("=reactive", "'=reactive' has no label before its ="),
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),

@@ -19,8 +19,6 @@ RENDER = "got a mesh; render a capture of it with `splatpilot capture render roo
         ("view room.gltf", RENDER),
         ("reconstruct room.gltf --out out", RENDER),
         ("reconstruct scene --out out", "got a scene folder; fly in it with `splatpilot fly --sce"),
-        ("tour images --out out", "images must be a mesh or a scenario, got a capture"),
-        ("tour P0l --out out", "expected a mesh or a scenario, here or in"),
         ("mesh room.gltf --out out", RENDER),
     ],
 )

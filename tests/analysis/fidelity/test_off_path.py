@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.fidelity.study import choose_withheld, displace_pose, drop_frames
+from splatpilot.analysis.fidelity.study import choose_held_out, displace_pose, drop_frames
 
 
 def test_withheld_stretches():
     """Stretches come in turn, with as many kept frames before, between and after them."""
-    assert choose_withheld(16, [1, 3], 2) == [2, 5, 6, 7, 10]
-    assert choose_withheld(5, [1], 2) == [2]
-    with pytest.raises(ValueError, match="4 frames are too few to withhold 1 between 2"):
-        choose_withheld(4, [1], 2)
+    assert choose_held_out(16, [1, 3], 2) == [2, 5, 6, 7, 10]
+    assert choose_held_out(5, [1], 2) == [2]
+    with pytest.raises(ValueError, match="4 frames are too few to hold out 1 between 2"):
+        choose_held_out(4, [1], 2)
 
 
 def test_capture_without_frames(place):

@@ -158,10 +158,11 @@ def test_studies_are_not_mixed(place, rendered_world):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("offsets=[0.5, 0.1]", r"offsets are [0.5, 0.1]"),
-        ("kept=0", "kept is 0"),
-        ("clearance=0.0", "clearance is 0.0"),
-        ("reconstruct.hold_out=1", "hold_out"),
+        ("offsets=[0.5, 0.1]", "offsets must be at least one, rising, got [0.5, 0.1]"),
+        ("stretches=[]", "stretches must be at least one, got []"),
+        ("kept=0", "kept must be in [1, inf), got 0"),
+        ("clearance=0.0", "clearance must be in (0, inf) m, got 0.0"),
+        ("reconstruct.hold_out=1", "hold_out must be 0 or at least 2, got 1"),
     ],
 )
 def test_bad_settings(place, capsys, setting, message):

@@ -9,10 +9,10 @@ import pytest
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction import ablation
 from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
+from splatpilot.analysis.reconstruction.measure_scene import SceneMetrics
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.metrics import ViewMeasures
+from splatpilot.training.reconstruction.metrics import ViewMetrics
 
 SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=0.2")
 
@@ -107,8 +107,8 @@ def test_each_arm_adds_what_its_name_says():
         )
 
 
-def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
-    view = ViewMeasures(
+def measures(psnr: float, mae: float, share: float) -> SceneMetrics:
+    view = ViewMetrics(
         psnr_db=psnr,
         psnr_on_black_db=psnr - 1,
         ssim=0.9,
@@ -120,7 +120,7 @@ def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
         unseen_fraction=0.0,
         gain=1.0,
     )
-    return SceneMeasures(True, 8, 8, {0: view}, {0: view}, "none", None)
+    return SceneMetrics(True, 8, 8, {0: view}, {0: view}, "none", None)
 
 
 def test_means_and_spreads():
@@ -152,7 +152,11 @@ def test_means_and_spreads():
 
 @pytest.mark.parametrize(
     ("setting", "message"),
-    [("hold_out=0", "hold_out is 0"), ("iterations=0", "iterations 0"), ("hold_out=1", "hold_out")],
+    [
+        ("hold_out=0", "hold_out must be not 0"),
+        ("iterations=0", "iterations must be not 0"),
+        ("hold_out=1", "hold_out must be 0 or"),
+    ],
 )
 def test_bad_settings(place, capsys, setting, message):
     """Without held-out frames or steps there is nothing to compare."""

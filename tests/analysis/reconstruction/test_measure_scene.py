@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import SceneViews, read_measures
+from splatpilot.analysis.reconstruction.measure_scene import SceneViews, measure_scene, read_metrics
 from splatpilot.systems.splats.scene import GaussianScene
 
 
@@ -65,7 +64,7 @@ def test_metrics_file(place, capsys):
     row = f"PSNR [dB]              {content['psnr_db']:<26.2f} {content['strict']['psnr_db']:.2f}\n"
     assert row in printed
     assert "measured on            2 held-out frames, 64 x 48\n" in printed
-    measures = read_measures(scene)
+    measures = read_metrics(scene)
     assert measures is not None and measures.as_json() == content
     assert np.shape(cv2.imread(str(scene / "views.png")))[1] > 5 * 64
 
@@ -116,7 +115,7 @@ def test_scenes_that_cannot_be_measured(place):
     with pytest.raises(ValueError, match=r"frame 16 is held out, but a room .* only 16 frames"):
         SceneViews(place.scene("other", held_out=[0, 16]))
     scene = place.scene("damaged")
-    assert read_measures(scene) is None
+    assert read_metrics(scene) is None
     (scene / "metrics.json").write_text("{}")
     with pytest.raises(ValueError, match=r"metrics\.json: .* measure again"):
-        read_measures(scene)
+        read_metrics(scene)

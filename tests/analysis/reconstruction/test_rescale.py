@@ -165,7 +165,7 @@ def test_known_height_of_the_cameras_gives_the_scale(unscaled, tmp_path):
 def test_scene_of_measured_depth_is_not_compared_with_its_capture_any_more(place, tmp_path):
     """The metres of a capture with depth stay as they are; a scene in others does not name it."""
     summary = rescale(place.scene("metric"), tmp_path / "scaled", 2.0)
-    assert "has metres of its own" in str(summary)
+    assert "has metric depth" in str(summary)
     metadata = read_scene_metadata(tmp_path / "scaled")
     assert (metadata.capture, metadata.held_out, metadata.gains) == ("", [], [])
 
@@ -173,9 +173,9 @@ def test_scene_of_measured_depth_is_not_compared_with_its_capture_any_more(place
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--factor", "-1"], "factor is -1.0; it must be positive"),
-        (["--height", "nan"], "height is nan; it must be positive"),
-        (["--between", "0,0,0", "0,0,0", "--distance", "1"], "two places are needed"),
+        (["--factor", "-1"], "factor must be finite and > 0, got -1.0"),
+        (["--height", "nan"], "height must be finite and > 0, got nan"),
+        (["--between", "0,0,0", "0,0,0", "--distance", "1"], "points of --between must differ"),
         (["--between", "0,0", "0,0,0", "--distance", "1"], "a point X,Y,Z is needed"),
         (["--between", "0,0,1", "0,0,0"], "--between and --distance belong together"),
         (["--factor", "2", "--distance", "1"], "--between and --distance belong together"),

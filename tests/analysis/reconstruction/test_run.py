@@ -6,12 +6,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import trimesh
+from pydrake.math import RigidTransform
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.run import run
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.captures.render import true_camera
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 SMALL = ReconstructConfig(
@@ -120,3 +123,35 @@ def test_refusals(tmp_path, config, capsys):
     words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "scene"), "--iterations", "5"]
     assert main([*words, "--set", "iterations=6"]) == 1
     assert "iterations are given by --iterations and by --set" in capsys.readouterr().err
+
+
+def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys):
+    mesh = trimesh.creation.box((7.0, 4.0, 3.0))
+    mesh.invert()
+    mesh.export(tmp_path / "room.obj", include_normals=True)
+    out = tmp_path / "scene"
+    command = ["reconstruct", str(tmp_path / "room.obj"), "--up", "z", "--out", str(out)]
+    for setting in (
+        "render.width=64",
+        "render.height=48",
+        "render.path=[[-2, 0, 0], [2, 0, 0]]",
+        "render.yaws=[0, 90, 180, -90]",
+        "iterations=20",
+        "image_width=0",
+        "initial_gaussians=2000",
+    ):
+        command += ["--set", setting]
+    assert main(command) == 0
+    written = (out / "gaussians.ply").read_bytes()
+    assert (out / "metrics.json").is_file()
+    camera = true_camera(out / "capture")
+    assert camera is not None
+    np.testing.assert_array_equal(camera(RigidTransform()).depth.shape, (48, 64))
+
+    assert main(command) == 1
+    assert "is there already" in capsys.readouterr().err
+    images = sorted((out / "capture" / "image_left").iterdir())
+    assert main([*command, "--overwrite"]) == 0
+    assert "is rendered already" in capsys.readouterr().out
+    assert (out / "gaussians.ply").read_bytes() == written
+    assert sorted((out / "capture" / "image_left").iterdir()) == images

@@ -12,7 +12,7 @@ from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import MovingBodies, World
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.scene import GaussianScene
@@ -30,7 +30,7 @@ def with_ball(world: World, path: np.ndarray, radius: float = 0.5) -> World:
         np.full(300, 0.99),
         np.tile([1.0, 0.0, 0.0], (300, 1)),
     )
-    balls = MovingBalls([radius], [path], 0.02)
+    balls = MovingSpheres([radius], [path], 0.02)
     return replace(world, moving=MovingBodies(balls, MovingGaussians([ball], balls.centers)))
 
 

@@ -29,8 +29,8 @@ from splatpilot.systems.messaging.tof_receiver import (
     TimeOfFlightStream,
     UdpConfig,
 )
+from splatpilot.systems.policies.base import LearnedPolicyConfig
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
@@ -341,7 +341,7 @@ def test_what_no_message_carries_is_refused(post_world):
 def test_images_of_another_size_are_refused_by_the_other_half(post_world):
     camera = OnboardCamera(width=32, height=18)
     policy = policy_named("diffaero")
-    assert isinstance(policy, DepthPolicyConfig)
+    assert isinstance(policy, LearnedPolicyConfig)
     other = Scenario(policy=dataclasses.replace(policy, camera=camera))
     halves = Halves(Scenario(policy=policy), post_world, vehicle=other)
     heard = []

@@ -21,9 +21,9 @@ from splatpilot.diagrams.worlds.outdoor import (
 )
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig, find_scene, write_scene_folder
 from splatpilot.diagrams.worlds.solids.shading import Daylight
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
+from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, HalfSpace
 from splatpilot.systems.common.config import load_config
@@ -54,12 +54,12 @@ def test_instances_are_feasible_and_repeatable(file):
     """Start and goal are clear, a way is proven, the same seed gives the same world and another
     seed another."""
     config = load_config(Scenario(), file).world
-    one, again, other = (make_blueprint(config, seed) for seed in (3, 3, 4))
+    one, again, other = (make_spec(config, seed) for seed in (3, 3, 4))
     if file.stem != "P08":  # its slits need a finer grid than is worth searching twice
         ends = one.p_WS, one.p_WG
         assert connects(one.distance_field, *ends, VEHICLE_RADIUS, 0.3)
     p = np.random.default_rng(0).uniform(one.lower_W, one.upper_W, (500, 3))
-    fields = [blueprint.distance_field for blueprint in (one, again, other)]
+    fields = [spec.distance_field for spec in (one, again, other)]
     np.testing.assert_array_equal(fields[0].distance(p), fields[1].distance(p))
     assert np.abs(fields[0].distance(p) - fields[2].distance(p)).max() > 0.05
     assert fields[0].distance(np.stack([one.p_WS, one.p_WG])).min() >= CLEARANCE
@@ -68,41 +68,37 @@ def test_instances_are_feasible_and_repeatable(file):
 def test_walls_have_the_sizes_asked_for():
     """P06's wall is 14 m and full height, P08's slits are 1.4 to 1.0 m, P09's ways are 3.6 m."""
 
-    def free_widths(blueprint: Blueprint) -> list[float]:
+    def free_widths(spec: WorldSpec) -> list[float]:
         """Widths in y of the free stretches in the planes through the middles of walls across."""
         widths = []
         walls = {
             round(float(s.shape.X_WO.translation()[0]), 6)
-            for s in blueprint.solids
+            for s in spec.solids
             if isinstance(s.shape, Box) and np.isclose(np.asarray(s.shape.size)[0], 0.3)
         }
-        y = np.arange(blueprint.lower_W[1], blueprint.upper_W[1], 0.005)
-        for x in sorted(w for w in walls if 0 < w < blueprint.upper_W[0]):
+        y = np.arange(spec.lower_W[1], spec.upper_W[1], 0.005)
+        for x in sorted(w for w in walls if 0 < w < spec.upper_W[0]):
             p = np.column_stack([np.full_like(y, x), y, np.full_like(y, 5.9)])
-            free = blueprint.distance_field.distance(p) > 0
+            free = spec.distance_field.distance(p) > 0
             edges = np.flatnonzero(np.diff(np.concatenate([[0], free, [0]])))
             widths += [0.005 * (b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         return widths
 
-    slits = free_widths(make_blueprint(_config("P08"), 1))
+    slits = free_widths(make_spec(_config("P08"), 1))
     np.testing.assert_allclose(slits, [1.4, 1.25, 1.1, 1.0], atol=0.012)
-    np.testing.assert_allclose(
-        free_widths(make_blueprint(_config("P09"), 1)), [3.6] * 4, atol=0.012
-    )
-    sides = free_widths(make_blueprint(_config("P06"), 1))
+    np.testing.assert_allclose(free_widths(make_spec(_config("P09"), 1)), [3.6] * 4, atol=0.012)
+    sides = free_widths(make_spec(_config("P06"), 1))
     assert sum(sides) == pytest.approx(2.0, abs=0.02) and max(sides) > 2 * VEHICLE_RADIUS + 0.5
 
 
 def test_thin_things_are_thin_and_hit():
     """P11's limbs and wires are 2 to 4 cm thick, and the distance on their axes is minus that."""
-    blueprint = make_blueprint(_config("P11"), 2)
-    thin = [
-        s.shape for s in blueprint.solids if isinstance(s.shape, Capsule) and s.shape.radius < 0.05
-    ]
+    spec = make_spec(_config("P11"), 2)
+    thin = [s.shape for s in spec.solids if isinstance(s.shape, Capsule) and s.shape.radius < 0.05]
     assert len(thin) > 60
     assert all(0.02 <= 2 * shape.radius <= 0.04 for shape in thin)
     middles = np.array([(np.asarray(s.p_WA) + np.asarray(s.p_WB)) / 2 for s in thin])
-    distance = blueprint.distance_field.distance(middles)
+    distance = spec.distance_field.distance(middles)
     assert (distance[np.isfinite(distance)] <= -0.0099).all()
 
 
@@ -172,12 +168,12 @@ def test_infeasible_draws_are_redrawn_and_given_up(monkeypatch):
         length=8, width=4, height=3, spheres=0, boxes=200, half_min=0.5, half_max=0.7, floating=True
     )
     with pytest.raises(InfeasibleFlightError, match=r"none of 2 instances .* seed 0 leaves a"):
-        make_blueprint(full, 0)
-    monkeypatch.setattr(branches, "is_feasible", lambda blueprint: False)
+        make_spec(full, 0)
+    monkeypatch.setattr(branches, "is_feasible", lambda spec: False)
     with pytest.raises(InfeasibleFlightError, match=r"leave no route in \d+ draws from seed 0"):
-        make_blueprint(BranchesConfig(length=8, width=5, height=3), 0)
+        make_spec(BranchesConfig(length=8, width=5, height=3), 0)
     with pytest.raises(ValueError, match="seed must be"):
-        make_blueprint(RoomConfig(), -1)
+        make_spec(RoomConfig(), -1)
 
 
 @pytest.fixture(scope="module")

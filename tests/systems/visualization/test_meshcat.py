@@ -17,7 +17,7 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingBalls, Sphere
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -86,7 +86,7 @@ def test_fan_is_ribbons_along_the_plans_in_the_colours_of_their_costs():
 
 def test_balls_are_drawn_where_they_are(meshcat):
     paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
-    balls = MovingBalls([0.5, 0.25], paths, period=0.1)
+    balls = MovingSpheres([0.5, 0.25], paths, period=0.1)
     builder = DiagramBuilder()
     builder.AddSystem(BallsVisualizer(meshcat, balls, period=0.1))
     simulator = Simulator(builder.Build())

@@ -11,7 +11,7 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
@@ -167,7 +167,7 @@ def test_controls_move_time_and_view(open_page):
 
 
 def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
-    balls = MovingBalls([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
+    balls = MovingSpheres([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
     flights = [straight("a", "collision"), straight("b", "goal", y=1.0)]
     page = open_page(cloud(np.random.default_rng(2)), flights, balls=balls)
     assert page.run("() => replay.time") == pytest.approx(2.0)

@@ -1,5 +1,3 @@
-"""Where a camera goes to see a place."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
@@ -20,9 +18,6 @@ def divided_hall() -> Esdf:
 
 
 def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
-    """Every free place of the band lies near the path, on both sides of a wall that the path goes
-    around without coming nearer than the clearance asked for. It begins in the middle, near the
-    gap."""
     clearance, apart = 0.5, 2.5
     lower_W, upper_W = np.array([0, 0, 1.0]), np.array([12, 8, 2.0])
     path = visiting_path(divided_hall, lower_W, upper_W, clearance, apart)
@@ -38,14 +33,11 @@ def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
 
 
 def test_path_names_the_room_there_is(divided_hall):
-    """Without room for the clearance, the error says how much there is."""
     with pytest.raises(ValueError, match=r"largest clearance .* 9.0 m is asked for"):
         visiting_path(divided_hall, LOWER_W, UPPER_W, 9.0, 2.0)
 
 
 def test_poses_stop_evenly_and_look_ahead_and_aside():
-    """Along a straight path, stops are evenly spaced, and each looks along the path, to its left
-    and to its right, pitched, upright."""
     path = np.array([[1.0, 2, 1.5], [1, 8, 1.5]])
     X_WCs = poses_along(path, 0.5, [0.0, 90.0, -90.0], -10.0)
     assert len(X_WCs) == 3 * 13
@@ -62,20 +54,17 @@ def test_poses_stop_evenly_and_look_ahead_and_aside():
 
 
 def test_heading_outlasts_a_climb():
-    """On a vertical stretch the camera keeps the heading that it had."""
     path = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
     ahead = np.array([X.rotation().matrix()[:, 2] for X in poses_along(path, 0.5, [0.0], 0.0)])
     np.testing.assert_allclose(ahead, np.tile([0.5**0.5, 0.5**0.5, 0], (len(ahead), 1)), atol=1e-6)
 
 
 def test_one_point_is_one_stop():
-    """A path of one point gives that stop alone."""
     (X_WC,) = poses_along(np.array([[1.0, 2, 3]]), 0.5, [0.0], 0.0)
     np.testing.assert_array_equal(X_WC.translation(), [1, 2, 3])
 
 
 def test_beside_is_exactly_lateral():
-    """The displaced camera stands the offset to its own left and looks in parallel."""
     X_WC = look_along(np.array([1.0, 2, 3]), 0.7, -0.2)
     X_WD = move_left(X_WC, 0.5)
     moved = X_WC.inverse() @ X_WD
@@ -85,6 +74,5 @@ def test_beside_is_exactly_lateral():
 
 @pytest.mark.parametrize("path", [[[0.0, 1.0]], [], [[0, np.nan, 1]]])
 def test_bad_paths_are_named(path):
-    """A path that is no list of finite points is an error that shows its shape."""
     with pytest.raises(ValueError, match="shape"):
         poses_along(np.array(path), 0.5, [0.0], 0.0)

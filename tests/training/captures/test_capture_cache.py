@@ -7,7 +7,6 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 
 
 def test_where(monkeypatch, tmp_path):
-    """What a capture names comes first, then XDG_CACHE_HOME, then the home folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder(CaptureConfig(cache="here"), "bags", "a") == Path("here")
     assert cache_folder(CaptureConfig(), "bags", "a") == tmp_path / "splatpilot/bags/a"
@@ -16,8 +15,6 @@ def test_where(monkeypatch, tmp_path):
 
 
 def test_keys(tmp_path):
-    """Another file, another size, and anything else that decides give another name; the same the
-    same."""
     one, other = tmp_path / "a", tmp_path / "b"
     one.write_text("1")
     other.write_text("1")
@@ -29,7 +26,6 @@ def test_keys(tmp_path):
 
 
 def test_no_place(tmp_path):
-    """A folder that cannot be made is named, with the remedy."""
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=r"file/deep: cannot be written .*; set capture\.cache to"):
         prepare_cache(tmp_path / "file/deep")

@@ -1,5 +1,3 @@
-"""Which photographs are compared."""
-
 import cv2
 import numpy as np
 import pytest
@@ -14,14 +12,11 @@ from splatpilot.training.captures.colmap import (
 
 
 def test_all_pairs():
-    """Of few, every two are compared."""
     assert all_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 @pytest.mark.parametrize("partners", [4, 8])
 def test_likely_pairs(partners):
-    """Neighbours in the order of names, and of the others those most alike, are compared; nothing
-    twice, and nothing with itself."""
     rng = np.random.default_rng(0)
     noise = rng.uniform(0, 0.1, (40, 40))
     similarity = noise + noise.T
@@ -35,8 +30,6 @@ def test_likely_pairs(partners):
 
 
 def test_images_of_one_place_look_alike():
-    """Images that share descriptors are more alike than others, in whatever order and number they
-    come; an image without descriptors is like nothing."""
     rng = np.random.default_rng(1)
     places = [rng.normal(size=(400, 16)).astype(np.float32) for _ in range(3)]
     features = [
@@ -55,7 +48,6 @@ def test_images_of_one_place_look_alike():
 
 
 def test_features_of_a_database(tmp_path):
-    """Images whose features pycolmap keeps are compared: shifted ones are alike, others not."""
     pycolmap = import_pycolmap()
     rng = np.random.default_rng(2)
     places = [

@@ -1,5 +1,3 @@
-"""Meshes with holes, panes and faces of one side, in color, depth and distance alike."""
-
 import json
 import struct
 from io import BytesIO

@@ -50,14 +50,12 @@ def write(tmp_path, K, room_views, room_poses, trace_rays):
 
 
 def test_room(write, shows_room):
-    """Camera axes are OpenGL's, depth is in thousandths."""
     capture = read_capture(write())
     assert capture.metric and capture.depth_camera is None
     shows_room(capture, color=0.5)
 
 
 def test_distortion_is_taken_out(write, K, shows_room):
-    """Images and depth of a distorted camera become those of a pinhole."""
     v, u = np.mgrid[0:48, 0:64] + 0.5
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     coefficients = np.array([DISTORTION[name] for name in ("k1", "k2", "p1", "p2")])
@@ -75,7 +73,6 @@ def test_distortion_is_taken_out(write, K, shows_room):
 
 
 def test_edges_of_undistorted_images_are_not_dark(write, K):
-    """At the edges of the pinhole's images is what the lens sees there, and nothing black."""
     path = write(camera_model="OPENCV", k1=0.02)
     for i in range(10):
         cv2.imwrite(str(path / f"{i:02d}.png"), np.full((48, 64, 3), 200, np.uint8))
@@ -83,7 +80,6 @@ def test_edges_of_undistorted_images_are_not_dark(write, K):
 
 
 def test_fisheye(write, K, shows_room):
-    """An equidistant fisheye becomes a pinhole."""
     v, u = np.mgrid[0:48, 0:64] + 0.5
     bent = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
     theta = np.linalg.norm(bent, axis=-1, keepdims=True)
@@ -92,7 +88,6 @@ def test_fisheye(write, K, shows_room):
 
 
 def test_each_frame_may_have_its_camera(write, shows_room):
-    """Frames with intrinsics of their own are resampled into one pinhole."""
     path = write()
     content = json.loads((path / "transforms.json").read_text())
     for name in ("cx", "cy"):
@@ -109,7 +104,6 @@ def test_each_frame_may_have_its_camera(write, shows_room):
 
 
 def test_small_depth(write, shows_room, room_views, K):
-    """Depth of a lower resolution than the images is carried into their pixels."""
     path = write()
     for i, view in enumerate(room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)):
         np.save(path / f"{i:02d}.npy", (1000 * view.depth).astype(np.float32))
@@ -119,7 +113,6 @@ def test_small_depth(write, shows_room, room_views, K):
 
 
 def test_depth_of_another_view_is_refused(write, room_views, K):
-    """Depth whose ratio of width to height is not the images' cannot show what they show."""
     path = write()
     for i in range(10):
         np.save(path / f"{i:02d}.npy", np.ones((24, 24), np.float32))
@@ -268,7 +261,6 @@ def test_eccentric_principal_point_is_noted(write):
 
 
 def test_scale(write, room_poses):
-    """Without depth the scale is unknown, until two cameras' distance is given."""
     path = write(depth=False)
     capture = read_capture(path)
     assert not capture.metric and not capture.has_depth
@@ -283,7 +275,6 @@ def test_scale(write, room_poses):
 
 
 def test_points(write):
-    """Points of a PLY are read with their colours."""
     path = write(ply_file_path="points.ply")
     rows = [(1.0, 2.0, 3.0, 255, 0, 51)]
     kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -321,7 +312,6 @@ def test_points(write):
     ],
 )
 def test_bad_transforms(write, change, message):
-    """What is wrong in the file is said."""
     path = write()
     content = json.loads((path / "transforms.json").read_text()) | change
     (path / "transforms.json").write_text(json.dumps(content))
@@ -330,7 +320,6 @@ def test_bad_transforms(write, change, message):
 
 
 def test_nesting_without_end(write):
-    """Brackets in brackets are refused by file, however many."""
     path = write()
     (path / "transforms.json").write_text('{"frames": ' + "[" * 10**5 + "]" * 10**5 + "}")
     with pytest.raises(ValueError, match=r"transforms\.json: not nerfstudio's format"):
@@ -348,7 +337,6 @@ def test_nesting_without_end(write):
     ],
 )
 def test_bad_depth_drops_its_frame(write, depth):
-    """A depth that is none, or whose header claims what is not there, drops its own frame only."""
     path = write()
     if isinstance(depth, bytes):
         (path / "03.npy").write_bytes(depth)
@@ -359,7 +347,6 @@ def test_bad_depth_drops_its_frame(write, depth):
 
 
 def test_bad_matrix_is_left_out(write):
-    """A frame whose matrix is none is left out and named."""
     path = write()
     content = json.loads((path / "transforms.json").read_text())
     content["frames"][2]["transform_matrix"] = [[1, 2], [3, 4]]
@@ -369,7 +356,6 @@ def test_bad_matrix_is_left_out(write):
 
 
 def test_depth_name_that_no_file_system_takes(write):
-    """A frame whose depth has a name of 5000 letters is left out, and told shortened."""
     path = write()
     content = json.loads((path / "transforms.json").read_text())
     content["frames"][0]["depth_file_path"] = "n" * 5000

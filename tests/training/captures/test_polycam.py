@@ -45,21 +45,18 @@ def write(tmp_path, K, room_views):
 
 @pytest.mark.parametrize("prefix", ["", "corrected_"])
 def test_room(write, shows_room, prefix):
-    """World axes have y up, cameras are OpenGL's, and each brings its intrinsics and its depth."""
     capture = read_capture(write(prefix))
     assert capture.source.startswith("Polycam") and capture.metric and not capture.dropped
     shows_room(capture, color=4.0, depth=0.03)
 
 
 def test_corrected_poses_come_first(write, shows_room):
-    """Where Polycam has optimised poses, those are read, and not the first ones."""
     path = write("corrected_")
     (path / "keyframes/cameras").mkdir()
     assert len(read_capture(path)) == 10
 
 
 def test_damaged_keyframes_are_named(write):
-    """A keyframe whose camera is unreadable is left out; too many are refused."""
     path = write()
     cameras = sorted((path / "keyframes/cameras").iterdir())
     cameras[2].write_text("{}")

@@ -63,7 +63,6 @@ def errors(poses: list[RigidTransform], truth: list[RigidTransform]) -> np.ndarr
 
 @pytest.mark.parametrize(("noise", "left"), [(0.0, 0.1), (0.005, 0.3)])
 def test_drift_is_mended(frames, room_poses, noise, left):
-    """Of a drift of a degree and 2 cm a tenth is left, of noisy depth a third at most."""
     given = drifting(room_poses, 0.02, 0.02)
     refined = refine_poses(frames(room_poses, noise), given)
     assert (errors(refined.X_WCs, room_poses) < left * errors(given, room_poses)).all()
@@ -74,7 +73,6 @@ def test_drift_is_mended(frames, room_poses, noise, left):
 
 
 def test_exact_poses_stay(frames, room_poses):
-    """Exact poses stay, to a millimetre and a twentieth of a degree."""
     refined = refine_poses(frames(room_poses), room_poses)
     turned, moved = errors(refined.X_WCs, room_poses)
     assert turned < 1e-3
@@ -82,7 +80,6 @@ def test_exact_poses_stay(frames, room_poses):
 
 
 def test_who_sees_nothing_goes_with_its_neighbours(frames, room_poses):
-    """A frame without depth is moved as those before and after it are."""
     given = drifting(room_poses, 0.02, 0.02)
     seen = frames(room_poses)
     blind = CaptureFrame(
@@ -98,7 +95,6 @@ def test_who_sees_nothing_goes_with_its_neighbours(frames, room_poses):
 
 
 def test_nothing_in_common(frames, room_poses):
-    """Frames that see nothing of each other are refused."""
     X_WC = room_poses[0]
     behind = X_WC @ RigidTransform(RotationMatrix.MakeYRotation(np.pi), [0, 0, 0])
     with pytest.raises(ValueError, match="no two frames see the same"):

@@ -1,5 +1,3 @@
-"""Kinds of captures, ours and those of other packages."""
-
 import subprocess
 import sys
 from pathlib import Path
@@ -59,8 +57,6 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_kind_of_another_package(folder, tmp_path):
-    """An installed package's kind is told from the files, before our own that would take it for
-    photographs; with it come the settings and the folder, by which it can be opened again."""
     info = tmp_path / "packages" / "pairs-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: pairs\nVersion: 1.0\n")
@@ -75,7 +71,6 @@ def test_a_kind_of_another_package(folder, tmp_path):
 
 
 def test_a_kind_that_is_not_installed(folder):
-    """`module:attribute` names a kind; what is none, or nowhere, is refused with what there is."""
     assert read_capture(folder, CaptureConfig(kind="pairs:PAIR")).source == f"pair {folder}"
     for kind, message in (
         ("pairs:NUMBER", "pairs:NUMBER is no kind of capture"),
@@ -87,7 +82,6 @@ def test_a_kind_that_is_not_installed(folder):
 
 
 def test_registered_kinds_are_listed(folder):
-    """A folder that is nothing known is refused with all that is known; names are given once."""
     register_capture(
         "cubes", lambda path: False, lambda path, config: None, description="cubes (*)"
     )
@@ -102,7 +96,6 @@ def test_registered_kinds_are_listed(folder):
 
 
 def test_settings_say_what_is_not_as_usual(folder):
-    """Settings name the fields that differ from the defaults, and give the configuration again."""
     config = CaptureConfig(depth_unit=1e-05, up="-y", p_DC=[0.0, 1e-7, np.pi])
     config.scale.between = ["a b.jpg@1,2", "c: #d.jpg"]
     config.scale.distance = 2.0
@@ -115,7 +108,6 @@ def test_settings_say_what_is_not_as_usual(folder):
 
 
 def test_captures_are_read_without_torch_and_pycolmap(tmp_path):
-    """Reading captures imports neither; what needs pycolmap says what to install."""
     (tmp_path / "model").mkdir()
     for part in ("cameras", "images"):
         (tmp_path / "model" / f"{part}.txt").touch()

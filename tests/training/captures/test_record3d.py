@@ -46,7 +46,6 @@ def relative(capture, room_poses):
 
 
 def test_room(write, shows_room, room_poses):
-    """Poses are relative to the first camera; up is what the cameras say."""
     capture = read_capture(write())
     assert capture.source.startswith("Record3D") and capture.metric and not capture.dropped
     X_RW = relative(capture, room_poses)
@@ -55,7 +54,6 @@ def test_room(write, shows_room, room_poses):
 
 
 def test_intrinsics_of_each_frame(write, K, shows_room, room_poses):
-    """Newer exports have intrinsics for each frame, which come before those of the first."""
     own = [[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]] * 10
     wrong = np.diag([2.0, 2.0, 1]) @ K
     path = write(K=wrong.T.ravel().tolist(), perFrameIntrinsicCoeffs=own)
@@ -64,7 +62,6 @@ def test_intrinsics_of_each_frame(write, K, shows_room, room_poses):
 
 
 def test_what_is_not_an_export(write, tmp_path):
-    """The application's own format, damaged metadata and images without a pose are refused."""
     recording = tmp_path / "room.r3d"
     recording.write_bytes(b"PK")
     with pytest.raises(ValueError, match=r'own format.*export the recording as "EXR'):
@@ -80,7 +77,6 @@ def test_what_is_not_an_export(write, tmp_path):
 
 
 def test_damaged_depth_is_named(write):
-    """A depth file that is cut short leaves its frame out."""
     path = write()
     whole = (path / "depth/3.exr").read_bytes()
     (path / "depth/3.exr").write_bytes(whole[:40])

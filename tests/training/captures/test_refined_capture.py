@@ -44,8 +44,6 @@ def config(tmp_path) -> CaptureConfig:
 
 
 def test_poses_are_refined_once(folder, config, room_poses, monkeypatch, capfd):
-    """A capture opens with refined poses, which say what they mended, and are found again; a file
-    that has changed makes them anew."""
     capture = read_capture(folder, config)
     assert "poses moved by" in capfd.readouterr().err
     wrong = [
@@ -71,7 +69,6 @@ def test_poses_are_refined_once(folder, config, room_poses, monkeypatch, capfd):
 
 
 def test_without_depth(tmp_path, config):
-    """What has no depth cannot be refined so, and no cache is begun."""
     path = tmp_path / "nerfstudio"
     path.mkdir()
     cv2.imwrite(str(path / "0.png"), np.zeros((240, 320, 3), np.uint8))
@@ -84,7 +81,6 @@ def test_without_depth(tmp_path, config):
 
 
 def test_no_place_for_the_cache(folder, config, tmp_path, monkeypatch):
-    """A cache that cannot be written is named before anything is refined."""
     (tmp_path / "cache").touch()
     monkeypatch.setattr(module, "refine_poses", lambda *_: pytest.fail("refined"))
     with pytest.raises(OSError, match=r"cache: cannot be written .*; set capture\.cache to a"):
@@ -92,7 +88,6 @@ def test_no_place_for_the_cache(folder, config, tmp_path, monkeypatch):
 
 
 def test_nothing_in_common(folder, config):
-    """A capture whose frames see nothing of each other is named."""
     for file in folder.glob("*.pose.txt"):
         X_WC = np.loadtxt(file)
         X_WC[:3, 3] *= 100
@@ -103,8 +98,6 @@ def test_nothing_in_common(folder, config):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_redkitchen(tmp_path):
-    """The poses of KinectFusion, refined: colours of frames differ by half as much, by a measure
-    that has no part in it."""
     capture = tmp_path / "redkitchen"
     capture.mkdir()
     for file in sorted((Path(os.environ["SPLATPILOT_DATA"]) / "redkitchen").iterdir())[: 3 * 40]:

@@ -17,7 +17,6 @@ def plane_depth(n, d, K, width, height):
 
 @pytest.mark.parametrize("finer", [1, 3])
 def test_plane(finer):
-    """A slanted plane keeps its place in space, also seen by a much finer camera."""
     X_CD = RigidTransform(RotationMatrix.MakeYRotation(0.05), [0.024, 0.005, -0.01])
     K = np.diag([finer, finer, 1]) @ K_C
     n, d = np.array([0.2, -0.1, 1.0]), 2.0
@@ -32,7 +31,6 @@ def test_plane(finer):
 
 
 def test_same_camera_changes_nothing():
-    """With equal cameras in one place every pixel keeps its value, also 0 and infinity."""
     depth = np.random.default_rng(0).uniform(1, 5, (48, 64)).astype(np.float32)
     depth[3, 4], depth[5, 6] = 0, np.inf
     got = register_depth(depth, K_D, RigidTransform(), K_D, 64, 48)
@@ -40,7 +38,6 @@ def test_same_camera_changes_nothing():
 
 
 def test_nearer_surface_hides_the_farther():
-    """Where two surfaces fall into one pixel, the nearer one is kept."""
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:30] = 1.0
     got = register_depth(depth, K_D, RigidTransform([0.3, 0, 0]), K_D, 64, 48)

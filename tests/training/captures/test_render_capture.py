@@ -1,5 +1,3 @@
-"""Captures rendered of meshes."""
-
 import os
 import shutil
 from dataclasses import replace
@@ -15,7 +13,7 @@ from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.indoor import RoomConfig
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.diagrams.worlds.splits import find_test_source, source_digest
-from splatpilot.diagrams.worlds.world_registry import make_blueprint
+from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import render as render_capture
 from splatpilot.training.captures.capture_registry import read_capture
@@ -66,25 +64,22 @@ def depth_of_room(frame) -> np.ndarray:
 
 
 def test_a_world_may_be_named_as_in_the_benchmark(tmp_path, monkeypatch, capsys):
-    """`capture render P02` plans the world of that scenario; a name that is neither is refused."""
     planned = []
 
     def plan(config, seed):
         planned.append((config, seed))
         raise ValueError("planned")
 
-    monkeypatch.setattr(render_capture, "make_blueprint", plan)
+    monkeypatch.setattr(render_capture, "make_spec", plan)
     words = ["--out", str(tmp_path / "capture"), "--seed", "3"]
     assert main(["capture", "render", "P02", *words]) == 1
     assert "planned" in capsys.readouterr().err
     assert planned == [(load_config(Scenario(), benchmark_scenarios()["P02"]).world, 3)]
     assert main(["capture", "render", "P99", *words]) == 1
-    assert "P99: there is no such file" in capsys.readouterr().err
+    assert "No such file or folder: P99" in capsys.readouterr().err
 
 
 def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
-    """Read back by the loader of its format, every frame's depth is that of rays cast from its
-    pose, and the same view can be rendered again."""
     run(world=room, out=tmp_path / "capture", config=small())
     capture = read_capture(tmp_path / "capture")
     assert len(capture) == 12
@@ -100,7 +95,6 @@ def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
 
 
 def test_offset_captures_stand_beside(opengl, room, tmp_path):
-    """The second capture has the poses beside those of the first, but for those without room."""
     config = small(yaws=[0.0], offsets=[0.5], clearance=0.3)
     run(world=room, out=tmp_path / "capture", config=config)
     middle, beside = (read_capture(tmp_path / p) for p in ("capture", "capture/offset_+0.50"))
@@ -113,7 +107,6 @@ def test_offset_captures_stand_beside(opengl, room, tmp_path):
 
 
 def test_interrupted_rendering_goes_on(opengl, room, tmp_path):
-    """What an interrupted run left is kept, and the whole equals that of an uninterrupted one."""
     run(world=room, out=tmp_path / "whole", config=small())
     partial = tmp_path / ".part.partial"
     shutil.copytree(tmp_path / "whole", partial)
@@ -132,18 +125,16 @@ def test_interrupted_rendering_goes_on(opengl, room, tmp_path):
 
 
 def test_generated_world_is_rendered_where_it_is(opengl, tmp_path):
-    """A scenario's generated world is exported with the capture, and all depth seen inside its
-    volume lies on the world's surfaces."""
     scenario = tmp_path / "room.yaml"
     scenario.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
     config = RenderConfig(width=64, height=48, path=[[1.5, 0.4, 1.5]], yaws=[0.0, 120.0])
     run(world=scenario, out=tmp_path / "capture", config=config, seed=4)
     capture = read_capture(tmp_path / "capture")
-    blueprint = make_blueprint(RoomConfig(length=6, width=4, height=2.6, items=1), 4)
+    spec = make_spec(RoomConfig(length=6, width=4, height=2.6, items=1), 4)
     for frame in capture.frames():
         v, u = np.mgrid[:48, :64] + 0.5
         p_CQ = frame.back_project(u, v, frame.depth)[np.isfinite(frame.depth)]
-        distance = blueprint.distance_field.distance(frame.X_WC.multiply(p_CQ.T).T)
+        distance = spec.distance_field.distance(frame.X_WC.multiply(p_CQ.T).T)
         inside = np.isfinite(distance)
         assert inside.sum() > 500
         assert np.abs(distance[inside]).max() < 0.01
@@ -196,7 +187,6 @@ def test_real_meshes_are_those_of_the_table(file, source):
 
 
 def test_distance_to_a_mesh(room):
-    """The grid's distances are those to the walls, to within a voxel and a half."""
     esdf = mesh_distance(room, "z", 0.1)
     p_WQ = np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3)) * SIZE
     truth = (SIZE / 2 - np.abs(p_WQ)).min(axis=1)
@@ -204,13 +194,12 @@ def test_distance_to_a_mesh(room):
 
 
 def test_bad_input_is_named(room, tmp_path, capsys):
-    """Each mistake ends with status 1, one message that says what is wrong, and no capture."""
     (tmp_path / "world.stl").write_bytes(b"x")
     (tmp_path / "damaged.glb").write_bytes(b"x")
     (tmp_path / "damaged.gltf").write_text("{")
     out = tmp_path / "capture"
     for world, options, message in (
-        (tmp_path / "no.gltf", [], "no such file"),
+        (tmp_path / "no.gltf", [], "No such file"),
         (tmp_path / "world.stl", [], "a mesh must be one of .gltf, .glb, .obj"),
         (tmp_path / "damaged.glb", [], "damaged.glb: not a readable mesh"),
         (tmp_path / "damaged.gltf", [], "damaged.gltf"),
@@ -228,7 +217,6 @@ def test_bad_input_is_named(room, tmp_path, capsys):
 
 
 def test_other_contents_are_not_overwritten(opengl, room, tmp_path):
-    """A folder that holds something else, or a capture rendered otherwise, stays as it is."""
     run(world=room, out=tmp_path / "capture", config=small(yaws=[0.0]))
     with pytest.raises(ValueError, match="holds something other"):
         run(world=room, out=tmp_path / "capture", config=small())
@@ -242,5 +230,4 @@ def test_captures_of_meshes_drawn_otherwise_are_refused(tmp_path):
 
 
 def test_captures_of_other_kinds_have_no_true_camera(tmp_path):
-    """Without a record of a world there is no truth to render."""
     assert true_camera(tmp_path) is None

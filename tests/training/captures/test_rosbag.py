@@ -195,7 +195,6 @@ def config(tmp_path):
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("moved", ["odometry", "transforms"])
 def test_room(bag, config, shows_room, version, moved):
-    """Bags of both kinds, poses of the body by a topic or by `/tf`, the camera mounted on it."""
     recorded = bag(version)
     recorded.images()
     recorded.calibration()
@@ -208,7 +207,6 @@ def test_room(bag, config, shows_room, version, moved):
 
 @pytest.mark.parametrize("depth32", [False, True])
 def test_compressed_images(bag, config, shows_room, depth32):
-    """Images as `image_transport` compresses them, depth as integers or by its inverse."""
     recorded = bag(1)
     recorded.images(compressed=True, depth32=depth32)
     recorded.calibration()
@@ -265,7 +263,6 @@ def test_calibration_that_cannot_be_used_is_not_needed_if_intrinsics_are_given(
 
 
 def test_the_bag_is_read_once(bag, config, shows_room):
-    """The second time the bag is not read, but what was written; other settings are."""
     recorded = bag(2)
     recorded.images(depth32=True)
     recorded.odometry()
@@ -283,7 +280,6 @@ def test_the_bag_is_read_once(bag, config, shows_room):
 
 
 def test_what_is_missing_is_named(bag, config):
-    """Bags without poses, with several, with topics that are not there, and parts of bags."""
     recorded = bag(1)
     recorded.images()
     with pytest.raises(ValueError, match=r"has no topic of poses; it has /color, /depth"):
@@ -305,7 +301,6 @@ def test_what_is_missing_is_named(bag, config):
 
 
 def test_no_pose_of_the_camera(bag, config):
-    """Where `/tf` does not lead to the camera, that is said, and nothing is kept."""
     recorded = bag(1)
     recorded.images()
     recorded.calibration()
@@ -317,7 +312,6 @@ def test_no_pose_of_the_camera(bag, config):
 
 
 def test_damaged_bag(tmp_path, config):
-    """What is no bag is named."""
     path = tmp_path / "room.bag"
     path.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     with pytest.raises(ValueError, match=r"room\.bag: not a readable ROS bag"):

@@ -28,7 +28,6 @@ def write(tmp_path, K, room_views):
 
 
 def test_room(write, shows_room):
-    """Poses are the colour camera's, and depth is carried into its pixels."""
     capture = read_capture(write)
     assert capture.source.startswith("ScanNet") and not capture.dropped
     shows_room(capture, color=0.5, depth=0.03)
@@ -45,7 +44,6 @@ def test_intrinsics_of_larger_images_are_refused(write, K):
 
 
 def test_lost_tracking_is_no_damage(write):
-    """Frames whose tracking was lost are left out however many they are; damage is counted."""
     for i in (1, 4, 5):
         np.savetxt(write / f"pose/{i}.txt", np.full((4, 4), -np.inf))
     capture = read_capture(write)

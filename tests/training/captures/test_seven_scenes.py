@@ -45,14 +45,12 @@ def config(K):
 
 
 def test_two_cameras(write, config, shows_room):
-    """Poses are the depth camera's, images the colour camera's, and depth is carried over."""
     capture = read_capture(write(), config())
     assert capture.depth_camera is not None and len(capture) == 10 and not capture.dropped
     shows_room(capture, color=0.5, depth=0.01)
 
 
 def test_invalid_depth(write, config):
-    """0 and 65535 are unknown; the rest is in metres."""
     depth = read_capture(write(), config()).load_depth(0)
     assert depth is not None
     np.testing.assert_array_equal(depth[0, :2], 0)
@@ -60,7 +58,6 @@ def test_invalid_depth(write, config):
 
 
 def test_depth_unit(write, config):
-    """Another unit of depth scales it."""
     path = write()
     one, two = (read_capture(path, config(depth_unit=unit)).load_depth(3) for unit in (1000, 500))
     assert one is not None
@@ -68,7 +65,6 @@ def test_depth_unit(write, config):
 
 
 def test_config_file_in_the_folder(write, config):
-    """`capture.yaml` gives what the caller leaves open, and the caller wins."""
     path = write()
     (path / "capture.yaml").write_text("intrinsics: [40, 41, 30, 20]\nup: z\n")
     np.testing.assert_array_equal(read_capture(path).K, [[40, 0, 30], [0, 41, 20], [0, 0, 1]])
@@ -83,7 +79,6 @@ def test_config_file_in_the_folder(write, config):
 
 
 def test_up_of_level_cameras(write, config):
-    """Without an up direction given, level cameras give it: z is up to a degree or two."""
     path = write()
     R = RotationMatrix.MakeXRotation(1.0) @ RotationMatrix.MakeYRotation(0.4)
     for file in path.glob("*.pose.txt"):
@@ -124,7 +119,6 @@ def test_up_of_level_cameras(write, config):
     ],
 )  # fmt: skip
 def test_one_bad_frame_is_left_out(write, config, spoil, message):
-    """A frame that cannot be used is left out and named, and the others stay what they were."""
     path = write()
     whole = read_capture(path, config())
     spoil(path)
@@ -137,7 +131,6 @@ def test_one_bad_frame_is_left_out(write, config, spoil, message):
 
 
 def test_too_many_bad_frames(write, config):
-    """More than a fifth of bad frames is an error that counts them and names the first."""
     path = write()
     for i in (0, 3, 5):
         (path / f"frame-{10 * i:06d}.depth.png").unlink()
@@ -147,7 +140,6 @@ def test_too_many_bad_frames(write, config):
 
 @pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
 def test_pictures_of_depth(write, config, shape):
-    """A picture of depth is no depth: its frame is left out, and named."""
     path = write()
     cv2.imwrite(str(path / "frame-000010.depth.png"), np.zeros(shape, np.uint8))
     capture = read_capture(path, config())
@@ -158,7 +150,6 @@ def test_pictures_of_depth(write, config, shape):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_redkitchen():
-    """The real capture opens whole, and most colour pixels have depth, but not those at its rim."""
     capture = read_capture(Path(os.environ["SPLATPILOT_DATA"]) / "redkitchen")
     assert len(capture) == 200 and not capture.dropped
     depth = capture.registered_depth(0)

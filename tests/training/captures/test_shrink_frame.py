@@ -18,13 +18,11 @@ def frame_of(depth: np.ndarray) -> CaptureFrame:
     ("width", "wanted", "factor"), [(640, 320, 2), (640, 0, 1), (100, 320, 1), (2832, 320, 9)]
 )
 def test_factors_are_whole_and_never_enlarge(width, wanted, factor):
-    """The factor is the whole number that comes nearest to the wanted width, at least 1."""
     assert shrink_factor(width, wanted) == factor
 
 
 @pytest.mark.parametrize("factor", [2, 3])
 def test_a_slanted_plane_keeps_its_depth(factor):
-    """Shrunk depth is that of the plane at the centres of the shrunk pixels, by the new K."""
     normal = np.array([0.3, -0.2, 1.0])
 
     def plane(K, width, height):
@@ -40,8 +38,6 @@ def test_a_slanted_plane_keeps_its_depth(factor):
 
 
 def test_edges_holes_and_sky():
-    """At an edge a depth that was seen is kept, where most is unknown it is unknown, and where all
-    is beyond range it is infinite."""
     inf = np.inf
     depth = np.array(
         [
@@ -66,7 +62,6 @@ def test_pixels_are_valid_that_replace_valid_ones_alone():
 
 
 def test_colours_are_averaged():
-    """Each shrunk pixel has the mean colour of those it replaces, within rounding."""
     frame = frame_of(np.ones((4, 6)))
     mean = frame.image.reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
     assert np.abs(shrink(frame, 2).image - mean).max() <= 0.5

@@ -9,7 +9,6 @@ def turned(angle: float, x: float = 0.0) -> RigidTransform:
 
 
 def test_poses_are_composed_and_interpolated():
-    """A camera at rest on a body that moves in the map, between two samples in no order."""
     tree = TransformTree()
     tree.fix("body", "camera", turned(0.0, 1.0))
     tree.move("map", "body", 10.1, turned(0.4, 4.0))
@@ -24,7 +23,6 @@ def test_poses_are_composed_and_interpolated():
 
 
 def test_what_is_not_known():
-    """Before the first sample, in a gap, and of frames with no parent or in a ring."""
     tree = TransformTree()
     for time in (1.0, 2.0):
         tree.move("map", "body", time, turned(0.0))
@@ -37,7 +35,6 @@ def test_what_is_not_known():
 
 
 def test_fixed_poses():
-    """Only what is at rest all the way has one."""
     tree = TransformTree()
     tree.fix("body", "mast", turned(0.1, 1.0))
     tree.fix("mast", "camera", turned(0.1, 1.0))

@@ -34,14 +34,12 @@ def write(tmp_path, room_views, room_poses):
 
 
 def test_room(write, shows_room):
-    """Depth is 5000 a metre, poses are interpolated in time, the driver's intrinsics are used."""
     capture = read_capture(write)
     assert len(capture) == 10 and not capture.dropped
     shows_room(capture, color=0.5, depth=0.001)
 
 
 def test_images_without_depth_or_pose_are_left_out(write):
-    """Colour images with nothing near in time are left out, and counted."""
     for name in ("depth.txt", "groundtruth.txt"):
         lines = (write / name).read_text().splitlines()
         (write / name).write_text(
@@ -53,7 +51,6 @@ def test_images_without_depth_or_pose_are_left_out(write):
 
 
 def test_known_camera_is_undistorted(write, tmp_path):
-    """The folder's name tells the camera, whose distortion is taken out."""
     named = write.rename(tmp_path.with_name("rgbd_dataset_freiburg1_room"))
     capture = read_capture(named)
     assert capture.K[0, 0] >= 517.3 / 8
@@ -105,7 +102,6 @@ def test_calibration_beside_the_images_is_read(write):
     ],
 )
 def test_bad_lists(write, name, text, message):
-    """A list that is not as it should be is named."""
     (write / name).write_text(text)
     with pytest.raises(ValueError, match=message):
         read_capture(write)
@@ -123,7 +119,6 @@ def keep_keyframes(folder, every: int, offset: float = 0.0) -> None:
 
 
 def test_keyframes(write, shows_room):
-    """Where only keyframes have poses, far apart, their images are the capture."""
     keep_keyframes(write, every=4)
     capture = read_capture(write)
     assert len(capture) == 3
@@ -134,7 +129,6 @@ def test_keyframes(write, shows_room):
 
 
 def test_clocks_must_overlap(write):
-    """Poses by another clock are no missing poses: the message says both times."""
     keep_keyframes(write, every=4, offset=1e6)
     with pytest.raises(
         ValueError, match=r"groundtruth\.txt: runs from 1000100\.000 to .*rgb\.txt from 100\.000"

@@ -1,5 +1,3 @@
-"""Videos as captures."""
-
 import cv2
 import numpy as np
 import pytest
@@ -47,7 +45,6 @@ def registered(monkeypatch):
 
 
 def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, registered):
-    """Of each half second the sharpest frame is taken, and kept for the next time."""
     made = frames(60, sharp={3, 29, 30, 50})
     write_video(tmp_path / "flight.mp4", made)
     config = CaptureConfig(cache=str(tmp_path / "cache"))
@@ -62,7 +59,6 @@ def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, registered):
 
 
 def test_rate(tmp_path, registered):
-    """More frames a second are taken where that is asked for."""
     write_video(tmp_path / "flight.mp4", frames(60, sharp=set()))
     config = CaptureConfig(cache=str(tmp_path / "cache"), video_rate=10)
     with pytest.raises(ValueError, match="enough"):
@@ -71,7 +67,6 @@ def test_rate(tmp_path, registered):
 
 
 def test_what_is_no_video(tmp_path):
-    """Other files, short videos and rates that are none are named, and leave nothing."""
     config = CaptureConfig(cache=str(tmp_path / "cache"))
     (tmp_path / "a.mp4").write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"a\.mp4: not a readable video"):

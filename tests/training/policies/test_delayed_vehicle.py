@@ -6,7 +6,7 @@ import torch
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from splatpilot.systems.policies.agile_autonomy_inference import FOV_X
+from splatpilot.systems.policies.agile_autonomy import FOV_X
 from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.evaluation import (

@@ -1,4 +1,4 @@
-"""Samples of several corpora as one, split by world."""
+"""Samples of several corpora as one, split by world, and features of their images."""
 
 import shutil
 from dataclasses import replace
@@ -37,21 +37,6 @@ def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
         outside = {data.worlds[w] for w in data.labels(data.held_out).world}
         inside = {data.worlds[w] for w in data.labels(data.training).world}
         assert outside == set(data.held_out_worlds) and not outside & inside
-
-
-def test_fewer_worlds_are_a_part_of_more(two):
-    """One world to train in, beside the one held out: samples of no other are there, the held-out
-    ones are the same, and a world more than there are is refused."""
-    whole, one = StudentData(two, HELD_OUT), StudentData(two, HELD_OUT, worlds=1)
-    assert one.held_out_worlds == whole.held_out_worlds
-    assert len(one.worlds) == 2 and set(one.worlds) < set(whole.worlds)
-    trained_in = {one.worlds[w] for w in one.labels(one.training).world}
-    assert trained_in == set(one.worlds) - set(one.held_out_worlds)
-    np.testing.assert_array_equal(one.labels(one.held_out).X_WB, whole.labels(whole.held_out).X_WB)
-    both = StudentData(two, HELD_OUT, worlds=2)
-    assert both.worlds == whole.worlds and len(both.training) == len(whole.training)
-    with pytest.raises(ValueError, match=r"worlds is 3, but .* 2 are left"):
-        StudentData(two, HELD_OUT, worlds=3)
 
 
 def test_samples_keep_their_order_and_world(two):

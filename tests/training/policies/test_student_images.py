@@ -7,6 +7,7 @@ import torch
 from splatpilot.systems.policies import student as student_observation
 from splatpilot.systems.sensing import noise as observation_noise
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.training.policies.image_noise import disturb_color, noisy_color
 from splatpilot.training.policies.student_images import (
     Appearance,
     clean_images,
@@ -14,7 +15,6 @@ from splatpilot.training.policies.student_images import (
     relit,
     training_images,
 )
-from splatpilot.training.policies.torch_observations import disturb_color, noisy_color
 
 
 def some_pixels(observation: str) -> np.ndarray:

@@ -8,13 +8,6 @@ from splatpilot.training.reconstruction.optimize import DefaultStrategy
 from splatpilot.training.reconstruction.parameters import SplatParameters
 from splatpilot.training.reconstruction.splat_rendering import render
 
-RATES = {
-    "means": 1e-3,
-    "quats": 1e-3,
-    "log_scales": 1e-3,
-    "logit_opacities": 1e-2,
-    "sh_0": 1e-3,
-}
 K = torch.tensor([[[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]])
 VIEWMAT = torch.eye(4)[None]
 
@@ -47,7 +40,7 @@ def test_large_gradients_double_small_gaussians_and_split_large_ones():
     strategy = strategy_for(splats)
     strategy.gradients, strategy.counts = torch.tensor([1.0, 1.0, 0.0]), torch.ones(3)
     small, large, other = splats["means"].detach().clone()
-    strategy.refine(1, splats, RATES)
+    strategy.refine(1, splats)
     assert len(splats) == 5
     means, scales = splats["means"], splats.scales[:, 0]
     assert (means == small).all(dim=1).sum() == 2 and (means == other).all(dim=1).sum() == 1
@@ -64,7 +57,7 @@ def test_only_the_strongest_grow_up_to_the_limit():
     strategy = strategy_for(splats, max_gaussians=4)
     strategy.gradients, strategy.counts = torch.tensor([1.0, 3.0, 2.0]), torch.ones(3)
     strongest = splats["means"][1].detach().clone()
-    strategy.refine(1, splats, RATES)
+    strategy.refine(1, splats)
     assert len(splats) == 4
     assert (splats["means"] == strongest).all(dim=1).sum() == 2
 
@@ -73,11 +66,11 @@ def test_faint_and_huge_gaussians_are_removed_and_opacities_reset():
     """Faint Gaussians go at once, huge ones after the first reset, which dims all the others."""
     splats = three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.004))
     strategy = strategy_for(splats, reset_every=2)
-    strategy.refine(1, splats, RATES)
+    strategy.refine(1, splats)
     assert len(splats) == 2
-    strategy.refine(2, splats, RATES)
+    strategy.refine(2, splats)
     np.testing.assert_allclose(splats.opacities.detach(), [0.01, 0.01], rtol=1e-4)
-    strategy.refine(3, splats, RATES)
+    strategy.refine(3, splats)
     assert splats.scales.max() < 0.01
 
 

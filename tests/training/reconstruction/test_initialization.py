@@ -15,7 +15,7 @@ from splatpilot.training.reconstruction.initialize import (
 )
 from splatpilot.training.reconstruction.photometry import ThinnedFrame, estimate_photometry
 
-COARSE = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2, "opacity": 0.5}
+COARSE = {"contrast": 1.0, "max_cell": 16, "max_extent": 0.2}
 
 
 class Frames:

@@ -156,7 +156,7 @@ def test_absent_weights(tmp_path, monkeypatch):
     monkeypatch.delenv("SPLATPILOT_DATA")
     with pytest.raises(FileNotFoundError, match="no weights"):
         Lpips()
-    with pytest.raises(FileNotFoundError, match=r"mine\.pt: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*mine\.pt"):
         Lpips(tmp_path / "mine.pt")
 
 
@@ -198,7 +198,7 @@ def test_other_files_are_refused(tmp_path, weights, content):
 @pytest.mark.parametrize("shape", [(16, 40, 3), (40, 40, 4), (40, 40)])
 def test_bad_images(weights_file, shape):
     """What is no image of three colours, or too small, is refused with its shape."""
-    with pytest.raises(ValueError, match=r"images have shapes .* at least 17 pixels"):
+    with pytest.raises(ValueError, match=r"images must be .* at least 17 pixels, got \("):
         Lpips(weights_file)(torch.zeros(shape), torch.zeros(shape))
 
 

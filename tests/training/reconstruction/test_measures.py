@@ -16,7 +16,7 @@ from splatpilot.training.reconstruction.metrics import (
     floater_fraction,
     floaters,
     hole_fraction,
-    mean_measure,
+    mean_metric,
     measure_view,
     psnr_db,
     ssim,
@@ -249,8 +249,8 @@ def test_a_view_of_which_nothing_was_seen_has_no_measures():
     assert {blind.depth_mae_m, blind.floater_fraction, blind.hole_fraction} == {None}
     assert (blind.unseen_fraction, blind.gain) == (1.0, 1.0)
     for name in ("psnr_db", "ssim", "depth_mae_m"):
-        assert mean_measure([blind, seeing], name) == (getattr(seeing, name), 1)
-    assert mean_measure([blind], "psnr_db") == (None, 0)
+        assert mean_metric([blind, seeing], name) == (getattr(seeing, name), 1)
+    assert mean_metric([blind], "psnr_db") == (None, 0)
 
 
 def never(*_args) -> None:

@@ -165,7 +165,7 @@ def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
         depth = np.where(on_plate, 2.0, np.inf).astype(np.float32)
         frames.append(CaptureFrame(image, depth, RigidTransform([x, 0, 0]), K))
     views = ReconstructionViews(frames, Photometry(np.ones(5), 0.0))
-    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2, "opacity": 0.9}
+    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2}
     detail = Detail(max_gaussians=300, optimized=True, **cells)
     start = gaussians_from_depth(frames, Photometry(np.ones(5), 0.0), detail)
     holes = []

@@ -13,7 +13,7 @@ from splatpilot.training.reconstruction.distance_field import (
     add_sky,
     choose_grid,
     fuse,
-    render_depth_of,
+    render_depth,
 )
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
@@ -72,7 +72,7 @@ def test_masked_pixels_leave_space_unknown():
         np.full(61**2, 0.99),
         np.zeros((61**2, 3)),
     )
-    rendered = render_depth_of(capture, 2, wall, "3dgs", 1)
+    rendered = render_depth(capture, 2, wall, "3dgs", 1)
     grid = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
     for source in (measured, rendered):
         states = fuse(source, grid).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state

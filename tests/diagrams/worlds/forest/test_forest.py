@@ -13,7 +13,12 @@ from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET, PASSAGE
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig, lay_out
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, Sphere
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Capsule,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -144,7 +149,7 @@ def test_leaves_around_the_volume_stay_out_of_it(world):
     solid = p[:, 2] < 0.1  # ground and litter
     for shape in _shapes(world):
         if isinstance(shape, (Capsule, Sphere)):
-            solid |= np.abs(type(shape).distances(p, *shape.parameters())) < 0.15
+            solid |= np.abs(ShapeUnion.of([shape]).distance(p)) < 0.15
     reach = 3 * scene.scales.max(axis=1)
     leaves = (beyond > 0) & ~solid
     assert leaves.sum() > 10_000
@@ -165,7 +170,7 @@ def test_every_shape_to_hit_is_seen(world):
             continue
         if ((centre < field.lower_W) | (centre > field.upper_W))[:2].any():
             continue
-        on_it = np.abs(type(shape).distances(p, *shape.parameters())) < 0.03
+        on_it = np.abs(ShapeUnion.of([shape]).distance(p)) < 0.03
         assert on_it.sum() > 40
         seen += 1
     assert seen > 30

@@ -5,7 +5,14 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Solid, faces_of
-from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from splatpilot.systems.collision.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    ShapeUnion,
+    Sphere,
+)
 
 BOX = Box(RigidTransform(RollPitchYaw(0.2, -0.4, 1.0), [1.0, 0, 2]), [1.0, 2.0, 0.5])
 SHAPES = {
@@ -32,8 +39,8 @@ def test_faces_lie_on_the_surface_and_look_outwards(kind):
     rng = np.random.default_rng(0)
     for face in faces_of(shape, *BOUNDS):
         p, n, t = face.at(rng.uniform(0.02, 0.98, (200, 2)) * face.size)
-        np.testing.assert_allclose(type(shape).distances(p, *shape.parameters()), 0, atol=1e-12)
-        outwards = type(shape).gradients(p + 1e-6 * n, *shape.parameters())
+        np.testing.assert_allclose(ShapeUnion.of([shape]).distance(p), 0, atol=1e-12)
+        outwards = ShapeUnion.of([shape]).nearest(p + 1e-6 * n)[1]
         np.testing.assert_allclose(outwards, n, atol=1e-4)
         np.testing.assert_allclose(np.einsum("nk,nk->n", n, t), 0, atol=1e-12)
 
