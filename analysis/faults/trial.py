@@ -64,9 +64,9 @@ KINDS = (
 )
 """Types of faults: messages are dropped, 300 ms late, sent twice, or overtake each other; the
 vehicle's clock jumps; its state is constant, or meters off; motion capture loses the vehicle, or
-its messages are dropped; packets of the time-of-flight sensor are dropped, or have flipped bits; the
-policy outputs nonsense or raises exceptions, its process stalls or ends; messages contain NaN, or
-have flipped bits.
+its messages are dropped; packets of the time-of-flight sensor are dropped, or have flipped bits;
+the policy outputs nonsense or raises exceptions, its process stalls or ends; messages contain NaN,
+or have flipped bits.
 
 Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
 
