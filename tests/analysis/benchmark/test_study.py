@@ -6,7 +6,7 @@ import pytest
 
 from splatpilot.analysis.benchmark.rollout import chunks
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, default_policies
-from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 
 
 def test_rollouts_are_all_combinations(short_scenario):

@@ -8,7 +8,7 @@ from splatpilot.analysis.benchmark.tables import (
     policy_table,
     scenarios_passed,
 )
-from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 
 
 def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:

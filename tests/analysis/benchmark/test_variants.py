@@ -2,7 +2,7 @@
 
 import pytest
 
-from splatpilot.analysis.benchmark.study import Variant, parse_variant, split_policies, sweep
+from splatpilot.analysis.benchmark.variants import Variant, parse_variant, split_policies, sweep
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.reactive import ReactiveConfig

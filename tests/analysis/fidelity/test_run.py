@@ -112,7 +112,7 @@ def test_withheld_stretches(place):
     ]
     words = [word for setting in settings for word in ("--set", setting)]
     out = place.folder / "out"
-    assert main(["fidelity", str(scene), "--out", str(out), *words]) == 0
+    assert main(["scene", "fidelity", str(scene), "--out", str(out), *words]) == 0
     rows = rows_of(out)
     assert [int(row["frame"]) for row in rows] == [3, 7, 8, 9]
     expected = [0.15, 0.15, 0.3, 0.15]
@@ -124,7 +124,7 @@ def test_withheld_stretches(place):
     assert 0 < np.median(metadata.pose_perturbation_bounds) < 0.31
 
     made = (out / "real" / "gaussians.ply").stat().st_mtime_ns
-    assert main(["fidelity", str(scene), "--out", str(out), *words]) == 0
+    assert main(["scene", "fidelity", str(scene), "--out", str(out), *words]) == 0
     assert (out / "real" / "gaussians.ply").stat().st_mtime_ns == made
 
 
@@ -158,7 +158,7 @@ def test_studies_are_not_mixed(place, rendered_world):
 )
 def test_bad_settings(place, capsys, setting, message):
     scene, out = place.scene("scene"), place.folder / "out"
-    assert main(["fidelity", str(scene), "--out", str(out), "--set", setting]) == 1
+    assert main(["scene", "fidelity", str(scene), "--out", str(out), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 
@@ -169,5 +169,5 @@ def test_capture_without_depth(place, monkeypatch, capsys):
     blind = replace(place.capture, load_depth=no_depth)
     monkeypatch.setattr(capture_of_scene, "read_capture", lambda path, config: blind)
     scene = place.scene("blind")
-    assert main(["fidelity", str(scene), "--out", str(place.folder / "out")]) == 1
+    assert main(["scene", "fidelity", str(scene), "--out", str(place.folder / "out")]) == 1
     assert "has no metric depth" in capsys.readouterr().err

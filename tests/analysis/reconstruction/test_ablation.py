@@ -19,7 +19,9 @@ SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=
 
 def ablate(place, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
-    return main(["ablate", *captures, "--out", str(place.folder / "out"), *settings, *words])
+    return main(
+        ["scene", "ablate", *captures, "--out", str(place.folder / "out"), *settings, *words]
+    )
 
 
 def test_ablation_end_to_end(place, capsys, monkeypatch):
@@ -154,11 +156,11 @@ def test_means_and_spreads():
     ],
 )
 def test_bad_settings(place, capsys, setting, message):
-    assert main(["ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
+    assert main(["scene", "ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 
 def test_two_captures_of_one_name(place, capsys):
     for other in ("room", str(place.scene("scene"))):
-        assert main(["ablate", "room", other, "--out", str(place.folder / "out")]) == 1
+        assert main(["scene", "ablate", "room", other, "--out", str(place.folder / "out")]) == 1
         assert "two captures are called room" in capsys.readouterr().err

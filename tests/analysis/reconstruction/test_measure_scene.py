@@ -47,7 +47,7 @@ def test_a_curtain_is_a_floater(place):
 
 def test_metrics_file(place, capsys):
     scene = place.scene("same", with_curtain(place.gaussians, 3.0))
-    assert main(["measure", str(scene)]) == 0
+    assert main(["scene", "measure", str(scene)]) == 0
     printed = capsys.readouterr().out
     content = json.loads((scene / "metrics.json").read_text())
     frames, strict = content["frames"], content["strict_frames"]
@@ -67,7 +67,7 @@ def test_metrics_file(place, capsys):
 
 def test_without_lpips_weights(place, capsys):
     scene = place.scene("same")
-    assert main(["measure", str(scene)]) == 0
+    assert main(["scene", "measure", str(scene)]) == 0
     content = json.loads((scene / "metrics.json").read_text())
     assert content["lpips"] is None
     assert "pip install lpips" in content["lpips_missing"]

@@ -88,11 +88,20 @@ def unscaled(seen_room, photographs, tmp_path):
 def test_scene_of_photographs_can_be_flown_in_once_it_has_its_size(
     unscaled, seen_room, tmp_path, capsys
 ):
-    with pytest.raises(ValueError, match=r"splatpilot view .* `splatpilot scale`"):
+    with pytest.raises(ValueError, match=r"splatpilot view .* `splatpilot scene scale`"):
         read_scene(unscaled)
     before = {file.name: file.read_bytes() for file in unscaled.iterdir()}
     out = tmp_path / "scaled"
-    command = ["scale", str(unscaled), "--out", str(out), "--between", "-0.1,0.2,0.3", "1.4,.2,.3"]
+    command = [
+        "scene",
+        "scale",
+        str(unscaled),
+        "--out",
+        str(out),
+        "--between",
+        "-0.1,0.2,0.3",
+        "1.4,.2,.3",
+    ]
     assert main([*command, "--distance", "6"]) == 0
     assert "6 x 3 x 2.5 m" in capsys.readouterr().out
     assert {file.name: file.read_bytes() for file in unscaled.iterdir()} == before
@@ -175,7 +184,7 @@ def test_scene_of_measured_depth_is_not_compared_with_its_capture_any_more(place
     ],
 )
 def test_scales_that_make_no_sense_are_refused(unscaled, tmp_path, capsys, words, message):
-    assert main(["scale", str(unscaled), "--out", str(tmp_path / "scaled"), *words]) == 1
+    assert main(["scene", "scale", str(unscaled), "--out", str(tmp_path / "scaled"), *words]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "scaled").exists()
 

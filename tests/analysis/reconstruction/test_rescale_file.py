@@ -22,7 +22,17 @@ def test_file_of_gaussians_in_metres_and_upright(seen_room, tmp_path, up):
     R_FW = RotationMatrix(np.column_stack([x_F, np.cross(up_F, x_F), up_F]))
     file, out = tmp_path / "file.ply", tmp_path / "upright.ply"
     write_ply(gaussians.scaled_by(SHRUNK).transformed_by(RigidTransform(R_FW)), file)
-    command = ["scale", str(file), "--out", str(out), "--up", up, "--factor", str(1 / SHRUNK)]
+    command = [
+        "scene",
+        "scale",
+        str(file),
+        "--out",
+        str(out),
+        "--up",
+        up,
+        "--factor",
+        str(1 / SHRUNK),
+    ]
     assert main(command) == 0
     found = read_ply(out)
     np.testing.assert_allclose(found.means[:, 2], gaussians.means[:, 2], atol=1e-5)
@@ -46,7 +56,10 @@ def test_a_tilted_file_becomes_level(seen_room, tmp_path):
         words = [",".join(str(x) for x in point) for point in points]
         out = tmp_path / f"{k}.ply"
         assert (
-            main(["scale", str(file), "--out", str(out), "--floor", *words, "--factor", "2"]) == 0
+            main(
+                ["scene", "scale", str(file), "--out", str(out), "--floor", *words, "--factor", "2"]
+            )
+            == 0
         )
         heights = read_ply(out).means[:, 2]
         np.testing.assert_allclose(heights, 2 * (gaussians.means[:, 2] - lowest), atol=2e-5)
@@ -95,6 +108,6 @@ def test_files_that_cannot_be_scaled(place, monkeypatch, capsys, words, message)
     (folder / "room.ply").write_bytes((scene / "gaussians.ply").read_bytes())
     (folder / "a.ksplat").write_bytes(bytes(64))
     there = sorted(folder.iterdir())
-    assert main(["scale", *words]) == 1
+    assert main(["scene", "scale", *words]) == 1
     assert message in capsys.readouterr().err
     assert sorted(folder.iterdir()) == there

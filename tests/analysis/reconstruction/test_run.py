@@ -73,7 +73,7 @@ def test_what_was_said_of_a_capture_stays_with_its_scene(folder, config, tmp_pat
     assert (scene / "metrics.json").read_bytes() == written
 
     capsys.readouterr()
-    assert main(["measure", str(scene), "--overwrite"]) == 0
+    assert main(["scene", "measure", str(scene), "--overwrite"]) == 0
     assert (scene / "metrics.json").read_bytes() == written
     printed = capsys.readouterr().out
     assert f"made from              nerfstudio capture {folder}, 16 frames" in printed
@@ -82,7 +82,7 @@ def test_what_was_said_of_a_capture_stays_with_its_scene(folder, config, tmp_pat
     (scene / "scene.yaml").write_text(
         (scene / "scene.yaml").read_text().replace("depth_unit", "depth_units")
     )
-    assert main(["measure", str(scene), "--overwrite"]) == 1
+    assert main(["scene", "measure", str(scene), "--overwrite"]) == 1
     message = capsys.readouterr().err
     assert "scene.yaml: capture_settings: " in message and "did you mean depth_unit" in message
 

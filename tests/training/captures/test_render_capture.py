@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.indoor import RoomConfig
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
