@@ -176,7 +176,9 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
                 "scene.yaml, as written by `splatpilot reconstruct`"
             )
     metadata = read_scene_metadata(path)
-    remedy = f"measure a length in `splatpilot view {path}` and rescale with `splatpilot scale`"
+    remedy = (
+        f"measure a length in `splatpilot view {path}` and rescale with `splatpilot scene scale`"
+    )
     if metric:
         require(metadata.metric, f"{path / 'scene.yaml'}: metric", "true to fly", "false", remedy)
     gaussians = read_ply(path / "gaussians.ply")
@@ -276,7 +278,7 @@ def _read_bare_gaussians(path: Path) -> World:
     voxel_size = max(0.1, float(np.cbrt(np.prod(upper_W - lower_W) / _MAX_VOXELS)))
     extent = np.round(upper_W - lower_W, 1).tolist()
     condition = f"small enough for voxels of {_MAX_VOXEL} m"
-    remedy = "crop far Gaussians away, or rescale with `splatpilot scale`"
+    remedy = "crop far Gaussians away, or rescale with `splatpilot scene scale`"
     require(voxel_size <= _MAX_VOXEL, f"{path}: extent", condition, f"{extent} m", remedy)
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
     p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
