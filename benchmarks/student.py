@@ -17,15 +17,14 @@ from harness import seconds
 from splatpilot.systems.policies.student import StudentNetwork, StudentSpec, plan
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import pose_from_state
-from splatpilot.training.policies.student_config import StudentDepthTraining
 from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.train import step_optimizer
-from splatpilot.training.policies.train_student import StudentTrainer
+from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
 
 
 def tick_time(observation: str, width: int, height: int) -> float:
     """Of a decision [s], from the camera's image to the hypotheses."""
-    spec, rng = StudentSpec(observation, width, height), np.random.default_rng(0)
+    spec, rng = StudentSpec(observation, width, height, way_version=2), np.random.default_rng(0)
     weights = {name: w.numpy() for name, w in StudentModule(spec).state_dict().items()}
     network = StudentNetwork(spec, weights)
     color = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)

@@ -124,8 +124,6 @@ def test_there_are_as_many_worlds_as_seeds(index):
 
 
 def test_some_kind_or_scene_is_needed(tmp_path):
-    """No kinds are fine with a scene, and refused without; so are scenarios of captured places and
-    those that nobody knows."""
     LibraryConfig(kinds=[], scenes=[write_scene(tmp_path / "attic", 0.1)]).validate()
     for kinds, message in (
         ([], "neither kinds nor scenes"),

@@ -198,7 +198,6 @@ def test_what_an_interruption_left_of_a_world_is_not_used(small, gathered, tmp_p
 
 
 def test_another_corpus_is_not_added_to(small, gathered):
-    """A folder keeps to the configuration that it was begun with."""
     folder = gathered.shards[0].path.parents[1]
     other = load_config(small, overrides=["flights=3"])
     with pytest.raises(ValueError, match="another configuration"):

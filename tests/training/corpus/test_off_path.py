@@ -74,7 +74,6 @@ def test_same_seed_draws_the_same_states():
 
 
 def test_a_place_without_room_is_named():
-    """Nothing can be drawn where nothing has room."""
     labeller = labeller_of()
     labeller.toa = replace(labeller.toa, reachable=np.zeros_like(labeller.toa.reachable))
     with pytest.raises(InfeasibleFlightError, match="no place from which a way leads"):

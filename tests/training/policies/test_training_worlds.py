@@ -129,7 +129,6 @@ def test_policies_learn_in_places(yard):
 
 
 def test_bad_selections_are_refused(yard, tmp_path):
-    """Nothing to choose from, places that are flown in, and kinds that are captured places."""
     WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
     tested = write_place(tmp_path / "warehouse", "test")
     for fields, message in (
