@@ -117,7 +117,7 @@ class SceneMetadata(Config):
     """[px], to which images were scaled down; 0 if they were not."""
     perturbation_bound: float | None = bounded(None, "[0, inf) m")
     """[m], distance from the poses of the capture up to which images of the scene can be trusted,
-    as measured by `splatpilot fidelity`; None before."""
+    as measured by `splatpilot scene fidelity`; None before."""
     pose_perturbation_bounds: list[float] = bounded(list, "[0, inf) m")
     """[m], the same for each pose of the capture, in frame order; empty before."""
 

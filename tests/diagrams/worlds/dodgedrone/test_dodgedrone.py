@@ -5,8 +5,9 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.dodgedrone import (
     LEVELS,
     SEED,
