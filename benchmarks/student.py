@@ -24,7 +24,7 @@ from splatpilot.training.policies.train_student import StudentDepthTraining, Stu
 
 def tick_time(observation: str, width: int, height: int) -> float:
     """Times planning [s], from the camera's image to the hypotheses."""
-    spec, rng = StudentSpec(observation, width, height), np.random.default_rng(0)
+    spec, rng = StudentSpec(observation, width, height, way_version=2), np.random.default_rng(0)
     weights = {name: w.numpy() for name, w in StudentModule(spec).state_dict().items()}
     network = StudentNetwork(spec, weights)
     color = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)

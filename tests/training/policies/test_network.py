@@ -137,7 +137,6 @@ def test_trajectories_that_fly_are_those_trained():
 
 
 def test_quaternions_of_rotations():
-    """Rotations of all kinds, half turns included, give back their quaternion with w >= 0."""
     angles = [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.3, -2.0, 1.0), (3, 1, -2)]
     for roll, pitch, yaw in angles:
         rpy = RollPitchYaw(roll, pitch, yaw)

@@ -317,7 +317,6 @@ def test_threads_and_instructions_change_no_bit():
 
 
 def test_bad_input_is_refused():
-    """What cannot be is a ValueError that says so, and no crash."""
     geometry = ShapeGeometry([some_world(0)])
     field = EsdfGeometry([field_of(some_world(0))])
     p, R = cameras(0, 2)

@@ -17,10 +17,9 @@ from splatpilot.training.corpus.library import LibraryConfig
 from splatpilot.training.corpus.samples import EXPERT, RECOVERY
 from splatpilot.training.policies import recover as recovery
 from splatpilot.training.policies import recover as student_flights
-from splatpilot.training.policies.student_config import StudentDepthTraining
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
-from splatpilot.training.policies.train_student import StudentTrainer
+from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
 
 TINY = [
     "pretrained=false",
@@ -161,11 +160,11 @@ def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
     natural = len(data.recovered) / len(data.training)
     assert 0.0 < natural < 1.0
     for share, part in ((0.0, natural), (0.25, 0.25), (0.8, 0.8), (1.0, 1.0)):
-        drawn = data.drawn(draw, share)
+        drawn = data.draw(draw, share)
         assert set(drawn) <= set(data.training)
         assert np.isin(drawn, data.recovered).mean() == pytest.approx(part, abs=0.03)
     plain = StudentData([Corpus(expert)], 0.5)
-    assert set(plain.drawn(draw, 0.5)) == set(plain.training)
+    assert set(plain.draw(draw, 0.5)) == set(plain.training)
 
 
 def test_what_corpora_share_is_flown_once(expert, tmp_path):
@@ -206,7 +205,6 @@ def interrupt(*_args) -> None:
 
 
 def test_counts_out_of_range_are_refused(expert, tmp_path):
-    """The option is named, before anything is trained."""
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"--flights .* got 0"):
         recovery.run(config=config, make=StudentTrainer, out=tmp_path, flights=0, jobs=1)
