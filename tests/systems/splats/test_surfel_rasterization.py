@@ -32,7 +32,7 @@ def random_scene(**options) -> dict[str, Any]:
 
 
 def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
-    """Surfels whose planes meet the rays through their centres at `sine`, all on the image."""
+    """Surfels whose planes meet the rays through their centers at `sine`, all on the image."""
     scene = random_scene(count=8 * count)
     generator = np.random.default_rng(0)
     X_CW = scene["viewmats"][0].double().numpy()
@@ -45,8 +45,8 @@ def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
             continue  # the plane passes too far beside that ray
         a_W = [r - slope * n for r, n in zip(ray_W, n_W, strict=True)]  # in the plane
         x, y = depth * (1.0 - sine * sine) ** 0.5 / dot(a_W, a_W) ** 0.5, depth * sine
-        centre_W = [-dot(X_CW[:3, k], X_CW[:3, 3]) for k in range(3)]
-        means.append([c + x * a + y * n for c, a, n in zip(centre_W, a_W, n_W, strict=True)])
+        center_W = [-dot(X_CW[:3, k], X_CW[:3, 3]) for k in range(3)]
+        means.append([c + x * a + y * n for c, a, n in zip(center_W, a_W, n_W, strict=True)])
         kept.append(i)
     for name in ("quats", "scales", "opacities", "colors"):
         scene[name] = scene[name][kept[:count]]
