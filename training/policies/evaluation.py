@@ -13,7 +13,6 @@ from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.training.policies.augmentation import noisy_depth
 from splatpilot.training.policies.ray_casting import Geometry, PixelRays
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 from splatpilot.training.policies.training_worlds import (
     WorldBatch,
@@ -24,6 +23,7 @@ from splatpilot.training.policies.training_worlds import (
 from splatpilot.training.policies.vehicles import (
     BodyRate,
     History,
+    Observation,
     PointMass,
     Vehicle,
     take_rows,

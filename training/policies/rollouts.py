@@ -20,9 +20,14 @@ from splatpilot.training.policies.evaluation import (
 )
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import Geometry
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.training_worlds import STARTS, WorldBatch
-from splatpilot.training.policies.vehicles import History, PointMass, choose_rows, map_tensors
+from splatpilot.training.policies.vehicles import (
+    History,
+    Observation,
+    PointMass,
+    choose_rows,
+    map_tensors,
+)
 
 NUM_OBSTACLES = 4
 """Number of nearest obstacles in the loss of each step."""

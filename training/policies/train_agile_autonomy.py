@@ -31,9 +31,11 @@ from splatpilot.systems.policies.agile_autonomy import (
     MODES,
     PROGRESS,
     RATE,
+    state_observation,
 )
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
+from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.planner import plan
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
@@ -48,12 +50,12 @@ from splatpilot.training.policies.evaluation import (
 )
 from splatpilot.training.policies.networks import TrajectoryModule
 from splatpilot.training.policies.ray_casting import PixelRays
-from splatpilot.training.policies.torch_observations import Observation, target_velocity
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import STARTS
 from splatpilot.training.policies.vehicles import (
     BodyRate,
     History,
+    Observation,
     choose_rows,
     reaching_acceleration,
 )
@@ -85,8 +87,7 @@ class AgileAutonomyAgent:
             else 0.0 * vehicle.v
         )
         v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
-        rows = torch.stack([vehicle.v, v_target], 1) @ R_WB
-        state = torch.cat([R_WB.flatten(1), rows[:, 0], rates, rows[:, 1]], 1)
+        state = state_observation(R_WB, vehicle.v, rates, v_target)
         return self.encode_depth(seen.depth), state
 
     def encode_depth(self, depth: Tensor) -> Tensor:

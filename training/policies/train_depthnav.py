@@ -28,13 +28,17 @@ from splatpilot.systems.policies.depthnav import (
     MIN_DEPTH,
     RATE,
 )
+from splatpilot.systems.policies.observations import (
+    heading_frame,
+    limit_smoothly,
+    target_velocity,
+)
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
-from splatpilot.training.policies import torch_observations as observation
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.trainer import Schedule
+from splatpilot.training.policies.vehicles import Observation
 
 
 @dataclass
@@ -96,15 +100,15 @@ class DepthNavLearner:
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         spec, vehicle, speed = self.network.spec, seen.vehicle, seen.speed
         start_yaw = torch.where(memory[:, -1].isnan(), vehicle.yaw, memory[:, -1]).detach()
-        R_WS = observation.heading_frame(start_yaw)
+        R_WS = heading_frame(start_yaw)
         image = 1.0 / seen.depth.clamp(MIN_DEPTH, MAX_DEPTH)
-        v_target = observation.target_velocity(vehicle.p, seen.p_WG, speed)
+        v_target = target_velocity(vehicle.p, seen.p_WG, speed)
         q_SB = quaternion_from_rotation(R_WS.mT @ vehicle.attitude())
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)
         output, hidden = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
         )
-        a_S = observation.limit_smoothly(output[:, :3], self._limits)
+        a_S = limit_smoothly(output[:, :3], self._limits)
         to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
         heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
         return (

@@ -29,14 +29,20 @@ from splatpilot.systems.policies.diffaero import (
     VELOCITY_LIMITS,
     DiffAeroTofConfig,
 )
+from splatpilot.systems.policies.observations import (
+    heading_frame,
+    heading_observation,
+    inverse_depth,
+    limit_smoothly,
+)
+from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.sensing.time_of_flight import range_of_depth, sensor_of
-from splatpilot.training.policies import torch_observations as observation
+from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH, range_of_depth, sensor_of
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.trainer import Schedule
+from splatpilot.training.policies.vehicles import Observation
 
 
 @dataclass
@@ -82,13 +88,13 @@ class DiffAeroLearner:
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         spec = self.network.spec
-        R_WH = observation.heading_frame(seen.vehicle.yaw)
-        image = observation.inverse_depth(seen.depth, MIN_DEPTH, MAX_DEPTH)
-        state = observation.heading_observation(seen, R_WH)
+        R_WH = heading_frame(seen.vehicle.yaw)
+        image = inverse_depth(seen.depth, MIN_DEPTH, MAX_DEPTH)
+        state = _state_observation(seen, R_WH)
         output, memory = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory
         )
-        a_H = observation.limit_smoothly(output, self._limits)
+        a_H = limit_smoothly(output, self._limits)
         return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
@@ -107,6 +113,25 @@ class DiffAeroLearner:
             "acceleration": weights.acceleration * transitions.a.square().sum(1).mean(),
             "jerk": weights.jerk * transitions.jerk.square().sum(1).mean(),
         }
+
+
+def _state_observation(seen: Observation, R_WH: Tensor) -> Tensor:
+    p, v, z = seen.vehicle.p, seen.vehicle.v, seen.vehicle.body_z()
+    return heading_observation(p, v, z, seen.p_WG, seen.speed, R_WH)
+
+
+def proximity_grid(
+    depth: Tensor, range_of_depth: Tensor, max_range: float, height: int, width: int
+) -> Tensor:
+    """The proximities (N, height, width) in images of depth (N, R) [m], the lowest row first.
+
+    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W); H and W must
+    be multiples of height and width.
+    """
+    H, W = range_of_depth.shape
+    measured = torch.where(depth > LEAST_DEPTH, depth, max_range).reshape(-1, H, W)
+    blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
+    return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
 
 
 # DiffAero on the grid of a time-of-flight sensor: ranges to 5 m as 1 - range / 5 m, of 86 x 48.4
@@ -151,12 +176,12 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        sensor, R_WH = self._sensor, observation.heading_frame(seen.vehicle.yaw)
-        grid = observation.proximity_grid(
+        sensor, R_WH = self._sensor, heading_frame(seen.vehicle.yaw)
+        grid = proximity_grid(
             seen.depth, self._range_of_depth, sensor.max_range, sensor.rows, sensor.columns
         )
-        state = observation.heading_observation(seen, R_WH)
+        state = _state_observation(seen, R_WH)
         output, memory = self.network(grid, state, memory)
-        v_H = observation.limit_smoothly(output, self._limits)
+        v_H = limit_smoothly(output, self._limits)
         v_desired = (R_WH @ v_H[:, :, None])[:, :, 0]
-        return observation.tracking_acceleration(seen.vehicle.v, v_desired), None, memory
+        return tracking_acceleration(seen.vehicle.v, v_desired), None, memory

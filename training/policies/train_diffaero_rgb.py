@@ -26,6 +26,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
     rays_B,
     require_view,
 )
+from splatpilot.systems.policies.observations import heading_frame, inverse_depth
 from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
@@ -34,7 +35,6 @@ from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import check_noise, noisy_color, relit
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.student_data import StudentData
-from splatpilot.training.policies.torch_observations import heading_frame, inverse_depth
 from splatpilot.training.policies.trainer import CorpusTraining, Schedule, Trainer, spread
 
 

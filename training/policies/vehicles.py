@@ -141,6 +141,15 @@ class BodyRate(NamedTuple):
 Vehicle = PointMass | BodyRate
 
 
+class Observation(NamedTuple):
+    """Inputs of a policy for N vehicles at one step."""
+
+    depth: Tensor  # (N, R) [m], planar, inf beyond
+    vehicle: Vehicle
+    p_WG: Tensor  # (N, 3) [m]
+    speed: Tensor  # (N,) [m/s], nominal
+
+
 def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
     """Computes accelerations (N, 3) [m/s^2] that reach p_WR (N, 3) in the lookahead."""
     T = FlatnessControllerConfig.lookahead

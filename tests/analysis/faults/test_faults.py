@@ -154,7 +154,7 @@ def test_grids_travel_as_packets_of_the_sensor(kind, came):
 
 def test_kinds_interfaces_and_policies_take_turns_and_repeat():
     count = 4 * len(KINDS)
-    trials = [Trial.draw(n, np.random.default_rng([0, n])) for n in range(count)]
+    trials = [Trial.sample(n, np.random.default_rng([0, n])) for n in range(count)]
     for number, trial in enumerate(trials):
         kinds = [fault.kind for fault in trial.faults]
         assert KINDS[number % len(KINDS)] in kinds and len(set(kinds)) == len(kinds)
@@ -164,7 +164,7 @@ def test_kinds_interfaces_and_policies_take_turns_and_repeat():
     assert {trial.policy for trial in trials} == {"straight", "reactive", "diffaero_tof"}
     pairs = sum(len(trial.faults) == 2 for trial in trials)
     assert 0.3 * count < pairs < 0.7 * count
-    assert trials[3] == Trial.draw(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
+    assert trials[3] == Trial.sample(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
 
 
 @pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])

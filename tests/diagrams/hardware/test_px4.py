@@ -29,10 +29,10 @@ def test_it_counts_how_long_there_is_no_heartbeat(udp_url, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (["--arm"], "px4.arm is asked for without px4.engage; give both"),
-        (["--set", "motion_capture={}"], "px4.motion_capture has no px4.body"),
-        (["--set", "udp.senders=[drone]"], "px4.udp.senders is 'drone'"),
-        (["--set", "system=0"], "px4.system is 0"),
+        (["--arm"], "arm must be false without engage"),
+        (["--set", "motion_capture={}"], "body must be a name, which motion_capture needs"),
+        (["--set", "udp.senders=[drone]"], "senders must be an IPv4 address"),
+        (["--set", "system=0"], "system must be in [1, 255], got 0"),
         (["--lcm-url", "tcp://there"], "must begin with udpm://"),
     ],
 )
