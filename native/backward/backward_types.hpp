@@ -58,7 +58,7 @@ struct GaussianGradients {
   float* scales;
   float* opacities;
   float* colors;
-  // Whether rows, or those of colours, are to be written, zeros included, instead of added to.
+  // Whether rows, or those of colors, are to be written, zeros included, instead of added to.
   bool overwrite, overwrite_colors;
 };
 

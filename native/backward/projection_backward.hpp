@@ -126,7 +126,7 @@ struct PoseGradientPack {
     R[0] = R[1] = R[2] = p_C = direction = zero;
   }
 
-  // From the gradients of p_C and, by way of colours, of d_W = p_W - centre.
+  // From the gradients of p_C and, by way of colors, of d_W = p_W - centre.
   SP_INLINE void add(const Vector16& by_p_C, const Vector16& d_W, const Vector16& by_direction) {
     R[0] = R[0] + by_p_C.x * d_W;
     R[1] = R[1] + by_p_C.y * d_W;
@@ -168,7 +168,7 @@ SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients
     soa[7][lane] = keep * g.uv;
     soa[8][lane] = keep * g.vv;
     for (int c = 0; c < 3; ++c) {
-      // A colour that was cut off at 0 does not change with its coefficients.
+      // A color that was cut off at 0 does not change with its coefficients.
       const bool constant = colors_cut_off && !(splat.color[c] > 0.0f);
       soa[9 + c][lane] = constant ? 0.0f : keep * g.color[c];
     }

@@ -107,7 +107,7 @@ void check_size(const Array& image, const Camera& camera, size_t channels) {
           "an image has the wrong shape");
 }
 
-// Where an image of colour (3 channels), depth (1) or both (4) and its alpha are to be written.
+// Where an image of color (3 channels), depth (1) or both (4) and its alpha are to be written.
 inline Image output_image(const Output& image, const Output& alpha, const Camera& camera,
                           DepthMode depth_mode, const Floats<nb::shape<3>>& background) {
   const size_t channels = image.shape(2);

@@ -130,7 +130,7 @@ void turn(float w, const float* q, const float* v, float* turned) {
   turned[2] = v[2] + w * c[2] + q[0] * c[1] - q[1] * c[0];
 }
 
-// The gradient by an unnormalised quaternion of v . R(q) u, added to `gradient`.
+// The gradient by an unnormalized quaternion of v . R(q) u, added to `gradient`.
 void add_quaternion_gradient(const float* quat, float inverse_norm, const float* u, const float* v,
                              float* gradient) {
   const float w = quat[0] * inverse_norm, x = quat[1] * inverse_norm, y = quat[2] * inverse_norm,

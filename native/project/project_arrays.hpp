@@ -89,7 +89,7 @@ SP_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint
   }
 }
 
-// Gathers the colours of the lanes in `bits` and evaluates them.
+// Gathers the colors of the lanes in `bits` and evaluates them.
 SP_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
                              const Vector16& d_W, F16 color[3]) {
   const int used = g.sh_degree < 0 ? 1 : (g.sh_degree + 1) * (g.sh_degree + 1);

@@ -1,4 +1,4 @@
-// Colours from real spherical harmonics of degree 0 to 3, in the order and with the signs that
+// Colors from real spherical harmonics of degree 0 to 3, in the order and with the signs that
 // Gaussian-splat files use.
 #pragma once
 
@@ -42,7 +42,7 @@ SP_INLINE F16 inverse_length(const F16& x, const F16& y, const F16& z) {
   return F16(1.0f) / sqrt(max(x * x + y * y + z * z, F16(1e-30f)));
 }
 
-// colour = max(0, 1/2 + sum_k c_k Y_k(d)) for 16 Gaussians. `coefficients` holds 3 K packs, channel
+// color = max(0, 1/2 + sum_k c_k Y_k(d)) for 16 Gaussians. `coefficients` holds 3 K packs, channel
 // fastest; (x, y, z) is the direction from the camera to the Gaussian, of any length.
 SP_INLINE void evaluate_sh(int degree, const float* coefficients, const F16& x, const F16& y,
                            const F16& z, F16 color[3]) {

@@ -91,7 +91,7 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     const Vector16 by_t1 = to_world(camera, by.t[1]) + cross(by_normal, t_W[0]);
     F16 by_color[3] = {g[10], g[11], g[12]};
     if (input.sh_degree >= 0) {
-      // Colours held at zero do not follow their coefficients.
+      // Colors held at zero do not follow their coefficients.
       F16 color[3];
       gather_colors(input, indices, bits, d_W, color);
       for (int c = 0; c < 3; ++c) by_color[c] = zero_unless(color[c] > zero, by_color[c]);

@@ -28,7 +28,7 @@ struct Surfel {
 constexpr int kSurfelFields = sizeof(Surfel) / sizeof(float);
 
 // The pixels that a surfel may reach are those of an ellipse and of a disc. The ellipse is written
-// as a Splat, with the disc where that has its colour.
+// as a Splat, with the disc where that has its color.
 struct Disc {
   float x, y, radius;  // [px]
 };

@@ -18,7 +18,7 @@ def gradient(height: int = 64, width: int = 128) -> EnvironmentMap:
     return EnvironmentMap((0.5 + 0.4 * v_W).astype(np.float32))
 
 
-def test_each_direction_has_its_colour():
+def test_each_direction_has_its_color():
     expected = 0.5 + 0.4 * AXES[:, [2, 0, 1]]
     np.testing.assert_allclose(gradient().color(AXES), expected, atol=0.011)
     np.testing.assert_array_equal(gradient().color(3 * AXES), gradient().color(AXES))

@@ -256,8 +256,8 @@ def test_a_disc_seen_exactly_edge_on_has_depth_alone(simd):
         opacities=np.ones(1, np.float32),
         sh=np.zeros((1, 1, 3), np.float32),
     )
-    through_centres = np.array([[70.0, 0, 41.5], [0, 75.0, 30.5], [0, 0, 1]])
-    camera = (through_centres, WIDTH, HEIGHT, RigidTransform())
+    through_centers = np.array([[70.0, 0, 41.5], [0, 75.0, 30.5], [0, 0, 1]])
+    camera = (through_centers, WIDTH, HEIGHT, RigidTransform())
     depth = BakedScene(disc, simd=simd).render_depth(*camera)
     assert depth[30, 41] == pytest.approx(2.0)
     np.testing.assert_array_equal(np.unique(np.nonzero(depth)[1]), [41])
@@ -425,7 +425,7 @@ def disc(color: tuple[float, float, float]) -> GaussianScene:
 
 
 def along(*places: float):
-    """From a time to a centre at that place on the z axis."""
+    """From a time to a center at that place on the z axis."""
     return lambda time: np.array([[0.0, 0.0, places[int(time)]]])
 
 

@@ -27,7 +27,7 @@ K_CIRCLE = np.array([[45.0, 0, 78.0], [0, 45.0, 61.0], [0, 0, 1]])
 
 
 def opencv_pixels(lens: Distortion, p_C: np.ndarray) -> np.ndarray:
-    """OpenCV's pixels (N, 2) of points, with centres at +1/2 as ours."""
+    """OpenCV's pixels (N, 2) of points, with centers at +1/2 as ours."""
     none = np.zeros(3)
     if lens.model == "fisheye":
         return cv2.fisheye.projectPoints(p_C[None], none, none, K, np.array(lens.radial))[0][0]

@@ -48,7 +48,7 @@ INFO = CameraInfo(WIDTH, HEIGHT, fov_y=np.pi / 2)
 BACKGROUND = (0.2, 0.4, 0.6)
 BOX_LABEL = RenderLabel(7)
 UNSPECIFIED, EMPTY = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
-CENTRE = HEIGHT // 2, WIDTH // 2
+CENTER = HEIGHT // 2, WIDTH // 2
 CORNER = 1, 1
 
 
@@ -134,10 +134,10 @@ def is_orange(rgba: np.ndarray) -> bool:
 def test_box_before_the_wall_is_seen():
     engine = SplatRenderEngine(wall(4.0), background=BACKGROUND)
     add_box(engine, 2.0)
-    assert is_green(color(engine)[CENTRE]) and is_orange(color(engine)[CORNER])
-    assert depth(engine)[CENTRE] == pytest.approx(2.0, abs=1e-4)
+    assert is_green(color(engine)[CENTER]) and is_orange(color(engine)[CORNER])
+    assert depth(engine)[CENTER] == pytest.approx(2.0, abs=1e-4)
     assert depth(engine)[CORNER] == pytest.approx(4.0, rel=2e-3)
-    assert label(engine)[CENTRE] == int(BOX_LABEL) and label(engine)[CORNER] == UNSPECIFIED
+    assert label(engine)[CENTER] == int(BOX_LABEL) and label(engine)[CORNER] == UNSPECIFIED
 
 
 def test_box_behind_the_wall_is_not_seen():
@@ -170,8 +170,8 @@ def test_depth_is_the_minimum():
 def test_out_of_range_reads_as_in_drake():
     engine = SplatRenderEngine(wall(4.0))
     add_box(engine, 2.0)
-    assert depth(engine, depth_camera(3.0, 5.0))[CENTRE] == 0.0
-    assert depth(engine, depth_camera(0.1, 3.0))[CENTRE] == pytest.approx(2.0, abs=1e-4)
+    assert depth(engine, depth_camera(3.0, 5.0))[CENTER] == 0.0
+    assert depth(engine, depth_camera(0.1, 3.0))[CENTER] == pytest.approx(2.0, abs=1e-4)
     assert depth(engine, depth_camera(0.1, 3.0))[CORNER] == np.inf
     assert np.all(depth(engine, depth_camera(5.0, 9.0)) == 0.0)
     assert np.all(depth(engine, depth_camera(0.1, 1.0)) == np.inf)
@@ -189,23 +189,23 @@ def test_shapes_shine_through_thin_gaussians():
     for target in (engine, alone):
         add_box(target, 5.0)
     view = scene.render(INFO.intrinsic_matrix(), WIDTH, HEIGHT, RigidTransform())
-    alpha = view.alpha[CENTRE]
+    alpha = view.alpha[CENTER]
     assert 0.1 < alpha < 0.5
-    expected = 255 * view.color[CENTRE] + (1 - alpha) * color(alone)[CENTRE][:3]
-    np.testing.assert_allclose(color(engine)[CENTRE][:3], expected, atol=1)
-    assert depth(engine)[CENTRE] == pytest.approx(5.0, abs=1e-4)
-    assert label(engine)[CENTRE] == int(BOX_LABEL) and label(engine)[CORNER] == EMPTY
+    expected = 255 * view.color[CENTER] + (1 - alpha) * color(alone)[CENTER][:3]
+    np.testing.assert_allclose(color(engine)[CENTER][:3], expected, atol=1)
+    assert depth(engine)[CENTER] == pytest.approx(5.0, abs=1e-4)
+    assert label(engine)[CENTER] == int(BOX_LABEL) and label(engine)[CORNER] == EMPTY
 
 
 def test_removed_shape_is_gone_and_can_come_back():
     engine = SplatRenderEngine(wall(4.0))
     id = add_box(engine, 2.0)
-    assert depth(engine)[CENTRE] < 3
+    assert depth(engine)[CENTER] < 3
     assert engine.RemoveGeometry(id) and not engine.has_geometry(id)
     assert not engine.RemoveGeometry(id)
-    assert depth(engine)[CENTRE] == pytest.approx(4.0, rel=2e-3)
+    assert depth(engine)[CENTER] == pytest.approx(4.0, rel=2e-3)
     engine.RegisterVisual(id, Box(1, 1, 1), green(), RigidTransform([0, 0, 3.5]), True)
-    assert depth(engine)[CENTRE] == pytest.approx(3.0, abs=1e-4)
+    assert depth(engine)[CENTER] == pytest.approx(3.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, RenderEngine.Clone])
@@ -218,12 +218,12 @@ def test_copies_share_the_scene_and_nothing_else(duplicate):
     for image in (color, depth, label):
         np.testing.assert_array_equal(image(other), image(engine))
     other.UpdateViewpoint(RigidTransform([0, 0, 1.0]))
-    assert depth(other)[CENTRE] == pytest.approx(1.0, abs=1e-4)
+    assert depth(other)[CENTER] == pytest.approx(1.0, abs=1e-4)
     assert other.RemoveGeometry(id)
-    assert depth(other)[CENTRE] == pytest.approx(3.0, rel=2e-3)
-    assert depth(engine)[CENTRE] == pytest.approx(2.0, abs=1e-4)
+    assert depth(other)[CENTER] == pytest.approx(3.0, rel=2e-3)
+    assert depth(engine)[CENTER] == pytest.approx(2.0, abs=1e-4)
     assert engine.RemoveGeometry(id)
-    assert depth(engine)[CENTRE] == pytest.approx(4.0, rel=2e-3)
+    assert depth(engine)[CENTER] == pytest.approx(4.0, rel=2e-3)
 
 
 def test_a_given_engine_renders_the_shapes():
@@ -242,8 +242,8 @@ def test_an_environment_is_behind_everything():
     v_W = pixel_rays(INFO.intrinsic_matrix(), rows, columns, RigidTransform())
     seen = color(engine)
     np.testing.assert_allclose(seen[rows, columns, :3] / 255, environment.color(v_W), atol=0.01)
-    assert is_green(seen[CENTRE])
-    assert is_orange(color(SplatRenderEngine(wall(4.0), background=environment))[CENTRE])
+    assert is_green(seen[CENTER])
+    assert is_orange(color(SplatRenderEngine(wall(4.0), background=environment))[CENTER])
 
 
 @pytest.mark.parametrize("background", [(0, 0), (0, 0, 1.5), (0, 0, np.nan)])
@@ -283,12 +283,12 @@ def test_rgbd_sensor_in_a_diagram():
 
     for z, box_is_seen in ((2.0, True), (3.0, True), (6.0, False)):
         images = see(z)
-        assert is_green(images["color_image"][CENTRE]) == box_is_seen
-        assert (images["label_image"][CENTRE] == int(BOX_LABEL)) == box_is_seen
-        metres = images["depth_image_32f"][..., 0]
-        assert metres[CENTRE] == pytest.approx(z if box_is_seen else 4.0, rel=2e-3)
-        assert metres[CORNER] == pytest.approx(3.0, rel=1e-4)
-        np.testing.assert_allclose(images["depth_image_16u"][..., 0], metres * 1000, atol=1)
+        assert is_green(images["color_image"][CENTER]) == box_is_seen
+        assert (images["label_image"][CENTER] == int(BOX_LABEL)) == box_is_seen
+        meters = images["depth_image_32f"][..., 0]
+        assert meters[CENTER] == pytest.approx(z if box_is_seen else 4.0, rel=2e-3)
+        assert meters[CORNER] == pytest.approx(3.0, rel=1e-4)
+        np.testing.assert_allclose(images["depth_image_16u"][..., 0], meters * 1000, atol=1)
     assert scene.renders == 1
 
 
@@ -314,5 +314,5 @@ def test_shapes_that_name_their_renderer():
     context = scene_graph.GetMyContextFromRoot(diagram.CreateDefaultContext())
     query = scene_graph.get_query_output_port().Eval(context)
     image = query.RenderDepthImage(depth_camera(), SceneGraph.world_frame_id(), RigidTransform())
-    assert image.data[CENTRE][0] == pytest.approx(2.0, abs=1e-4)
-    assert image.data[CENTRE[0], 2][0] == pytest.approx(4.0, rel=2e-3)
+    assert image.data[CENTER][0] == pytest.approx(2.0, abs=1e-4)
+    assert image.data[CENTER[0], 2][0] == pytest.approx(4.0, rel=2e-3)

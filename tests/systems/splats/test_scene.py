@@ -58,7 +58,7 @@ def test_arrays_are_float32_contiguous_with_unit_quaternions():
     assert (len(scene), scene.sh_degree) == (6, 1)
 
 
-def test_tiny_quaternions_are_normalised():
+def test_tiny_quaternions_are_normalized():
     arrays = random_arrays()
     scene = GaussianScene(**arrays | {"quats": (arrays["quats"] * 1e-6).astype(np.float32)})
     np.testing.assert_allclose(scene.quats, GaussianScene(**arrays).quats, atol=1e-6)

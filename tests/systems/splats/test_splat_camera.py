@@ -83,13 +83,13 @@ def test_output_ports_are_those_of_rgbd_sensor():
     assert camera.body_pose_input_port().get_name() == "body_pose"
 
 
-def test_wall_is_seen_at_its_distance_and_in_its_colour():
+def test_wall_is_seen_at_its_distance_and_in_its_color():
     camera = SplatCamera(wall(3), INFO, X_BC)
     np.testing.assert_allclose(
         evaluate(camera, "depth_image_32f", RigidTransform()), 2.9, rtol=2e-3
     )
-    millimetres = evaluate(camera, "depth_image_16u", RigidTransform())
-    np.testing.assert_allclose(millimetres, 2900, rtol=2e-3)
+    millimeters = evaluate(camera, "depth_image_16u", RigidTransform())
+    np.testing.assert_allclose(millimeters, 2900, rtol=2e-3)
     assert np.all(
         evaluate(camera, "label_image", RigidTransform()) == int(RenderLabel.kUnspecified)
     )
@@ -100,17 +100,17 @@ def test_wall_is_seen_at_its_distance_and_in_its_colour():
 
 
 @pytest.mark.parametrize(
-    ("x", "opacity", "metres", "millimetres"),
+    ("x", "opacity", "meters", "millimeters"),
     [
         (1.0, 0.99, 0.0, 0),  # nearer than the range
         (9.0, 0.99, np.inf, 65535),  # farther than the range
         (3.0, 0.02, np.inf, 65535),  # hardly there
     ],
 )
-def test_out_of_range_reads_as_in_drake(x, opacity, metres, millimetres):
+def test_out_of_range_reads_as_in_drake(x, opacity, meters, millimeters):
     camera = SplatCamera(wall(x, opacity), INFO, X_BC, min_depth=2.0, max_depth=5.0)
-    assert np.all(evaluate(camera, "depth_image_32f", RigidTransform()) == metres)
-    assert np.all(evaluate(camera, "depth_image_16u", RigidTransform()) == millimetres)
+    assert np.all(evaluate(camera, "depth_image_32f", RigidTransform()) == meters)
+    assert np.all(evaluate(camera, "depth_image_16u", RigidTransform()) == millimeters)
 
 
 def test_nothing_in_view_is_background():

@@ -20,7 +20,7 @@ N = 600  # more than two chunks of compressed PLY
 
 
 def random_scene(degree: int) -> GaussianScene:
-    """Gaussians whose colours and harmonics no format has to clamp."""
+    """Gaussians whose colors and harmonics no format has to clamp."""
     rng = np.random.default_rng(degree)
     return GaussianScene(
         means=rng.uniform(-5, 5, (N, 3)).astype(np.float32),

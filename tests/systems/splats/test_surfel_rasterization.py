@@ -32,7 +32,7 @@ def random_scene(**options) -> dict[str, Any]:
 
 
 def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
-    """Surfels whose planes meet the rays through their centres at `sine`, all on the image."""
+    """Surfels whose planes meet the rays through their centers at `sine`, all on the image."""
     scene = random_scene(count=8 * count)
     generator = np.random.default_rng(0)
     X_CW = scene["viewmats"][0].double().numpy()
@@ -45,8 +45,8 @@ def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
             continue  # the plane passes too far beside that ray
         a_W = [r - slope * n for r, n in zip(ray_W, n_W, strict=True)]  # in the plane
         x, y = depth * (1.0 - sine * sine) ** 0.5 / dot(a_W, a_W) ** 0.5, depth * sine
-        centre_W = [-dot(X_CW[:3, k], X_CW[:3, 3]) for k in range(3)]
-        means.append([c + x * a + y * n for c, a, n in zip(centre_W, a_W, n_W, strict=True)])
+        center_W = [-dot(X_CW[:3, k], X_CW[:3, 3]) for k in range(3)]
+        means.append([c + x * a + y * n for c, a, n in zip(center_W, a_W, n_W, strict=True)])
         kept.append(i)
     for name in ("quats", "scales", "opacities", "colors"):
         scene[name] = scene[name][kept[:count]]
@@ -137,16 +137,18 @@ def lengths(gradient: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("sh_degree", [None, 3])
 def test_gradients_agree_with_reference(sh_degree):
-    scene = random_scene(count=150, seed=3, sh_degree=sh_degree)
+    scene = random_scene(seed=3, sh_degree=sh_degree)
     clear = call_reference(scene, sh_degree=sh_degree).margin > 1e-4
     exact = reference_gradients(scene, clear, sh_degree=sh_degree)
-    # By how much half a last place of the inputs changes float64.
-    ends = {
-        k: scene[k].double() * (1 + 2.0**-24 * normal_tensor(0, *scene[k].shape).sign())
-        for k in LEARNED
-    }
-    other = reference_gradients(scene | ends, clear, sh_degree=sh_degree)
-    moved = {k: 3 * lengths(other[k] - exact[k]) for k in LEARNED}
+    # The change of float64 by half a last place of the inputs, the largest of three.
+    moved = {name: torch.zeros(len(exact[name]), dtype=torch.float64) for name in LEARNED}
+    for seed in range(3):
+        ends = {
+            k: scene[k].double() * (1 + 2.0**-24 * normal_tensor(seed, *scene[k].shape).sign())
+            for k in LEARNED
+        }
+        other = reference_gradients(scene | ends, clear, sh_degree=sh_degree)
+        moved = {k: torch.maximum(m, lengths(other[k] - exact[k])) for k, m in moved.items()}
     for simd in LEVELS:
         call = partial(render, sh_degree=sh_degree, renderer=create_renderer(1, simd))
         ours = loss_gradients(call, scene, clear, torch.float32)
@@ -155,7 +157,7 @@ def test_gradients_agree_with_reference(sh_degree):
             allowed = 1e-3 + 1e-5 * exact[name].abs()
             if name != "viewmats":  # each entry sums over the whole scene
                 assert (error <= allowed).double().mean() > 0.99, name
-            assert (lengths(error) <= 3 * lengths(allowed) + moved[name]).all(), name
+            assert (lengths(error) <= lengths(allowed) + moved[name]).all(), name
             assert exact[name].abs().max() > 1
 
 
