@@ -121,7 +121,7 @@ def test_bad_config_is_named(field, value):
 
 
 def test_frames_of_another_size_are_refused():
-    with pytest.raises(ValueError, match="frame must be 180x240 pixels.* got 100x80"):
+    with pytest.raises(ValueError, match=r"frame must be 180x240 pixels.* got 100x80"):
         time_of_flight_grid(np.ones((80, 100)), TimeOfFlight())
 
 
