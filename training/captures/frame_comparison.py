@@ -321,7 +321,7 @@ def choose_pairs(capture: Capture, count: int) -> list[FramePair]:
     """Chooses frames spread over the capture, each with a later one that sees it differently.
 
     That is at most 16 frames later: the first whose camera has moved by an eighth of the median
-    depth or turned by ten degrees, but by no more than 45, else the last.
+    depth or rotated by ten degrees, but by no more than 45, else the last.
     """
     axes, camera = capture.axes, capture.depth_camera
     X_CD = camera.X_CD if camera is not None else RigidTransform()

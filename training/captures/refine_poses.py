@@ -60,15 +60,15 @@ class RefinedPoses:
 
     X_WCs: list[RigidTransform]
     moved: float  # [m], mean over frames
-    turned: float  # [rad], mean over frames
+    rotated: float  # [rad], mean over frames
     depth: tuple[float, float]
     """Median relative difference of depth between frames, before and after."""
     contrast: tuple[float, float]
     """Median difference of contrast, before and after."""
 
     def __str__(self) -> str:
-        turned = np.rad2deg(self.turned)
-        lines = [f"poses moved by {self.moved:.3f} m and {turned:.1f} degrees on average"]
+        rotated = np.rad2deg(self.rotated)
+        lines = [f"poses moved by {self.moved:.3f} m and {rotated:.1f} degrees on average"]
         for name in ("depth", "contrast"):
             before, after = getattr(self, name)
             lines.append(f"{name} differs between frames by {after:.2%}, before by {before:.2%}")
@@ -116,12 +116,12 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
             rounds.set_postfix_str(f"largest step {largest:.4f}")
             if number >= len(_REACHES) and largest < _SETTLED:
                 break
-    turned, moved = np.split(_corrections(poses, given), 2, axis=1)
+    rotated, moved = np.split(_corrections(poses, given), 2, axis=1)
     (depth, contrast), (depth_after, contrast_after) = history[0].tolist(), history[-1].tolist()
     return RefinedPoses(
         poses,
         float(np.linalg.norm(moved, axis=1).mean()),
-        float(np.linalg.norm(turned, axis=1).mean()),
+        float(np.linalg.norm(rotated, axis=1).mean()),
         (depth, depth_after),
         (contrast, contrast_after),
     )

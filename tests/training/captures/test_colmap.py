@@ -334,3 +334,26 @@ def test_images_can_be_written_after_pycolmap_is_loaded(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], timeout=60)
     assert done.returncode == 0
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_count_that_a_file_does_not_hold_is_refused(model, name):
+    file = model / f"sparse/0/{name}.bin"
+    content = file.read_bytes()
+    for damaged in (b"\xff" * 8 + content[8:], content + b"\0", content[:-1]):
+        file.write_bytes(damaged)
+        with pytest.raises(ValueError, match=rf"{name}\.bin is damaged"):
+            read_capture(model)
+
+
+def test_sigterm_handler_survives_the_import_of_pycolmap():
+    script = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
+        "from splatpilot.training.captures.colmap import import_pycolmap\n"
+        "import_pycolmap()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+        "signal.pause()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60)
+    assert (done.returncode, done.stderr) == (7, b"")
