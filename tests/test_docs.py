@@ -25,7 +25,8 @@ from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
-from splatpilot.systems.common.config import describe_fields, load_config
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.field_help import describe_fields
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.check import CheckConfig
 from splatpilot.training.captures.render import RenderConfig

@@ -26,7 +26,7 @@ from splatpilot.analysis.benchmark.tables import (
     success_summary,
 )
 from splatpilot.analysis.output import write_png
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -407,7 +407,7 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> 
             flights[policy] = QuadrotorState.of(arrays["states"]).p_WB, row["outcome"]
     p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     figure = draw_trajectories(world, flights, p_WS, p_WG, config.policy_names, title)
     return _image(write_png(figure, folder.path / "trajectories.png"), title) + _note(
         "Dark: obstacles at the height of the goal, from the distance field; light: where the "

@@ -17,7 +17,7 @@ from pydrake.systems.framework import Diagram
 
 from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.flight.flight import Flight, Outcome, decision_times, fly
 from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD, BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import POLICIES
@@ -260,4 +260,4 @@ def _lengths_to(world: World, p_WG: tuple[float, ...]) -> TimeOfArrival:
 
 
 def _way_lengths(world: World, scenario: Scenario) -> TimeOfArrival:
-    return _lengths_to(world, tuple(goal_of(scenario, world)))
+    return _lengths_to(world, tuple(goal_position(scenario, world)))

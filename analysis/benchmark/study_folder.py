@@ -48,7 +48,7 @@ from splatpilot.systems.common.files import (
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_archive, read_text, reason_of, require_shallow
+from splatpilot.systems.common.readers import read_archive, read_text, reason_of
 
 FORMAT_VERSION = 1
 _SHAPES = {"times": (), "states": (13,), "commands": (4,), "clearances": ()}
@@ -127,7 +127,6 @@ class StudyFolder:
                 f"No such file: {file}; a study is a folder of `splatpilot benchmark`"
             )
         text = read_text(file)
-        require_shallow(text, str(file))
         try:
             described = yaml.safe_load(text)
             version = described["format_version"]

@@ -249,7 +249,7 @@ def _place_of(error: Exception) -> str:
     registry = sys.modules.get(
         "splatpilot.systems.common.registry"
     )  # else nothing of theirs is there
-    return raised_by(error, registry.packages_of_others()) if registry is not None else ""
+    return raised_by(error, registry.plugin_packages()) if registry is not None else ""
 
 
 def _heeded() -> list[int]:

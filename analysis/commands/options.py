@@ -15,12 +15,8 @@ import yaml
 
 from splatpilot.analysis.benchmark.study import SCENARIO, Variant, parse_variant
 from splatpilot.diagrams.flight.scenario import benchmark_scenarios, other_scenarios, scenario_file
-from splatpilot.systems.common.config import (
-    FieldDescription,
-    describe_fields,
-    dump_config,
-    is_configuration,
-)
+from splatpilot.systems.common.config import is_configuration
+from splatpilot.systems.common.field_help import FieldDescription, describe_fields
 from splatpilot.systems.common.files import (
     find_data,
     require_corpus,
@@ -177,7 +173,6 @@ POLICIES = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
-    "pilot_rgb",
 )
 """The names of our own policies."""
 
@@ -433,7 +428,6 @@ def name_of_flight(options: argparse.Namespace, scenario: "Scenario") -> str:
 def format_settings(config: Any) -> str:
     """All fields that `--set` takes for a configuration: their names, types, values, and what they
     are."""
-    dump_config(config)  # Gives the open fields the types that they may have.
     width = max(shutil.get_terminal_size().columns - 2, 40)
     lines = []
     for name, type_, value, text in _settings(config, ""):
@@ -456,7 +450,7 @@ def _settings(config: Any, prefix: str) -> Iterator[tuple[str, str, str, str]]:
 def _kinds(field: FieldDescription) -> str:
     """The tags of what may stand in a field, that of what stands there first."""
     own = f"!{type(field.value).__name__}"
-    others = field.registry.configs(set()) if field.registry is not None else []
+    others = field.registry.configs() if field.registry is not None else []
     tags = [own, *(f"!{config.__name__}" for config in others)]
     return " or ".join(dict.fromkeys(tags))
 

@@ -12,7 +12,7 @@ from lcm import LCM
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
-from splatpilot.diagrams.flight.blocks import goal_of, make_policy
+from splatpilot.diagrams.flight.blocks import goal_position, make_policy
 from splatpilot.diagrams.flight.flight import (
     Outcome,
     flight_outcome,
@@ -372,7 +372,7 @@ def fly_trial(
     plant.SetContinuousState(sample_initial_state(scenario, world))
     autopilot = vehicle.GetSubsystemByName("failsafe")
     autopilot_context = autopilot.GetMyContextFromRoot(root)
-    p_WG, field = goal_of(scenario, world), world.distance_field
+    p_WG, field = goal_position(scenario, world), world.distance_field
     measured = {"max_speed": 0.0, "max_tilt": 0.0, "min_clearance": np.inf, "min_inside": np.inf}
     reasons: set[int] = set()
     last = max(fault.begin + min(fault.duration, 4.0) for fault in faults)

@@ -32,7 +32,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import put_behind
 from splatpilot.systems.splats.baked_scene import RenderedView
-from splatpilot.systems.splats.scene import C0, GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
 from splatpilot.training.captures.capture_registry import read_capture_of
@@ -356,5 +356,5 @@ def unseen_fraction(scene: Path) -> float | None:
 
 def _painted(gaussians: GaussianScene, level: float) -> GaussianScene:
     """Returns the Gaussians in one gray, 0 to 1."""
-    sh = np.full((len(gaussians), 1, 3), (level - 0.5) / C0, dtype=np.float32)
+    sh = np.full((len(gaussians), 1, 3), color_to_sh(level), dtype=np.float32)
     return replace(gaussians, sh=sh)

@@ -13,7 +13,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
-from splatpilot.diagrams.flight.blocks import goal_of, images_of
+from splatpilot.diagrams.flight.blocks import goal_position, policy_images
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -36,7 +36,7 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
         InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
             surface than the vehicle's radius; or if the flight would start at its goal.
     """
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
     _check_free(world, "start", p_WS)
     _check_free(world, "goal", p_WG)
@@ -188,7 +188,7 @@ def fly(
         raise FlightError(flight) from error
     wall_time = time.perf_counter() - started
 
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
     return record_flight(diagram, root, world, ended, wall_time)
 
@@ -210,7 +210,7 @@ def flight_simulator(
     scenario.validate()
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
 
     def monitor(context: Context) -> EventStatus:
         if progress is not None:
@@ -235,7 +235,7 @@ def decision_times(
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     policy = diagram.GetSubsystemByName("policy")
     context = policy.GetMyContextFromRoot(root)
-    images = images_of(policy)
+    images = policy_images(policy)
     rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
     spent = np.zeros((count + 1, 2))  # [s]
     # The first time through, what is kept for the whole flight is made: it does not count.

@@ -11,13 +11,13 @@ from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
     AddObservation,
-    AddPilot,
+    AddPolicyAndController,
     AddSensors,
     ConnectObservation,
     decision_period,
-    goal_of,
+    goal_position,
+    onboard_sensors,
     require_ports,
-    sensors_of,
 )
 from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -55,7 +55,7 @@ def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
     Its camera sees the start and the goal from behind and above the start.
     """
     meshcat = empty_meshcat(world.background)
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
     draw_distance_slice(meshcat, "/splatpilot/distance_slice", world.distance_field, float(p_WG[2]))
     meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
@@ -175,7 +175,7 @@ def BuildFlightDiagram(
     scenario.validate()
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
-    sensors = sensors_of(scenario, policy)
+    sensors = onboard_sensors(scenario, policy)
     if plant is None:
         plant = cast(
             System, QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, world))
@@ -183,7 +183,7 @@ def BuildFlightDiagram(
     builder.AddNamedSystem("plant", plant)
     require_ports("plant", plant, inputs=["command"], outputs=["state"])
     state = plant.GetOutputPort("state")
-    pilot = AddPilot(builder, scenario, world, state, policy, controller)
+    pilot = AddPolicyAndController(builder, scenario, world, state, policy, controller)
     policy, controller = pilot.policy, pilot.controller
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
 

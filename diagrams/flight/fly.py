@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.flight.flight import (
     FLIGHT_FILES,
     Flight,
@@ -120,7 +120,7 @@ def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: Wor
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     start = world.p_WS if scenario.start is None else scenario.start
-    highest = max(start[2], goal_of(scenario, world)[2])
+    highest = max(start[2], goal_position(scenario, world)[2])
     cut = min(highest + 2 * VEHICLE_RADIUS, upper)
     page = live_page(meshcat, world.gaussians, world.background, (lower, upper), cut)
     with written_atomically(path) as partial:

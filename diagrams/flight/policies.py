@@ -26,7 +26,6 @@ from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPla
 from splatpilot.systems.policies.reactive import Reactive, ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
 from splatpilot.systems.policies.student import (
-    PilotRgbConfig,
     Student,
     StudentDepthConfig,
     StudentRgbConfig,
@@ -135,11 +134,7 @@ register_policy(
     DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
-for _config, _name in (
-    (StudentRgbConfig, "student_rgb"),
-    (StudentDepthConfig, "student_depth"),
-    (PilotRgbConfig, "pilot_rgb"),
-):
+for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
     register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
 
 

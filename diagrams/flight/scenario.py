@@ -116,7 +116,10 @@ class Scenario:
                 part.validate()
             except FieldError as error:
                 raise error.within(self) from None
-        self.observation.validate()
+        try:
+            self.observation.validate()
+        except FieldError as error:
+            raise error.within(self) from None
         _check_camera(self.camera)
         _check_simulator(self.simulator)
 

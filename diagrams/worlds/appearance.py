@@ -12,7 +12,7 @@ from splatpilot.diagrams.worlds.solids.shading import GAMMA
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import interpolate_grid
 from splatpilot.systems.splats.background import Background, EnvironmentMap
-from splatpilot.systems.splats.scene import C0, GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
 
 _PAINT = 0.35  # sRGB, largest change of a colour of paint
 _PAINTS = 4  # along each axis of the colour cube
@@ -108,7 +108,7 @@ def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
         linear = painted**GAMMA * (look.exposure * light)[:, None]
         after[some] = _developed(linear @ look.mixing.T)
     sh = scene.sh.copy()
-    sh[:, 0] = (after - 0.5) / C0
+    sh[:, 0] = color_to_sh(after)
     if scene.sh_degree > 0:
         brighter = (after.sum(axis=1) + 0.01) / (before.sum(axis=1) + 0.01)
         sh[:, 1:] *= np.minimum(brighter, 2.0)[:, None, None]

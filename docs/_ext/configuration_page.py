@@ -16,7 +16,8 @@ from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
-from splatpilot.systems.common.config import FieldDescription, describe_fields, is_configuration
+from splatpilot.systems.common.config import is_configuration
+from splatpilot.systems.common.field_help import FieldDescription, describe_fields
 from splatpilot.systems.common.registry import Registry
 from splatpilot.training.captures.check import CheckConfig
 from splatpilot.training.captures.render import RenderConfig
@@ -86,7 +87,7 @@ def configurations() -> Iterator[tuple[str, str, list[Any]]]:
                 yield from met(held)
 
     for heading, introduction, roots in GROUPS:
-        types = roots.configs(set()) if isinstance(roots, Registry) else roots
+        types = roots.configs() if isinstance(roots, Registry) else roots
         yield heading, introduction, [config for root in types for config in met(root())]
     yield (
         "Drake's own",
@@ -133,7 +134,7 @@ def _text(config: Any, field: FieldDescription) -> str:
     if field.registry is None:
         may = [_link(type(held)) for held in _held(config, field) if field.value is None]
         return f"{text} A {may[0]}." if may else text
-    kinds = ", ".join(_link(kind) for kind in field.registry.configs(set()))
+    kinds = ", ".join(_link(kind) for kind in field.registry.configs())
     return f"{text} One of {kinds}."
 
 

@@ -188,9 +188,6 @@ struct Kernels {
   bool (*all_within)(const float*, size_t count, float low, float high);
   // Whether all quaternions (count, 4) are long and short enough to be normalised.
   bool (*all_normalisable)(const float* quats, size_t count);
-  // kFmaChains independent products and sums of packs, `rounds` times: what the machine can do.
-  float (*multiply_add)(size_t rounds);
 };
-constexpr int kFmaChains = 12;
 
 }  // namespace splatpilot

@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <cstdint>
 
+#include "fields/trilinear.hpp"
+
 namespace splatpilot {
 
 struct Interpolant {
@@ -30,21 +32,10 @@ struct VoxelGrid {
       f[k] = position - static_cast<double>(cell);
       at += cell * strides[k];
     }
-    double along_x[2][2], slope_x[2][2];  // by y and z
-    for (int j = 0; j < 2; ++j) {
-      for (int k = 0; k < 2; ++k) {
-        const float* near = values + at + j * strides[1] + k;
-        slope_x[j][k] = static_cast<double>(near[strides[0]]) - near[0];
-        along_x[j][k] = near[0] + f[0] * slope_x[j][k];
-      }
-    }
-    const auto mix = [](double a, double b, double part) { return a + part * (b - a); };
-    const double low = mix(along_x[0][0], along_x[1][0], f[1]);
-    const double high = mix(along_x[0][1], along_x[1][1], f[1]);
-    const double x = mix(mix(slope_x[0][0], slope_x[1][0], f[1]),
-                         mix(slope_x[0][1], slope_x[1][1], f[1]), f[2]);
-    const double y = mix(along_x[1][0] - along_x[0][0], along_x[1][1] - along_x[0][1], f[2]);
-    return {mix(low, high, f[2]), {x / voxel_size, y / voxel_size, (high - low) / voxel_size}};
+    Interpolant result;
+    result.value = trilinear<double>(values + at, strides[0], strides[1], f, result.gradient);
+    for (double& slope : result.gradient) slope /= voxel_size;
+    return result;
   }
 };
 

@@ -1,4 +1,4 @@
-"""Ports by methods, as Drake's own systems have them: `camera.color_image_output_port()`."""
+"""Helpers for Drake systems: ports by methods, optional inputs, connections, weak callbacks."""
 
 import weakref
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 
 
 def input_port(name: str) -> Callable[[System], InputPort]:
-    """A method, for the body of a system's class, that returns its input port of that name."""
+    """Returns a method, for a system's class, that returns the input port of that name."""
 
     def port(self: System) -> InputPort:
         return self.GetInputPort(name)
@@ -26,7 +26,7 @@ def input_port(name: str) -> Callable[[System], InputPort]:
 
 
 def output_port(name: str) -> Callable[[System], OutputPort]:
-    """A method, for the body of a system's class, that returns its output port of that name."""
+    """Returns a method, for a system's class, that returns the output port of that name."""
 
     def port(self: System) -> OutputPort:
         return self.GetOutputPort(name)
@@ -41,7 +41,7 @@ def vector_input(system: System, name: str, context: Context) -> np.ndarray:
 
 
 def optional_input(system: System, name: str, context: Context) -> np.ndarray | None:
-    """The vector at the input port of that name; None where nothing is connected."""
+    """Returns the vector at an input port, None if the port is not connected."""
     port = system.GetInputPort(name)
     return np.asarray(port.Eval(context)) if port.HasValue(context) else None
 
@@ -50,30 +50,28 @@ def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> N
     """Connects two ports.
 
     Raises:
-        ValueError: if one has another size than the other, or holds no vector where that does; the
-            message names both.
+        ValueError: if their types or sizes differ; the message names both.
     """
     if (source.get_data_type(), source.size()) != (target.get_data_type(), target.size()):
         raise ValueError(
-            f"{_described(source)} and {_described(target)} that it leads to; they must be alike"
+            f"{_describe(target)} must be of the type and size of its source, {_describe(source)}"
         )
     builder.Connect(source, target)
 
 
-def _described(port: InputPort | OutputPort) -> str:
+def _describe(port: InputPort | OutputPort) -> str:
     vector = port.get_data_type() == PortDataType.kVectorValued
-    way = "input" if isinstance(port, InputPort) else "output"
-    what = f"a vector of {port.size()}" if vector else "no vector"
-    system = port.get_system()
-    return f"the {way} {port.get_name()!r} of {type(system).__name__} is {what}"
+    kind = "input" if isinstance(port, InputPort) else "output"
+    what = f"a vector of {port.size()}" if vector else "not a vector"
+    system = type(port.get_system()).__name__
+    return f"the {kind} {port.get_name()!r} of {system} ({what})"
 
 
 def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
-    """The bound method, for Drake to call without owning what it is bound to.
+    """Returns a callback for a bound method that does not keep its system alive.
 
-    Drake keeps the callbacks of abstract output ports and of cache entries for as long as their
-    system lives, and a callback that refers to the system would keep it, and the whole Diagram
-    around it, alive for ever.
+    Drake keeps callbacks of abstract output ports and cache entries as long as the system lives.
+    A bound method would keep the system, and the Diagram around it, alive permanently.
     """
     reference = weakref.WeakMethod(method)
 

@@ -1,4 +1,4 @@
-"""Packages that only parts of splatpilot need, and the extras of `pip install` that bring them."""
+"""Optional packages and the extras of `pip install` that bring them; the OpenGL renderer."""
 
 import re
 import subprocess
@@ -10,11 +10,7 @@ from types import ModuleType
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """Imports a module that the extra brings.
-
-    Raises:
-        ModuleNotFoundError: a package is not installed; the message says which extra brings it.
-    """
+    """Imports a module that an extra brings; its ModuleNotFoundError names the extra."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -24,13 +20,7 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
 
 def missing_extra(error: ModuleNotFoundError, needed_by: str) -> str | None:
-    """
-    What to install for something that an import has failed for.
-
-    Returns:
-        A sentence with the extra that brings the missing package, as `pyproject.toml` has it; None
-        if no extra does.
-    """
+    """Returns a sentence with the extra that brings a missing package, None if no extra does."""
     for extra, packages in packages_of_extras().items():
         if error.name in packages:
             return f"{needed_by} needs {error.name}; pip install 'splatpilot[{extra}]'"
@@ -38,8 +28,8 @@ def missing_extra(error: ModuleNotFoundError, needed_by: str) -> str | None:
 
 
 def packages_of_extras() -> dict[str, list[str]]:
-    """The packages that each extra for users brings, as `pyproject.toml` has them."""
-    from importlib.metadata import requires  # Slow to load, and seldom needed.
+    """Returns the packages that each extra for users brings."""
+    from importlib.metadata import requires  # slow to load
 
     packages: dict[str, list[str]] = {}
     for requirement in requires("splatpilot") or []:
@@ -61,9 +51,9 @@ MakeRenderEngineVtk(RenderEngineVtkParams()).RenderColorImage(
 
 
 def load_triton() -> None:
-    """Loads Triton, where it is installed, before OpenGL brings Mesa's LLVM for the whole process
-    to see: Triton, which torch's optimisers load, has an LLVM of its own, and would take Mesa's
-    functions for it and end the process.
+    """Loads Triton, if it is installed, before OpenGL loads Mesa's LLVM.
+
+    Triton, which torch's optimizers load, has its own LLVM and crashes with the symbols of Mesa's.
     """
     with suppress(ImportError):
         import_module("triton")
@@ -71,8 +61,7 @@ def load_triton() -> None:
 
 @cache
 def require_opengl() -> None:
-    """Checks that RenderEngineVtk can render, and sees to it that torch still can be used when it
-    has (see `load_triton`). A library that is missing may end the process, so another one tries.
+    """Checks in another process that RenderEngineVtk can render, and loads Triton before it does.
 
     Raises:
         OSError: if it cannot; the message says what to install.

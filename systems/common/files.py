@@ -1,12 +1,10 @@
-"""Files and folders that appear whole or not at all.
+"""Atomic writes, locked output folders, and the folders that environment variables name.
 
-What is being written has a temporary name, `.STEM.HOST.PID.partial.SUFFIX`, beside its place. A
-process that is killed leaves it there; `require_writable_folder`, with which every run begins,
-removes what dead processes of this host have left.
+A file is written under a temporary name, `.STEM.HOST.PID.partial.SUFFIX`, next to its final one.
+A killed process leaves it there; `require_writable_folder` removes such leftovers of this host.
 """
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import functools
@@ -22,32 +20,34 @@ from typing import Any
 
 from splatpilot.systems.common.config import dump_config, load_config
 
+DATA = "SPLATPILOT_DATA"
+"""Environment variable with the folder of captures and meshes."""
+
+SCENES = "SPLATPILOT_SCENES"
+"""Environment variable with the folder of scenes."""
+
 _HOST = re.sub(r"[^\w-]", "-", platform.node()) or "host"
 _LEFTOVER = re.compile(rf"\..+\.{re.escape(_HOST)}\.(\d+)\.partial(\..*)?")
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of renameat2(2)
+_DISK_FULL = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: libraries without a number
 
 
 class _UnwritableError(OSError):
-    """Says already which file cannot be written."""
+    """An OSError whose message already names the file."""
 
 
 @contextmanager
 def written_atomically(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
-    """
-    Yields a temporary path beside `path` to write to, which becomes `path` when the block ends.
+    """Yields a temporary path next to `path` that is renamed to `path` when the block ends.
 
-    An exception in the block removes the temporary file and leaves what stood at `path`. The
-    temporary name keeps the suffix, because many writers choose their format by it.
+    An exception in the block removes the temporary file and leaves `path` as it was.
 
     Args:
-        check: raises OSError of a file that its writer left broken without a word; called with the
-            temporary file before it is renamed.
+        check: raises OSError for a file that its writer has silently left incomplete.
 
     Raises:
         OSError: if it cannot be written; the message names `path`.
     """
-    partial = _temporary(path, path.stem, path.suffix)
+    partial = _temporary(path, path.stem, path.suffix)  # Many writers choose the format by suffix.
     try:
         with _naming(path, partial):
             yield partial
@@ -61,19 +61,17 @@ def written_atomically(path: Path, check: Callable[[Path], None] | None = None) 
 
 @contextmanager
 def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """
-    Yields a temporary folder beside `path` to write into, which becomes `path` when the block ends.
+    """Yields a temporary folder next to `path` that is renamed to `path` when the block ends.
 
     An exception in the block removes the temporary folder.
 
     Args:
-        replace: whether it takes the place of a folder that is at `path`. Otherwise what another
-            process put there meanwhile stays.
+        replace: replaces a folder at `path`, which otherwise stays.
 
     Raises:
         OSError: if it cannot be written; the message names `path`.
     """
-    partial = _temporary(path, path.name)
+    partial, replaced = _temporary(path, path.name), _temporary(path, path.name, ".replaced")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         with _naming(path, partial):
@@ -82,18 +80,18 @@ def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[
             for file in partial.rglob("*"):
                 _flush(file)
             if replace and path.is_dir():
-                _exchange(partial, path)
-            else:
-                _rename_unless_there(partial, path)
+                path.rename(replaced)
+            _rename_unless_taken(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes what processes of this host that have ended were writing into a folder."""
+    """Removes the temporary files of processes of this host that have ended."""
     for path in folder.iterdir():
         match = _LEFTOVER.fullmatch(path.name)
-        if match is None or _runs(int(match[1])):
+        if match is None or _is_running(int(match[1])):
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -102,36 +100,27 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def require_existing(path: Path, what: str) -> None:
-    """
-    Raises:
-        FileNotFoundError: if nothing is there; the message says that `what` is expected.
-    """
+    """Raises FileNotFoundError, saying that `what` is expected, if nothing is at `path`."""
     if not path.exists():
         raise FileNotFoundError(f"No such file or folder: {path}; expected {what}")
 
 
 def require_unused(path: Path, overwrite: bool) -> None:
-    """
-    Raises:
-        FileExistsError: if there is a file, or a folder that holds anything, and that is not to be
-            overwritten.
-    """
-    if not path.is_dir():
-        used = path.exists()
-    else:
+    """Raises FileExistsError for a file or a folder with content, unless it may be overwritten."""
+    used = path.exists()
+    if path.is_dir():
         used = any(_LEFTOVER.fullmatch(file.name) is None for file in path.iterdir())
     if used and not overwrite:
         raise FileExistsError(
-            f"{path} is there already; name another, or replace it with --overwrite"
+            f"{path} is there already; choose another, or replace it with --overwrite"
         )
 
 
 def require_writable_folder(path: Path) -> None:
-    """
-    Makes the folder `path` if need be, and removes what dead processes have left in it.
+    """Makes the folder `path` if it is missing, and removes leftovers of ended processes.
 
     Raises:
-        OSError: if it cannot be made or written to; the message says which and what to do.
+        OSError: if it cannot be made or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -145,99 +134,35 @@ def require_writable_folder(path: Path) -> None:
         ) from None
 
 
-def _temporary(path: Path, stem: str, suffix: str = "") -> Path:
-    return path.with_name(f".{stem}.{_HOST}.{os.getpid()}.partial{suffix}")
-
-
-@contextmanager
-def _naming(path: Path, partial: Path) -> Iterator[None]:
-    """Says of which file it is that the disk is full; libraries do not."""
-    try:
-        yield
-    except _UnwritableError:
-        raise
-    except OSError as error:
-        if error.filename is not None and not str(error.filename).startswith(str(partial)):
-            raise  # It is about another file.
-        remedy = "make room" if error.errno in (None, *_NO_ROOM) else "is the folder writable?"
-        reason = error.strerror or str(error)
-        raise _UnwritableError(f"{path}: cannot be written ({reason}); {remedy}") from error
-
-
-def _flush(path: Path) -> None:
-    """Some file systems say only now that there is no room."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _rename_unless_there(folder: Path, path: Path) -> None:
-    try:
-        folder.rename(path)
-    except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-            raise
-
-
-def _exchange(one: Path, other: Path) -> None:
-    """Exchanges two folders in one step, where the system can; elsewhere a kill between two steps
-    leaves `other` under a temporary name."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    names = os.fsencode(one), os.fsencode(other)
-    if rename is not None and not rename(
-        _AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE
-    ):
-        return
-    between = one.with_name(f"{one.name}.old")
-    other.rename(between)
-    one.rename(other)
-    between.rename(one)
-
-
-def _runs(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
 def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
-    """
-    Makes the folder of `file` one of what `config` describes, which it may be already, and writes
-    `config` there.
+    """Writes `config` to `file`, whose folder belongs to that configuration from then on.
 
     Args:
-        overwrite: whether the folder may be of something else.
+        overwrite: takes a folder of another configuration or with other files.
 
     Returns:
         The configuration as YAML.
 
     Raises:
-        ValueError: if the file holds another configuration, or the folder something else.
+        ValueError: if the folder has another configuration, or files without one.
         OSError: if it cannot be written.
     """
     require_writable_folder(file.parent)
     text = dump_config(config)
-    if overwrite:
-        pass
-    elif file.exists():
-        there = dump_config(load_config(type(config)(), file))
-        if there != text:
-            own = text.splitlines()
-            other = next((line for line in there.splitlines() if line not in own), "").strip()
+    if file.exists() and not overwrite:
+        found = dump_config(load_config(type(config)(), file))
+        if found != text:
+            ours = text.splitlines()
+            other = next((line for line in found.splitlines() if line not in ours), "").strip()
             raise ValueError(
                 f"{file} holds another configuration{f', with {other}' if other else ''}; choose "
-                "another --out, or the same configuration to go on there"
+                "another --out, or resume with the same configuration"
             )
-    elif there := sorted(p.name for p in file.parent.iterdir() if not p.name.startswith(".")):
+    others = sorted(p.name for p in file.parent.iterdir() if not p.name.startswith("."))
+    if others and not file.exists() and not overwrite:
         raise ValueError(
-            f"{file.parent} holds {there[0]} and no {file.name}; choose another --out, or an empty "
-            "folder"
+            f"{file.parent} must be empty or hold {file.name}, got {others[0]}; choose another "
+            "--out, or an empty folder"
         )
     with written_atomically(file) as partial:
         partial.write_text(text)
@@ -246,13 +171,12 @@ def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
 
 @contextmanager
 def held_folder(path: Path) -> Iterator[None]:
-    """
-    Makes the folder `path` if need be, and holds it for this process while the block runs; a
-    process that ends in any way no longer holds it. A folder made here that stays empty goes again.
+    """Locks the folder `path`, made if it is missing, for this process while the block runs.
+
+    The lock ends with the process. A folder that was made here and stays empty is removed.
 
     Raises:
-        OSError: if it cannot be made or written to, or another process holds it; the message says
-            which. Network file systems that know no locks let all in.
+        OSError: if it cannot be made or written to, or another process has locked it.
     """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     require_writable_folder(path)
@@ -262,16 +186,14 @@ def held_folder(path: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OSError(
-                f"{path} is in use by {_holder(descriptor)}; wait until that ends, or choose "
-                "another folder"
+                f"{path} is in use by another process; wait until it ends, or choose another folder"
             ) from None
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL):
-                raise
+        except OSError:
+            pass  # Network file systems may have no locks.
         yield
     finally:
         os.close(descriptor)
-        with contextlib.suppress(OSError):  # unless they are empty
+        with contextlib.suppress(OSError):  # not empty
             for folder in made:
                 folder.rmdir()
 
@@ -279,8 +201,7 @@ def held_folder(path: Path) -> Iterator[None]:
 def holds_folder[**P, Result](
     argument: str,
 ) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
-    """Decorates a function that works in the folder which this argument names: it holds that
-    folder, see `held_folder`."""
+    """Decorates a function to lock the folder that its argument of this name gives."""
 
     def decorate(function: Callable[P, Result]) -> Callable[P, Result]:
         signature = inspect.signature(function)
@@ -295,54 +216,33 @@ def holds_folder[**P, Result](
     return decorate
 
 
-def _holder(descriptor: int) -> str:
-    """Who holds a folder, as Linux's /proc tells."""
-    status = os.fstat(descriptor)
-    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}"
-    with contextlib.suppress(OSError, IndexError, ValueError):
-        for line in Path("/proc/locks").read_text().splitlines():
-            words = line.split()
-            if words[1] == "FLOCK" and words[5] == f"{device}:{status.st_ino}":
-                pid = int(words[4])
-                command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-                return f"process {pid} ({b' '.join(command[:8]).decode(errors='replace').strip()})"
-    return "another process"
-
-
-DATA = "SPLATPILOT_DATA"
-"""Names the folder of captures and meshes."""
-
-SCENES = "SPLATPILOT_SCENES"
-"""Names the folder of scenes."""
-
-
 def data_folder() -> Path | None:
-    """The folder of captures and meshes; None where nobody named one."""
+    """Returns the folder of captures and meshes, None if it is not set."""
     return Path(os.environ[DATA]) if DATA in os.environ else None
 
 
 def scenes_folder() -> Path:
-    """The folder of scenes: `scenes` where nobody named one."""
+    """Returns the folder of scenes, `scenes` if it is not set."""
     return Path(os.environ.get(SCENES, "scenes"))
 
 
 def cache_folder(*parts: str) -> Path:
-    """The folder of what takes long to make again, in the user's cache."""
+    """Returns a folder in the user's cache."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(home, "splatpilot", *parts)
 
 
 def find_data(path: Path, what: str, hint: str = "") -> Path:
-    """
-    Finds a capture or a mesh: here, in the folder of data, or, by its name alone, in a folder of
-    that. Prints where, if that is not here.
+    """Finds a capture or a mesh: here, in the folder of data or, by name, in a folder of that.
+
+    Prints the path unless it is here.
 
     Args:
-        what: what it is, for the message.
-        hint: what to do if it is nowhere.
+        what: for the message.
+        hint: remedy if it is missing.
 
     Raises:
-        FileNotFoundError: if it is nowhere.
+        FileNotFoundError: if it is missing.
     """
     if path.exists():
         return path
@@ -361,10 +261,7 @@ def find_data(path: Path, what: str, hint: str = "") -> Path:
 
 
 def require_corpus(folder: Path) -> None:
-    """
-    Raises:
-        FileNotFoundError: unless a folder holds a corpus; the message says how to make one.
-    """
+    """Raises FileNotFoundError unless a folder holds a corpus."""
     if not (folder / "shards").is_dir():
         raise FileNotFoundError(
             f"{folder} holds no corpus; collect one with `splatpilot corpus make --out {folder} "
@@ -373,22 +270,65 @@ def require_corpus(folder: Path) -> None:
 
 
 def require_scene(path: str, source: str = "") -> Path:
-    """
-    Where a scene is: here, or in the folder of scenes.
+    """Finds a scene, here or in the folder of scenes.
 
     Args:
-        path: of it.
-        source: how to get it.
+        source: how to get it, for the message.
 
     Raises:
-        FileNotFoundError: if it is in neither; the message says how to get it.
+        FileNotFoundError: if it is missing.
     """
-    folder = scenes_folder()
-    for place in (Path(path), folder / path):
-        if place.exists():
-            return place
+    for found in (Path(path), scenes_folder() / path):
+        if found.exists():
+            return found
     raise FileNotFoundError(
-        f"No such file or folder: {path}; expected a scene, here or in {folder} (the environment "
-        f"variable {SCENES} names that folder); "
+        f"No such file or folder: {path}; expected a scene, here or in {scenes_folder()} (the "
+        f"environment variable {SCENES} names that folder); "
         + (source or "reconstruct one with `splatpilot reconstruct`").strip()
     )
+
+
+def _temporary(path: Path, stem: str, suffix: str = "") -> Path:
+    return path.with_name(f".{stem}.{_HOST}.{os.getpid()}.partial{suffix}")
+
+
+@contextmanager
+def _naming(path: Path, partial: Path) -> Iterator[None]:
+    """Adds `path` to errors about `partial`; libraries do not name the file if the disk is full."""
+    try:
+        yield
+    except _UnwritableError:
+        raise
+    except OSError as error:
+        if error.filename is not None and not str(error.filename).startswith(str(partial)):
+            raise  # It is about another file.
+        remedy = "make room" if error.errno in _DISK_FULL else "is the folder writable?"
+        reason = error.strerror or str(error)
+        raise _UnwritableError(f"{path}: cannot be written ({reason}); {remedy}") from error
+
+
+def _flush(path: Path) -> None:
+    """Writes a file to the disk: some file systems only then say that it is full."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _rename_unless_taken(folder: Path, path: Path) -> None:
+    try:
+        folder.rename(path)
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

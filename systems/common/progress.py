@@ -1,4 +1,4 @@
-"""Progress of long commands: bars in a terminal, a line a minute elsewhere."""
+"""Progress of long commands: bars in a terminal, one line per minute elsewhere."""
 
 import os
 import sys
@@ -10,28 +10,28 @@ from typing import Any
 from tqdm import tqdm
 
 _PERIOD = 60.0  # [s] between two lines that are not for a terminal
-_SHORT = 5.0  # [s] that work must have taken for a line at its end
-_COLUMNS, _ROWS = 80, 24  # of terminals that do not tell theirs
-_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"  # room for figures
-_KEEP_PERIOD = 30.0  # [s] between two checkpoints, unless writing one takes long
-_KEEP_SHARE = 0.02  # of the time, at most, that checkpoints take
+_SHORT = 5.0  # [s] shorter work has no line at its end
+_COLUMNS, _ROWS = 80, 24  # of terminals of unknown size
+_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+_CHECKPOINT_PERIOD = 30.0  # [s] between two checkpoints, or longer
+_MAX_FRACTION = 0.02  # maximum fraction of the time for checkpoints
 
 
 class Progress(tqdm):
-    """Shows how far work has come, on standard error: `tqdm` in a terminal; elsewhere a line when
-    the work begins, one a minute, and one at the end of what took long.
+    """Shows progress on standard error: `tqdm` in a terminal; elsewhere a line at the beginning,
+    one per minute, and one at the end of long work.
 
     Args:
-        iterable: whose items are counted, or None to count by `update`.
-        desc: what is done, such as "rendering frames".
-        total: how many there are; the length of `iterable` if None.
-        initial: how many are done already.
-        unit: what is counted, in the singular.
+        iterable: items to count, or None to count by `update`.
+        desc: such as "rendering frames".
+        total: number of items; the length of `iterable` if None.
+        initial: number of items that are done.
+        unit: singular noun for an item.
         delay: [s] before anything is shown.
         keywords: of `tqdm`.
     """
 
-    monitor_interval = 0  # no thread: Drake aborts where another thread frees what is its own
+    monitor_interval = 0  # No thread: Drake aborts if another thread frees its objects.
 
     def __init__(
         self,
@@ -45,8 +45,8 @@ class Progress(tqdm):
         **keywords: Any,
     ) -> None:
         self._lines = not sys.stderr.isatty()
-        self._said_at = -_PERIOD
-        self._begun_at = time.monotonic()
+        self._printed_at = -_PERIOD
+        self._started_at = time.monotonic()
         if self._lines:
             keywords |= {"mininterval": 0.0, "leave": False}  # `display` has a clock of its own
         elif total is not None or isinstance(iterable, Sized):
@@ -67,13 +67,13 @@ class Progress(tqdm):
         )
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """Shows the bar, or says a line if the last one is a minute old."""
+        """Shows the bar, or prints a line if the last one is a minute old."""
         if not self._lines:
             return super().display(msg, pos)
         now = time.monotonic()
-        if msg is None and now - self._said_at >= _PERIOD:
-            self._said_at = now
-            print(self._line(now - self._begun_at), file=sys.stderr, flush=True)
+        if msg is None and now - self._printed_at >= _PERIOD:
+            self._printed_at = now
+            print(self._line(now - self._started_at), file=sys.stderr, flush=True)
 
     def clear(self, nolock: bool = False) -> None:
         """Removes the bar; lines stay."""
@@ -81,10 +81,10 @@ class Progress(tqdm):
             super().clear(nolock)
 
     def close(self) -> None:
-        """Ends the bar, or says the last line."""
+        """Ends the bar, or prints the last line."""
         if not getattr(self, "disable", True) and self._lines:
-            if time.monotonic() - self._begun_at > max(_SHORT, self.delay):
-                self._said_at = -_PERIOD
+            if time.monotonic() - self._started_at > max(_SHORT, self.delay):
+                self._printed_at = -_PERIOD
                 self.display()
         super().close()
 
@@ -104,7 +104,7 @@ class Progress(tqdm):
 
 
 def say(text: str) -> None:
-    """Prints a line on standard error, above bars that are there."""
+    """Prints a line on standard error, above open bars."""
     if sys.stderr.isatty():
         tqdm.write(text, file=sys.stderr)
     else:
@@ -112,11 +112,10 @@ def say(text: str) -> None:
 
 
 class CheckpointClock:
-    """Tells when a checkpoint is due by time: 30 s after the last, or later where writing one takes
-    more than 2 % of that."""
+    """Clock for checkpoints: one is due 30 s after the last, or later if writing takes over 2 %."""
 
     def __init__(self) -> None:
-        self._next = time.monotonic() + _KEEP_PERIOD
+        self._next = time.monotonic() + _CHECKPOINT_PERIOD
 
     @property
     def is_due(self) -> bool:
@@ -129,13 +128,15 @@ class CheckpointClock:
         begun = time.monotonic()
         yield
         ended = time.monotonic()
-        self._next = ended + max(_KEEP_PERIOD, (ended - begun) / _KEEP_SHARE)
+        self._next = ended + max(_CHECKPOINT_PERIOD, (ended - begun) / _MAX_FRACTION)
 
 
 @contextmanager
 def resumable(kept: Callable[[], str]) -> Iterator[None]:
-    """Within the block, an interruption (Ctrl-C, SIGTERM) notes what `kept` returns, unless a block
-    inside has: what is kept and how to resume. The command line prints it."""
+    """Adds to an interruption (Ctrl-C, SIGTERM) of the block what is kept and how to resume.
+
+    The innermost block adds its note, which the command line prints.
+    """
     try:
         yield
     except KeyboardInterrupt as interruption:

@@ -1,4 +1,4 @@
-"""Which program a result comes from."""
+"""Provenance of results: revision and versions of the program."""
 
 import hashlib
 import importlib.metadata
@@ -11,7 +11,7 @@ import cv2
 
 _LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm", "torch", "onnx"
 _FOLDERS = "splatpilot", "native", "systems", "diagrams", "training", "analysis"
-_SUFFIXES = ".py", ".yaml", ".cpp", ".hpp", ".npz"  # the last are weights that ship
+_SUFFIXES = ".py", ".yaml", ".cpp", ".hpp", ".npz"  # with the weights that ship
 
 
 def program() -> dict[str, str]:
@@ -26,11 +26,9 @@ def program() -> dict[str, str]:
 
 
 def revision() -> str:
-    """
-    Identifies this source: in a checkout by the git revision, with a digest of the source files
-    that differ from it or are untracked; installed, by the version.
+    """Returns the git revision of this checkout, with a digest of changed and untracked source.
 
-    A checkout of something else around the installation says nothing about it.
+    Outside a checkout of splatpilot it is the version of the installation.
     """
     checkout = Path(__file__).resolve().parents[2]
 
@@ -55,17 +53,13 @@ def revision() -> str:
                 digest.update(file.read_bytes() if file.is_file() else b"")
             return f"{head}+{digest.hexdigest()[:8]}" if names else head
     except (OSError, KeyError, tomllib.TOMLDecodeError, subprocess.CalledProcessError):
-        pass  # No checkout, no git, or a checkout without a commit.
+        pass  # not a checkout, without a commit, or no git
     return importlib.metadata.version("splatpilot")
 
 
 class InfeasibleFlightError(ValueError):
-    """
-    This flight cannot be flown, though nothing is wrong with the program.
+    """A random world, start or goal that leaves no collision-free path.
 
-    Raised where a random world, start or goal does not leave what a flight needs: no instance of
-    the world drawn from its seed has a way through, start or goal lie where the vehicle does not
-    fit, or no way leads from where the planner is to its goal. Other seeds of the same scenario may
-    well be flown, and so a study counts such a flight as failed and goes on; every other exception
-    is a mistake in a program or a configuration, and stops it.
+    Other seeds of the scenario may be feasible, so a study counts the flight as failed and
+    continues. Every other exception stops it.
     """

@@ -1,218 +1,189 @@
-"""Kinds of one thing, ours and those of other packages, by name."""
+"""Registries of policies, worlds, sensors and other things, our own and those of other packages."""
 
 import functools
 import importlib
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from splatpilot.systems.common.validation import unknown
 
-_OURS = "splatpilot."
-_OTHER = "and module:attribute of your own"
-_others: set[str] = set()
+_OTHERS = "and module:attribute of your own"
 _ATTRIBUTE = re.compile(r"[\w.]+:[\w.]+")
+_plugins: set[str] = set()
 
 
-class Registry[Kind]:
-    """
-    What there is of one thing: policies, worlds, sensors and so on.
+class Registry[Entry]:
+    """Entries by name.
 
-    A kind is there under a name that our own code or a caller has given it, under the name of an
-    entry point of `group`, which an installed package announces in its pyproject.toml,
+    An entry has a name that a caller registered, or that of an entry point of `group`, which an
+    installed package announces in its pyproject.toml,
 
         [project.entry-points."splatpilot.policies"]
         hover = "my_package.hover:HoverConfig"
 
-    and, where nothing is installed, as `my_package.hover:HoverConfig`. What is behind the colon is
-    the kind, or the type of its configuration, for which the module registers a kind when imported.
+    or, without installation, is `my_package.hover:HoverConfig`. The attribute is the entry, or the
+    type of its configurations, for which the module registers an entry when imported.
 
-    Kinds with an attribute `config`, the type of their configurations, are found by these too.
+    Entries with an attribute `config`, the type of their configurations, are found by these too.
+
+    Args:
+        what: thing that is registered, for messages.
+        group: group of the entry points.
+        entry_type: type of the entries.
     """
 
-    def __init__(self, what: str, group: str, kind: type[Kind]):
-        """
-        Args:
-            what: the thing, for messages.
-            group: of the entry points.
-            kind: the type of the kinds.
-        """
+    def __init__(self, what: str, group: str, entry_type: type[Entry]) -> None:
         self.what, self.group = what, group
-        self._kind = kind
-        self._kinds: dict[str, Kind] = {}
+        self._entry_type = entry_type
+        self._entries: dict[str, Entry] = {}
 
-    def add(self, name: str, kind: Kind) -> None:
-        """
-        Registers a kind; the same one again changes nothing.
+    def add(self, name: str, entry: Entry) -> None:
+        """Registers an entry.
 
         Raises:
-            ValueError: if the name, or that of the type of its configurations, is another kind's.
+            ValueError: if another entry has the name, or a configuration of the same type name.
         """
-        if name in self._kinds and self._kinds[name] != kind:
+        if self._entries.get(name, entry) != entry:
             raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
-        config = getattr(kind, "config", None)
-        for other in self._configs():
+        config = getattr(entry, "config", None)
+        for other in self.configs():
             if config is not None and config.__name__ == other.__name__ and config is not other:
                 raise ValueError(
                     f"{config.__module__}.{config.__name__} has the name of {other.__module__}."
                     f"{other.__name__}, and files could not tell them apart; rename it"
                 )
-        self._kinds[name] = kind
+        self._entries[name] = entry
 
     def registered(self) -> list[str]:
-        """The names of the kinds that are registered by now."""
-        return list(self._kinds)
+        """Returns the names that are registered so far."""
+        return list(self._entries)
 
     def names(self) -> list[str]:
-        """The names of all kinds: those registered, then those that installed packages announce."""
-        return list(dict.fromkeys([*self._kinds, *(point.name for point in self._announced())]))
+        """Returns the registered names, then those that installed packages announce."""
+        return list(dict.fromkeys([*self._entries, *(point.name for point in self._announced())]))
 
-    def find(self, name: str) -> Kind:
-        """
-        The kind of a name, or of `module:attribute`, whose module is imported.
+    def find(self, name: str) -> Entry:
+        """Returns the entry of a name, or of `module:attribute`, whose module is imported.
 
         Raises:
-            ValueError: if there is none; the message lists what there is.
+            ValueError: if there is none; the message lists the names.
         """
-        if name in self._kinds:
-            return self._kinds[name]
+        if name in self._entries:
+            return self._entries[name]
         for point in self._announced():
             if point.name == name:
                 return self._load(point)
-        if _ATTRIBUTE.fullmatch(name):
-            _look_here_too()
-            return self._load(EntryPoint(name=name, value=name, group=self.group))
-        raise ValueError(unknown(self.what, name, self.names(), _OTHER))
+        if not _ATTRIBUTE.fullmatch(name):
+            raise ValueError(unknown(self.what, name, self.names(), _OTHERS))
+        _search_working_directory()
+        return self._load(EntryPoint(name=name, value=name, group=self.group))
 
-    def kind_of(self, config: Any) -> Kind:
-        """
-        The kind whose configuration this is, or the nearest of its base classes.
+    def kind_of(self, config: Any) -> Entry:
+        """Returns the entry of a configuration's type, or of the nearest of its base classes.
 
         Raises:
-            ValueError: if there is none; the message lists what there is.
+            ValueError: if there is none; the message lists the types.
         """
-        for type_ in type(config).__mro__:
-            for kind in self._kinds.values():
-                if getattr(kind, "config", None) is type_:
-                    return kind
-        known = ", ".join(config.__name__ for config in self._configs())
+        for base in type(config).__mro__:
+            if entry := self._by_config(base):
+                return entry
+        known = ", ".join(known.__name__ for known in self.configs())
         raise ValueError(
             f"no {self.what} has the configuration {type(config).__name__}; known are {known}, and "
-            f"what register_{self.what} is told"
+            f"those that register_{self.what} adds"
         )
 
-    def name_of(self, kind: Kind) -> str:
-        """The first name that a kind is registered under."""
-        return next(name for name, known in self._kinds.items() if known == kind)
+    def name_of(self, entry: Entry) -> str:
+        """Returns the first name of an entry."""
+        return next(name for name, known in self._entries.items() if known == entry)
 
-    def configs(self, tags: set[str]) -> list[type]:
-        """
-        The types of configurations, in the order of their registration.
+    def configs(self) -> list[type]:
+        """Returns the types of configurations, in the order of their registration."""
+        configs = [getattr(entry, "config", None) for entry in self._entries.values()]
+        return list(dict.fromkeys(config for config in configs if config is not None))
 
-        Args:
-            tags: names of types that are looked for: if one is unknown, the packages that announce
-                kinds are imported.
-        """
-        if tags - {config.__name__ for config in self._configs()}:
-            for point in self._announced():
-                self._load(point)
-        return list(self._configs())
+    def load_announced(self) -> None:
+        """Imports all entries that installed packages announce."""
+        for point in self._announced():
+            self._load(point)
 
     def modules(self) -> set[str]:
-        """The modules of others that must be imported for all kinds to be found again."""
-        announced = {point.module for point in self._announced()}
-        modules = {config.__module__ for config in self._configs()}
-        return {m for m in modules - announced if not m.startswith(_OURS) and m != "__main__"}
+        """Returns the modules of other packages that another process must import."""
+        announced = {point.module for point in self._announced()} | {"__main__"}
+        modules = {config.__module__ for config in self.configs()} - announced
+        return {module for module in modules if not module.startswith("splatpilot.")}
 
-    def _configs(self) -> Iterator[type]:
-        for kind in self._kinds.values():
-            config = getattr(kind, "config", None)
-            if config is not None:
-                yield config
+    def _by_config(self, config: Any) -> Entry | None:
+        entries = self._entries.values()
+        return next((entry for entry in entries if getattr(entry, "config", None) is config), None)
 
-    def _announced(self) -> Iterator[EntryPoint]:
-        yield from _installed(self.group, tuple(sys.path))
+    def _announced(self) -> tuple[EntryPoint, ...]:
+        return _entry_points(self.group, tuple(sys.path))
 
-    def _load(self, point: EntryPoint) -> Kind:
-        _others.add(point.module.partition(".")[0])
+    def _load(self, point: EntryPoint) -> Entry:
+        _plugins.add(point.module.partition(".")[0])
         try:
             value = point.load()
         except ImportError as error:
-            raise ValueError(_not_imported(point.module, error)) from error
+            raise ValueError(_import_error(point.module, error)) from error
         except AttributeError as error:
             raise ValueError(
                 f"the {self.what} {point.name!r} is not at {point.value}: {error}"
             ) from error
-        if isinstance(value, self._kind):
-            self.add(point.name, value)
-            return value
-        for kind in self._kinds.values():
-            if getattr(kind, "config", None) is value:
-                self.add(point.name, kind)
-                return kind
-        raise ValueError(
-            f"{point.value} is no {self.what}; it must be a {self._kind.__name__}, or the type of "
-            f"the configurations of one that its module registers"
-        )
+        entry = value if isinstance(value, self._entry_type) else self._by_config(value)
+        if entry is None:
+            raise ValueError(
+                f"{point.value} must be a {self._entry_type.__name__} of a {self.what}, or the "
+                "type of its configurations"
+            )
+        self.add(point.name, entry)
+        return entry
 
 
 def check_name(what: str, group: str, name: str, ours: Sequence[str]) -> None:
-    """
-    Checks a name before the registry that has it is imported, which may take seconds.
+    """Checks a name before the registry is imported, which may take seconds.
 
     Args:
-        what, group: of the registry.
-        ours: the names that our own code registers there.
-
-    Raises:
-        ValueError: if no kind will have the name; the message lists what there is.
+        what, group: attributes of the registry.
+        ours: names that our own code registers there.
     """
-    announced = [point.name for point in _installed(group, tuple(sys.path))]
-    if name not in (*ours, *announced) and not _ATTRIBUTE.fullmatch(name):
-        raise ValueError(unknown(what, name, [*ours, *announced], _OTHER))
-
-
-@functools.cache
-def _installed(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """The entry points of a group that packages on the `path` announce, whose files take 50 ms to
-    read."""
-    return tuple(entry_points(group=group))
+    known = [*ours, *(point.name for point in _entry_points(group, tuple(sys.path)))]
+    if name not in known and not _ATTRIBUTE.fullmatch(name):
+        raise ValueError(unknown(what, name, known, _OTHERS))
 
 
 def import_modules(names: Sequence[str]) -> None:
-    """
-    Imports modules that register kinds; those in the working directory are found too.
-
-    Raises:
-        ValueError: if one cannot be imported.
-    """
-    _look_here_too()
+    """Imports modules that register entries, also from the working directory."""
+    _search_working_directory()
     for name in names:
-        _others.add(name.partition(".")[0])
+        _plugins.add(name.partition(".")[0])
         try:
             importlib.import_module(name)
-        except SyntaxError as error:
-            raise ValueError(f"the module {name} cannot be imported: {error}") from error
-        except ImportError as error:
-            raise ValueError(_not_imported(name, error)) from error
+        except (ImportError, SyntaxError) as error:
+            raise ValueError(_import_error(name, error)) from error
 
 
-def _not_imported(module: str, error: ImportError) -> str:
-    return (
-        f"the module {module} cannot be imported: {error}; install it, run in its folder, or put "
-        "that into PYTHONPATH"
-    )
+def plugin_packages() -> set[str]:
+    """Returns the packages, or top-level modules, that were imported for their entries."""
+    return set(_plugins)
 
 
-def packages_of_others() -> set[str]:
-    """The packages, or modules outside of any, that were imported for what they register."""
-    return set(_others)
+@functools.cache
+def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Returns the entry points of a group; to read them takes 50 ms for each `path`."""
+    return tuple(entry_points(group=group))
 
 
-def _look_here_too() -> None:
-    """Lets modules that were named be found in the working directory, after all other places."""
+def _import_error(module: str, error: Exception) -> str:
+    remedy = "install it, run in its folder, or put that into PYTHONPATH"
+    hint = f"; {remedy}" if isinstance(error, ImportError) else ""
+    return f"the module {module} cannot be imported: {error}{hint}"
+
+
+def _search_working_directory() -> None:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())

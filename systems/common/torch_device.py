@@ -1,4 +1,4 @@
-"""Where tensors live, and whether that is there."""
+"""Checks and settings of torch devices."""
 
 import ctypes
 import importlib.util
@@ -7,57 +7,47 @@ from contextlib import contextmanager
 
 import torch
 
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
-"""Parameters of glibc's `mallopt`, see malloc.h."""
-_LARGEST_KEPT = 32 << 20
-"""[bytes] The most that glibc takes for the first; larger ones it always asks the system for."""
+from splatpilot.systems.common.validation import require
+
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # parameters of glibc's `mallopt`, see malloc.h
+_MAX_THRESHOLD = 32 << 20  # [bytes]
 
 
 def require_device(device: str) -> None:
-    """
-    Raises:
-        ValueError: unless torch can compute on a device: `cpu`, or `cuda` or `cuda:1`.
-    """
+    """Raises ValueError unless torch can compute on `cpu`, `cuda` or `cuda:1`."""
     kind = device.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
-        raise ValueError(f"device is {device!r}; it must be cpu or cuda")
+    require(kind in ("cpu", "cuda"), "device", "cpu or cuda", repr(device))
     if kind == "cuda" and not torch.cuda.is_available():
         built = torch.version.cuda or "the CPU alone"
         raise ValueError(
-            f"device is {device!r}, but there is no GPU that this PyTorch, built for {built}, can "
-            "use; choose device=cpu, or install a GPU's driver and a PyTorch for it"
+            f"device must be cpu, got {device!r}; this PyTorch, built for {built}, finds no GPU: "
+            "install a driver and a PyTorch for it"
         )
 
 
 def require_renderer(device: str) -> None:
-    """
-    Raises:
-        ValueError: unless Gaussians can be rendered on a device, for which a GPU needs gsplat.
-    """
+    """Raises ValueError unless Gaussians can be rendered on a device; a GPU needs gsplat."""
     require_device(device)
     if device.startswith("cuda") and importlib.util.find_spec("gsplat") is None:
         raise ValueError(
-            f"device is {device!r}, on which gsplat renders; pip install 'splatpilot[cuda]', or "
-            "choose device=cpu"
+            f"device must be cpu, got {device!r}; to render on it, pip install 'splatpilot[cuda]'"
         )
 
 
 def keep_freed_memory() -> None:
-    """Has this process keep the memory of tensors that are gone for those that come.
+    """Lets glibc keep freed memory of tensors instead of returning it to the system.
 
-    Otherwise glibc gives it back to the system after each pass of a network, and the system clears
-    it anew for the next: a fifth of the time of the student's encoder, and more where several
-    processes do so. Without effect where the C library is another.
+    Has no effect with other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _LARGEST_KEPT)
+        mallopt(_MMAP_THRESHOLD, _MAX_THRESHOLD)
         mallopt(_TRIM_THRESHOLD, 2**31 - 1)
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Has torch compute on one thread while the block lasts: its sums depend on their number."""
+    """Limits torch to one thread in the block: sums depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

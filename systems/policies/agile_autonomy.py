@@ -1,6 +1,7 @@
 """AgileAutonomy: three trajectories from a depth image, imitated from a sampling expert."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from splatpilot.systems.policies.recurrent_network import (
     leaky_relu,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.flatness import array_namespace
 
 RATE = 15.0  # [Hz]
 CAMERA_SIZE = 128, 96  # [px] width and height before pooling
@@ -136,13 +138,13 @@ def load_network(path: str | None) -> TrajectoryNetwork:
     return PolicyCheckpoint.load(path, "agile_autonomy", AGILE_NETWORK).build(TrajectoryNetwork)
 
 
-def state_observation(seen: Observation, speed: float) -> np.ndarray:
-    """Returns (18,): attitude row by row, then in the body frame velocity [m/s], rates [rad/s] and
-    target velocity [m/s]."""
-    R_WB = seen.X_WB.rotation().matrix()
-    v_target = target_velocity(seen.X_WB.translation(), seen.p_WG, speed)
-    _, v_WB, _, w_WB_B = seen.state
-    return np.concatenate([R_WB.ravel(), v_WB @ R_WB, w_WB_B, v_target @ R_WB])
+def state_observation(R_WB: Any, v_WB: Any, w_WB_B: Any, v_target: Any) -> Any:
+    """Returns (..., 18): attitude R_WB (..., 3, 3) row by row, then in the body frame velocity
+    [m/s], rates [rad/s] and target velocity [m/s]. Arrays are numpy or torch."""
+    xp = array_namespace(v_WB)
+    rows = xp.stack([v_WB, v_target], -2) @ R_WB
+    attitude = R_WB.reshape(*R_WB.shape[:-2], 9)
+    return xp.concatenate([attitude, rows[..., 0, :], w_WB_B, rows[..., 1, :]], -1)
 
 
 def plan(
@@ -160,7 +162,9 @@ def plan(
         last: the plan of the update before.
     """
     image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
-    state = state_observation(seen, speed)
+    p_WB, v_WB, _, w_WB_B = seen.state
+    v_target = target_velocity(p_WB, seen.p_WG, speed)
+    state = state_observation(seen.X_WB.rotation().matrix(), v_WB, w_WB_B, v_target)
     waypoints_B, costs = network(image, state)
     v_target_B = state[-3:]
     progress = waypoints_B[:, -1] @ v_target_B / max(float(np.linalg.norm(v_target_B)), 1e-6)

@@ -4,14 +4,20 @@ The start frame S has its z axis up and its x axis above the body's x axis at th
 """
 
 from dataclasses import dataclass, field
-from math import atan2, cos, sin
+from math import atan2
 from typing import NamedTuple
 
 import numpy as np
+from pydrake.math import RotationMatrix
 
 from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.observations import limit_smoothly, pool_depth, target_velocity
+from splatpilot.systems.policies.observations import (
+    heading_frame,
+    limit_smoothly,
+    pool_depth,
+    target_velocity,
+)
 from splatpilot.systems.policies.recurrent_network import (
     NetworkSpec,
     RecurrentNetwork,
@@ -75,28 +81,17 @@ def decide(
         start_yaw: of the start frame [rad].
         memory: (H,), the hidden state.
     """
-    R_WS = yaw_rotation(start_yaw)
+    R_WS = heading_frame(np.array(start_yaw))
     image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
-    q_SB = _rotate_about_z(-start_yaw, seen.X_WB.rotation().ToQuaternion().wxyz())
+    R_SB = RotationMatrix.MakeZRotation(-start_yaw) @ seen.X_WB.rotation()
+    q_SB = R_SB.ToQuaternion().wxyz()
+    q_SB *= np.copysign(1.0, q_SB[0])
     v_target = target_velocity(seen.X_WB.translation(), seen.p_WG, speed)
     state = np.concatenate([seen.state.v_WB @ R_WS, q_SB, v_target @ R_WS, [speed]])
     output, memory = network.step(image, state, memory)
     a_WB = R_WS @ limit_smoothly(output[:3], ACCELERATION_LIMITS)
     to_goal = atan2(v_target[1], v_target[0])
     return Decision(a_WB, to_goal + np.pi * np.tanh(float(output[3]) / np.pi), memory)
-
-
-def yaw_rotation(yaw: float) -> np.ndarray:
-    """Returns the rotation (3, 3) about z by `yaw` [rad]."""
-    return np.array([[cos(yaw), -sin(yaw), 0.0], [sin(yaw), cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-
-
-def _rotate_about_z(yaw: float, q: np.ndarray) -> np.ndarray:
-    """Rotates the quaternion (4,) wxyz about z by `yaw` [rad]; the result has w >= 0."""
-    c, s = cos(yaw / 2), sin(yaw / 2)
-    w, x, y, z = q
-    rotated = np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
-    return np.copysign(1.0, rotated[0]) * rotated
 
 
 class DepthNav(Policy):

@@ -91,10 +91,11 @@ def decide(
         memory: (H,), the hidden state.
         limits: (3,) of the command, `ACCELERATION_LIMITS` or `VELOCITY_LIMITS`.
     """
-    R_WB = seen.X_WB.rotation().matrix()
-    state = heading_observation(R_WB, seen.X_WB.translation(), seen.state.v_WB, seen.p_WG, speed)
+    p_WB, v_WB, _, _ = seen.state
+    R_WH, z_WB = heading_frame(seen.state.heading), seen.X_WB.rotation().matrix()[:, 2]
+    state = heading_observation(p_WB, v_WB, z_WB, seen.p_WG, speed, R_WH)
     output, memory = network.step(grid, state, memory)
-    return heading_frame(R_WB) @ limit_smoothly(output, limits), memory
+    return R_WH @ limit_smoothly(output, limits), memory
 
 
 class DiffAero(Policy):

@@ -168,7 +168,8 @@ def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
     view = np.empty((CHANNELS, HEIGHT, WIDTH), np.float32)
     view[:3] = color[first : first + HEIGHT].transpose(2, 0, 1) * np.float32(1.0 / 127.5)
     view[:3] -= np.float32(1.0)
-    R_HB = (heading_frame(R_WB).T @ R_WB).astype(np.float32)
+    R_WH = heading_frame(np.arctan2(R_WB[1, 0], R_WB[0, 0]))
+    R_HB = (R_WH.T @ R_WB).astype(np.float32)
     view[3:] = (R_HB @ rays_B().reshape(-1, 3).T).reshape(3, HEIGHT, WIDTH)
     return view
 

@@ -16,9 +16,10 @@ from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.policies.base import Observation, Policy
 from splatpilot.systems.policies.motion_primitives import rotation_to, velocity_fan
+from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.velocity import (
     RESPONSE_TIME,
-    approach_velocity,
+    SLOWING_TIME,
     tracking_acceleration,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -211,7 +212,7 @@ def decide(
     velocities = np.vstack(
         [
             candidate_velocities(seen.p_WG - p_WB, config),
-            approach_velocity(p_WB, seen.p_WG, config.speed),
+            target_velocity(p_WB, seen.p_WG, config.speed, SLOWING_TIME),
         ]
     )
     positions = responses(p_WB, v_WB, velocities, config.horizon)

@@ -7,7 +7,8 @@ import numpy as np
 from splatpilot.systems.common.drake import output_port
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.base import Observation, Policy
-from splatpilot.systems.policies.velocity import approach_velocity, tracking_acceleration
+from splatpilot.systems.policies.observations import target_velocity
+from splatpilot.systems.policies.velocity import SLOWING_TIME, tracking_acceleration
 
 
 @dataclass
@@ -21,7 +22,7 @@ class StraightConfig(Config):
 
 
 class Straight(Policy):
-    """Flies straight to the goal at a constant speed, by `approach_velocity` and
+    """Flies straight to the goal at a constant speed, by `target_velocity` and
     `tracking_acceleration`.
 
     .. pydrake_system::
@@ -43,5 +44,5 @@ class Straight(Policy):
         self.declare_state(np.zeros(3), "acceleration")
 
     def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
-        v_desired = approach_velocity(seen.state.p_WB, seen.p_WG, self._config.speed)
+        v_desired = target_velocity(seen.state.p_WB, seen.p_WG, self._config.speed, SLOWING_TIME)
         return [tracking_acceleration(seen.state.v_WB, v_desired)]

@@ -1,13 +1,21 @@
 """Tracking of desired velocities, and velocity setpoints for autopilots."""
 
 import math
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, optional_input, output_port
-from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, heading_along_motion
+from splatpilot.systems.vehicle.flatness import (
+    FlatnessControllerConfig,
+    array_namespace,
+    heading_along_motion,
+)
 from splatpilot.systems.vehicle.state import QuadrotorState
+
+SLOWING_TIME = 0.75
+"""[s] For `target_velocity`, of classical policies."""
 
 RESPONSE_TIME = 0.4
 """[s] Time constant of velocity tracking; that of the attitude is 0.1 s."""
@@ -15,22 +23,13 @@ RESPONSE_TIME = 0.4
 MAX_ACCELERATION = 6.0
 """[m/s^2] Maximum of velocity tracking, a tilt of 31 degrees."""
 
-_SLOWING_TIME = 0.75  # [s] at full speed before the goal, in which the speed falls
 
-
-def approach_velocity(p_WB: np.ndarray, p_WG: np.ndarray, speed: float) -> np.ndarray:
-    """Returns v_WB (3,) [m/s] straight to the goal at `speed`, falling linearly near it."""
-    to_goal = p_WG - p_WB
-    distance = float(np.sqrt(to_goal.dot(to_goal)))
-    return to_goal * (speed / max(distance, _SLOWING_TIME * speed))
-
-
-def tracking_acceleration(v_WB: np.ndarray, v_desired: np.ndarray) -> np.ndarray:
-    """Computes a_WB (3,) [m/s^2] by which v_WB approaches `v_desired` (3,) [m/s] exponentially:
-    (v_desired - v_WB) / 0.4 s, shortened to 6 m/s^2."""
-    acceleration = (v_desired - v_WB) / RESPONSE_TIME
-    size = float(np.sqrt(acceleration.dot(acceleration)))
-    return acceleration * min(1.0, MAX_ACCELERATION / size) if size > 0.0 else acceleration
+def tracking_acceleration(v_WB: Any, v_desired: Any) -> Any:
+    """Computes a_WB (..., 3) [m/s^2] by which v_WB approaches `v_desired` [m/s] exponentially:
+    (v_desired - v_WB) / 0.4 s, shortened to 6 m/s^2. Arrays are numpy or torch."""
+    a = (v_desired - v_WB) / RESPONSE_TIME
+    size = array_namespace(a).sqrt((a * a).sum(-1).clip(min=1e-12))
+    return a * (MAX_ACCELERATION / size).clip(max=1.0)[..., None]
 
 
 class VelocityTracker(LeafSystem):

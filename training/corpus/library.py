@@ -1,6 +1,6 @@
 """The worlds that a corpus is gathered in: generated ones, and scenes with obstacles put in."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
@@ -136,14 +136,16 @@ def world_of(kind: str) -> WorldConfig:
     return load_config(Scenario(), scenario_file(kind)).world
 
 
-def check_generated(kind: str) -> None:
-    """Raises ValueError unless the world of a scenario is generated; FileNotFoundError, ValueError
-    if there is no such scenario."""
-    if not is_procedural(world_of(kind)):
-        raise ValueError(
-            f"worlds.kinds has {kind}, whose world is not generated; choose kinds from "
-            f"{', '.join(PROCEDURAL)} and files, and put captured places into worlds.scenes"
-        )
+def check_library(kinds: Sequence[str], scenes: Sequence[str]) -> None:
+    """Checks that there are kinds or scenes, and that the worlds of the kinds are generated."""
+    if not kinds and not scenes:
+        raise ValueError("worlds must have kinds or scenes, got neither")
+    for kind in kinds:
+        if not is_procedural(world_of(kind)):
+            raise ValueError(
+                f"worlds.kinds must be of generated worlds, got {kind}; choose from "
+                f"{', '.join(PROCEDURAL)} and files, and put captured scenes into worlds.scenes"
+            )
 
 
 def place_to_learn_in(scene: str, split: str = "train") -> Path:
@@ -222,10 +224,7 @@ class LibraryConfig:
             FileNotFoundError: for a scene that is not there.
             ValueError: on a value out of range, naming it, its limit and the remedy.
         """
-        if not self.kinds and not self.scenes:
-            raise ValueError("worlds has neither kinds nor scenes; name some")
-        for kind in self.kinds:
-            check_generated(kind)
+        check_library(self.kinds, self.scenes)
         for scene in self.scenes:
             _measured_scene(self, scene)
 

@@ -17,7 +17,7 @@ from torch.nn.functional import conv2d, max_pool2d
 from splatpilot import _native
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 
 WINDOW = 11  # [px] of SSIM
 SIGMA = 1.5  # [px]

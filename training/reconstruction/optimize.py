@@ -11,7 +11,7 @@ from splatpilot.systems.splats.background import FAR, Background
 from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
 from splatpilot.systems.splats.rasterization import EPS2D
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.reconstruction.checkpoint import Checkpoint, event_log
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.losses import (

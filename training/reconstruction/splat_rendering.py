@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatpilot._native import Renderer
 from splatpilot.systems.splats.rasterization import EPS2D, rasterize
-from splatpilot.systems.splats.scene import degree_of
+from splatpilot.systems.splats.scene import harmonic_degree
 from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 
@@ -56,7 +56,7 @@ def render(
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
-        "sh_degree": degree_of(gaussians[4].shape[1]),
+        "sh_degree": harmonic_degree(gaussians[4].shape[1]),
         "backgrounds": background,
         "renderer": renderer,
     }

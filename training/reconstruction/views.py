@@ -18,7 +18,7 @@ from splatpilot.systems.splats.background import (
     Background,
     EnvironmentMap,
     pixel_rays,
-    texel_of,
+    texel_position,
 )
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink
 from splatpilot.training.reconstruction.losses import depth_edge_weights
@@ -136,7 +136,8 @@ def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> 
         rows, columns = np.nonzero(sky)
         factor = photometry.factor(k, *sky.shape)
         color = frame.image[sky] / (255 * factor[sky])[:, None]
-        row, column = texel_of(pixel_rays(frame.K, rows, columns, frame.X_WC), _HEIGHT, _WIDTH)
+        v_W = pixel_rays(frame.K, rows, columns, frame.X_WC)
+        row, column = texel_position(v_W, _HEIGHT, _WIDTH)
         row, column = np.minimum(row.astype(int), _HEIGHT - 1), column.astype(int) % _WIDTH
         np.add.at(sums, row * _WIDTH + column, color)
         np.add.at(counts, row * _WIDTH + column, 1)

@@ -1,14 +1,19 @@
-"""Atomic files."""
-
 import errno
 import subprocess
 import sys
-import threading
+from pathlib import Path
 
 import pytest
 
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import (
+    DATA,
+    claim_folder,
+    find_data,
     folder_written_atomically,
+    held_folder,
+    holds_folder,
     remove_leftovers,
     require_existing,
     require_unused,
@@ -17,8 +22,7 @@ from splatpilot.systems.common.files import (
 )
 
 
-def test_success_replaces_and_leaves_nothing_else(tmp_path):
-    """After the block the file holds the new content and the folder nothing besides."""
+def test_file_is_replaced_when_the_block_ends(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with written_atomically(path) as partial:
@@ -29,43 +33,49 @@ def test_success_replaces_and_leaves_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_failure_keeps_what_was_there(tmp_path):
-    """An exception half way leaves the old content and no temporary file."""
+def broken(written: Path) -> None:
+    raise OSError("it is not good")
+
+
+@pytest.mark.parametrize(
+    ("raised", "check", "error", "message"),
+    [
+        (RuntimeError("half way"), None, RuntimeError, "half way"),
+        (OSError(errno.ENOSPC, "No space left"), None, OSError, r"a\.txt: cannot .*; make room"),
+        (OSError("8 requested, 0 done"), None, OSError, r"a\.txt: cannot .*; make room"),
+        (FileNotFoundError(2, "No", "nowhere"), None, FileNotFoundError, "nowhere"),
+        (None, broken, OSError, r"a\.txt: cannot be written \(it is not good\)"),
+    ],
+)
+def test_file_stays_if_writing_fails(tmp_path, raised, check, error, message):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(RuntimeError, match="half way"), written_atomically(path) as partial:
+    with pytest.raises(error, match=message), written_atomically(path, check) as partial:
         partial.write_text("ne")
-        raise RuntimeError("half way")
+        if raised is not None:
+            raise raised
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_folder_that_cannot_be_made_is_refused(tmp_path):
-    """A folder below a file cannot be made: the message names it and the remedy."""
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"file/out.*--out"):
-        require_writable_folder(tmp_path / "file" / "out")
-
-
-def test_folders_appear_whole(tmp_path):
-    """A folder is there when the block ends and not before, and nothing besides; what a kill left
-    under the temporary name is overwritten."""
+def test_folder_appears_when_the_block_ends(tmp_path):
     path = tmp_path / "a"
     with folder_written_atomically(path) as left:
         pass
     path.rmdir()
     left.mkdir()
-    (left / "old").write_text("")
+    (left / "old").write_text("")  # as a kill leaves it
     with folder_written_atomically(path) as partial:
         (partial / "file").write_text("new")
         assert not path.exists()
-    assert (path / "file").read_text() == "new"
     assert list(path.iterdir()) == [path / "file"]
+    with folder_written_atomically(path, replace=True) as partial:
+        (partial / "other").write_text("newer")
+    assert list(path.iterdir()) == [path / "other"]
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_folders_that_fail_are_not_there_and_others_stay(tmp_path):
-    """An exception leaves nothing; a folder that another put there meanwhile stays as it is."""
+def test_folder_of_another_process_stays(tmp_path):
     path = tmp_path / "a"
     with pytest.raises(RuntimeError, match="half way"), folder_written_atomically(path) as partial:
         (partial / "file").write_text("ne")
@@ -76,86 +86,6 @@ def test_folders_that_fail_are_not_there_and_others_stay(tmp_path):
         path.mkdir()
         (path / "file").write_text("theirs")
     assert (path / "file").read_text() == "theirs"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_what_is_there_is_used_only_if_it_may_be_overwritten(tmp_path):
-    """Files, and folders that hold anything, are refused with the remedy; empty folders are not."""
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file").touch()
-    for unused in ("empty", "nothing"):
-        require_unused(tmp_path / unused, overwrite=False)
-    for used in (tmp_path / "file", tmp_path):
-        with pytest.raises(FileExistsError, match=r"is there already; .* --overwrite"):
-            require_unused(used, overwrite=False)
-        require_unused(used, overwrite=True)
-
-
-def test_what_must_be_there_is_named(tmp_path):
-    """A path that leads nowhere is said with what is needed."""
-    require_existing(tmp_path, "a folder")
-    with pytest.raises(FileNotFoundError, match=r"No such file.*nowhere; expected a scene"):
-        require_existing(tmp_path / "nowhere", "a scene")
-
-
-def test_full_disk_names_the_file_and_keeps_the_old(tmp_path):
-    """What libraries say of a full disk, with an error number or without, becomes a sentence with
-    the file and the remedy; an error about another file stays what it is."""
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-    for error in (OSError(errno.ENOSPC, "No space left on device"), OSError("8 requested, 0 done")):
-        with (
-            pytest.raises(OSError, match=r"a\.txt: cannot be written \(.*\); make room"),
-            written_atomically(path),
-        ):
-            raise error
-    with pytest.raises(FileNotFoundError, match="nowhere"), written_atomically(path):
-        (tmp_path / "nowhere").read_text()
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_what_is_found_broken_is_not_renamed(tmp_path):
-    """A file that its check refuses does not take the place of the old one."""
-    path = tmp_path / "a.txt"
-
-    def check(written):
-        if written.read_text() != "good":
-            raise OSError("it is not good")
-
-    with written_atomically(path, check) as partial:
-        partial.write_text("good")
-    with (
-        pytest.raises(OSError, match=r"a\.txt: cannot be written \(it is not good\)"),
-        written_atomically(path, check) as partial,
-    ):
-        partial.write_text("bad")
-    assert path.read_text() == "good"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_replaced_folder_is_there_at_every_instant(tmp_path):
-    """While a folder is replaced again and again, whoever looks finds it, and all of it."""
-    path = tmp_path / "a"
-    path.mkdir()
-    (path / "file").write_text("0")
-    over, found = threading.Event(), set()
-
-    def look():
-        while not over.is_set():
-            found.add((path / "file").read_text())
-
-    looking = threading.Thread(target=look)
-    looking.start()
-    try:
-        for number in range(1, 30):
-            with folder_written_atomically(path, replace=True) as partial:
-                (partial / "file").write_text(str(number))
-    finally:
-        over.set()
-        looking.join()
-    assert found <= {str(number) for number in range(30)} and len(found) > 1
-    assert (path / "file").read_text() == "29"
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -171,9 +101,7 @@ with written_atomically(folder / "a.txt") as file, folder_written_atomically(fol
 """
 
 
-def test_what_a_kill_has_left_goes_with_the_next_run(tmp_path):
-    """Temporary files and folders of processes that have ended are removed, and count as nothing;
-    those of this process, which is at work, and all else stay."""
+def test_leftovers_of_ended_processes_are_removed(tmp_path):
     subprocess.run([sys.executable, "-c", _KILLED, str(tmp_path)], check=False)
     assert len(list(tmp_path.iterdir())) == 2
     require_unused(tmp_path, overwrite=False)
@@ -184,3 +112,101 @@ def test_what_a_kill_has_left_goes_with_the_next_run(tmp_path):
         assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".mine.partial", partial])
     remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".mine.partial", "mine.txt"]
+
+
+def test_paths_are_checked(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    for unused in ("empty", "nothing"):
+        require_unused(tmp_path / unused, overwrite=False)
+    for used in (tmp_path / "file", tmp_path):
+        with pytest.raises(FileExistsError, match=r"is there already; .* --overwrite"):
+            require_unused(used, overwrite=False)
+        require_unused(used, overwrite=True)
+    require_existing(tmp_path, "a folder")
+    with pytest.raises(FileNotFoundError, match=r"No such file.*nowhere; expected a scene"):
+        require_existing(tmp_path / "nowhere", "a scene")
+    with pytest.raises(OSError, match=r"file/out.*--out"):
+        require_writable_folder(tmp_path / "file" / "out")
+
+
+def test_a_folder_belongs_to_one_configuration(tmp_path):
+    file, other = tmp_path / "mine" / "flight.yaml", tmp_path / "other"
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / ".flight.1.partial.yaml").touch()
+    text = claim_folder(file, Scenario(seed=1))
+    assert claim_folder(file, Scenario(seed=1)) == text == file.read_text()
+    with pytest.raises(ValueError, match=r"holds another configuration, with seed: 1; choose"):
+        claim_folder(file, Scenario(seed=2))
+    assert file.read_text() == text
+    claim_folder(file, Scenario(seed=2), overwrite=True)
+    assert load_config(Scenario(), file).seed == 2
+    other.mkdir()
+    (other / "letters").touch()
+    with pytest.raises(ValueError, match=r"other must be empty or hold flight.yaml, got letters"):
+        claim_folder(other / "flight.yaml", Scenario())
+    assert [path.name for path in other.iterdir()] == ["letters"]
+
+
+def test_a_locked_folder_is_refused_until_its_process_ends(tmp_path):
+    holding = (
+        "import sys, time; from pathlib import Path\n"
+        "from splatpilot.systems.common.files import held_folder\n"
+        "with held_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
+    )
+    folder = tmp_path / "out" / "folder"
+    words = [sys.executable, "-c", holding, str(folder)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"held\n"
+        told = "folder is in use by another process; wait"
+        with pytest.raises(OSError, match=told), held_folder(folder):
+            pass
+        other.kill()
+        other.wait()
+    with held_folder(folder):
+        (folder / "file").touch()
+    assert folder.is_dir()
+
+
+def test_a_locked_folder_that_stays_empty_is_removed(tmp_path):
+    @holds_folder("out")
+    def run(*, out, text):
+        assert out.is_dir()
+        if not text:
+            raise ValueError("nothing to write")
+        (out / "file").write_text(text)
+
+    with pytest.raises(ValueError, match="nothing to write"):
+        run(out=tmp_path / "a" / "b", text="")
+    assert list(tmp_path.iterdir()) == []
+    run(out=tmp_path / "a" / "b", text="something")
+    assert (tmp_path / "a" / "b" / "file").read_text() == "something"
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch) -> Path:
+    (tmp_path / "data" / "tartanair" / "hospital").mkdir(parents=True)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv(DATA, str(tmp_path / "data"))
+    return tmp_path / "data"
+
+
+@pytest.mark.parametrize("name", ["hospital", "tartanair/hospital"])
+def test_a_capture_is_found_in_the_folder_of_data(name, data, capsys):
+    found = data / "tartanair" / "hospital"
+    assert find_data(Path(name), "a capture") == found
+    assert capsys.readouterr().out == f"{name} is {found}\n"
+    Path(name).mkdir(parents=True)
+    assert find_data(Path(name), "a capture") == Path(name)
+    assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize("is_set", [True, False])
+def test_a_missing_capture_names_the_folders(is_set, data, monkeypatch):
+    if not is_set:
+        monkeypatch.delenv(DATA)
+    where = str(data) if is_set else rf"the folder that {DATA} names \(it is not set\)"
+    message = rf"^No such file or folder: hospitl; expected a capture, here or in {where}$"
+    with pytest.raises(FileNotFoundError, match=message):
+        find_data(Path("hospitl"), "a capture")

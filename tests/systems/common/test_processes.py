@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.common.processes import map_processes, run_apart
+from splatpilot.systems.common.processes import available_cores, map_processes, run_apart
 
 
 def _square(number: int) -> tuple[int, int]:
@@ -38,7 +38,6 @@ def _slow(number: int) -> int:
 
 
 def test_who_has_enough_ends_it_without_a_warning(recwarn):
-    """What still works is given up in silence, and the next call works."""
     results = map_processes(_slow, range(6), jobs=2)
     assert next(results) == 0
     results.close()
@@ -54,7 +53,6 @@ def test_killed_process_is_named_and_the_next_call_works(tmp_path):
 
 
 def _is_running(pid: int) -> bool:
-    """Whether there is such a process that has not ended; Linux's /proc tells."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except FileNotFoundError:
@@ -96,12 +94,15 @@ def _abort(work):
 
 
 def test_work_apart():
-    """What is done in a process of its own comes back, with its exceptions; where native code ends
-    that process or raises what it always does, an error says what was done."""
     work, process = run_apart("a: counting", _abort, "count")
     assert work == "count" and process != os.getpid()
     with pytest.raises(ValueError, match="refuse: no"):
         run_apart("a: counting", _abort, "refuse")
     for work, why in (("abort", "its process was ended"), ("fail", "no factory")):
-        with pytest.raises(OSError, match=f"a: counting: {why}, perhaps for want of room"):
+        with pytest.raises(OSError, match=f"a: counting: {why}, perhaps for lack of disk space"):
             run_apart("a: counting", _abort, work)
+
+
+def test_cores_are_those_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {1, 5, 7})
+    assert available_cores() == 3

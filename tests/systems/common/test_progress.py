@@ -1,5 +1,3 @@
-"""Progress of long commands, in a terminal and in a file."""
-
 import os
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""Which program a result says it comes from: a copy of the module stands for an installation."""
-
 import importlib.metadata
 import importlib.util
 import shutil
@@ -28,9 +26,9 @@ def commit(folder: Path) -> str:
 
 
 def installed(package: Path):
-    """The module as it is imported from `package`/systems."""
-    (package / "systems").mkdir(parents=True)
-    file = package / "systems" / "provenance.py"
+    """The module as it is imported from `package`."""
+    (package / "systems" / "common").mkdir(parents=True)
+    file = package / "systems" / "common" / "provenance.py"
     shutil.copyfile(str(provenance.__file__), file)
     spec = importlib.util.spec_from_file_location("copied_provenance", file)
     assert spec is not None and spec.loader is not None
@@ -98,9 +96,6 @@ def test_program_states_the_versions_of_what_computes_policies():
 
 @pytest.mark.parametrize("package", ["lib/site-packages/splatpilot", "third_party/splatpilot", "."])
 def test_checkout_of_something_else_says_nothing(checkout, package):
-    """Installed, copied or unpacked inside the checkout of another project, the program is its
-    version, whatever is committed there.
-    """
     copied = installed(checkout / package)
     if package.startswith("third_party"):
         (checkout / package / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
@@ -114,5 +109,4 @@ def test_checkout_of_something_else_says_nothing(checkout, package):
 
 
 def test_program_without_git_says_its_version(tmp_path):
-    """So it does where nothing is a checkout."""
     assert installed(tmp_path / "splatpilot").revision() == VERSION

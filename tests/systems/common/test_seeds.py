@@ -1,5 +1,3 @@
-"""Seeds and their purposes."""
-
 from itertools import combinations
 
 import pytest
@@ -32,7 +30,6 @@ def test_ranges_of_seeds_do_not_overlap():
 
 @pytest.mark.parametrize("run", [-1, 1000])
 def test_run_without_seeds_of_its_own_is_refused(run):
-    """Runs are numbered from 0 to 999; others would take seeds of the benchmark or validation."""
     with pytest.raises(ValueError, match=rf"seed .*999\], got {run}"):
         first_training_seed(run)
 

@@ -1,5 +1,3 @@
-"""Messages about values that a user gave."""
-
 import pickle
 from dataclasses import dataclass, field
 

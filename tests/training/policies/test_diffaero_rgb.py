@@ -192,5 +192,5 @@ def test_bad_configurations_are_named(wide_corpus, overrides, message):
 
 def test_a_corpus_seen_through_another_camera_is_refused(student_corpus):
     """The message says which images the policy looks at."""
-    with pytest.raises(ValueError, match="160 pixels wide.* got 32x24"):
+    with pytest.raises(ValueError, match=r"160 pixels wide.* got 32x24"):
         DiffAeroRgbTrainer(training(student_corpus))

@@ -16,7 +16,6 @@ from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies.networks import TrajectoryModule
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyAgent
 from splatpilot.training.policies.train_depthnav import (
     DepthNavLearner,
@@ -28,7 +27,7 @@ from splatpilot.training.policies.train_diffaero import (
     DiffAeroLoss,
     DiffAeroTofLearner,
 )
-from splatpilot.training.policies.vehicles import BodyRate
+from splatpilot.training.policies.vehicles import BodyRate, Observation
 
 P_WG = np.array([9.0, 2.0, 1.5])
 

@@ -7,7 +7,6 @@ import torch
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.policies import velocity as velocity_tracking
 from splatpilot.systems.policies.diffaero import DiffAeroTofConfig
 from splatpilot.systems.sensing import noise as observation_noise
 from splatpilot.systems.sensing.noise import ObservationNoise
@@ -17,17 +16,15 @@ from splatpilot.systems.sensing.time_of_flight import (
     sensor_of,
     time_of_flight_grid,
 )
-from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
-from splatpilot.training.policies.torch_observations import (
+from splatpilot.training.policies.image_noise import (
     blurred,
     disturb_depth,
     noisy_depth,
-    proximity_grid,
-    tracking_acceleration,
     training_noise,
 )
+from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyTraining
-from splatpilot.training.policies.train_diffaero import DiffAeroTraining
+from splatpilot.training.policies.train_diffaero import DiffAeroTraining, proximity_grid
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTraining
 
 
@@ -81,16 +78,6 @@ def test_training_has_the_grid_of_the_sensor(camera):
     flown = np.stack([time_of_flight_grid(image, sensor) for image in depth])
     np.testing.assert_allclose(trained, flown, atol=1e-12)
     assert flown[1:].max() > 0.7 and not flown[0].any()
-
-
-def test_training_takes_up_velocities_as_flight_does():
-    """Accelerations towards wanted velocities are those of flight, beyond the greatest too, and
-    none is asked for by the velocity that there is."""
-    v, wanted = np.random.default_rng(0).normal(scale=2.0, size=(2, 50, 3))
-    wanted[0] = v[0]
-    trained = tracking_acceleration(torch.tensor(v), torch.tensor(wanted))
-    flown = [velocity_tracking.tracking_acceleration(*row) for row in zip(v, wanted, strict=True)]
-    np.testing.assert_allclose(trained, flown, atol=1e-12)
 
 
 @pytest.mark.parametrize(
