@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import KDTree
 
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import (
     are_connected,
     cell_of,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.extras import packages_of_extras
 from splatpilot.systems.common.files import DATA, SCENES, data_folder, scenes_folder
 from splatpilot.systems.common.processes import available_cores
@@ -18,10 +18,10 @@ _DRIVER = Path("/proc/driver/nvidia")
 _SERVED = {
     "cluster": "`splatpilot benchmark --cluster`",
     "exr": "depth of Record3D's exports",
-    "mesh": "`splatpilot mesh`",
-    "mocap": "OptiTrack in `splatpilot px4`",
+    "mesh": "`splatpilot scene mesh`",
+    "mocap": "OptiTrack in `splatpilot hardware px4`",
     "photos": "photographs without poses, and COLMAP models",
-    "px4": "`splatpilot px4`",
+    "px4": "`splatpilot hardware px4`",
     "tensorboard": "curves in TensorBoard",
     "train": "training, reconstruction and measures of scenes",
     "ros": "captures in ROS bags",
@@ -118,7 +118,7 @@ def _messages() -> list[Finding]:
     try:
         open_lcm()
     except OSError as error:
-        return [_lacking("messages", error, "`splatpilot vehicle`, `bridge` and `px4`")]
+        return [_lacking("messages", error, "`splatpilot hardware vehicle`, `bridge` and `px4`")]
     return [Finding("messages", f"LCM delivers at {DEFAULT_URL}")]
 
 

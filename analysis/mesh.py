@@ -1,4 +1,4 @@
-"""`splatpilot mesh`: a place as a mesh that bodies collide with."""
+"""`splatpilot scene mesh`: a place as a mesh that bodies collide with."""
 
 from collections.abc import Sequence
 from pathlib import Path

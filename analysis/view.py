@@ -12,7 +12,8 @@ from pydrake.geometry import Rgba
 
 from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
-from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import (
     FRONTIER,
@@ -126,7 +127,7 @@ def _scene(path: Path) -> ShownPlace:
         beyond=False,
         metric=metadata.metric,
         notes=notes,
-        scale_command=f"splatpilot scale {shlex.quote(str(path))} --out {target}",
+        scale_command=f"splatpilot scene scale {shlex.quote(str(path))} --out {target}",
     )
 
 

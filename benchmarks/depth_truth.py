@@ -23,7 +23,8 @@ from true_depth import (
     ghosts_along_flight,
 )
 
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 

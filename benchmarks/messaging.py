@@ -84,10 +84,17 @@ class Listener:
 
 def fly(words: list[str], url: str, folder: Path) -> tuple[str, str, float]:
     """Flies once by two processes; the outcomes of vehicle and bridge, and the bridge's gaps."""
-    program = [sys.executable, "-c", "from splatpilot.analysis.commands.main import run; run()"]
+    program = [
+        sys.executable,
+        "-c",
+        "from splatpilot.analysis.commands.main import run; run()",
+        "hardware",
+    ]
     words = [*words, "--patience", "120", "--lcm-url", url]
     vehicle = subprocess.Popen(
-        [*program, "vehicle", *words, "--out", str(folder)], stdout=subprocess.PIPE, text=True
+        [*program, "vehicle", *words, "--out", str(folder)],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     bridge = subprocess.run([*program, "bridge", *words], capture_output=True, text=True)
     vehicle.communicate()

@@ -19,7 +19,8 @@ from scenes import camera_tensors, intrinsics, load_scene, scene_name, scene_ten
 
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

@@ -18,7 +18,8 @@ from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
-from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 

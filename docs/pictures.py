@@ -21,8 +21,9 @@ from pydrake.systems.sensors import CameraConfig
 
 from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.world_registry import is_procedural, make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.noise import ObservationNoise, expose, image_generator

@@ -32,7 +32,7 @@ from splatpilot.analysis.benchmark.tables import (
     sign_flip,
     wilson_interval,
 )
-from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.seeds import describe_seeds
 
 ROOT = Path(__file__).parents[1]

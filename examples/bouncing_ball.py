@@ -2,8 +2,8 @@
 
     python examples/bouncing_ball.py --place scenes/hospital --out ball.csv
 
-PLACE is a scene folder or an OctoMap, by default a generated forest. `splatpilot mesh` writes the
-same mesh as a file. Needs `pip install 'splatpilot[mesh]'`.
+PLACE is a scene folder or an OctoMap, by default a generated forest. `splatpilot scene mesh`
+writes the same mesh as a file. Needs `pip install 'splatpilot[mesh]'`.
 """
 
 import argparse

@@ -117,9 +117,6 @@ def projected_surfels(renderer: Renderer, frame: SurfelFrame) -> tuple[Annotated
     frame's surfels, in the order of the input.
     """
 
-def adam_step(*, parameters: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], means: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], squares: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], rate: float, step: int, mean_decay: float, square_decay: float, epsilon: float, simd: str = '') -> None:
-    """Moves parameters, and the averages of gradients and of their squares."""
-
 def splat_shapes(*, log_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], logit_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], smallest: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], simd: str = '') -> None:
     """
     Writes sqrt(exp(2 log_scales) + smallest^2) and sigmoid(logit_opacities).
@@ -170,10 +167,10 @@ class ShapeField:
     def __init__(self, *, shapes: Annotated[NDArray[numpy.float64], dict(shape=(None, 15), order='C', device='cpu', writable=False)], kinds: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)]) -> None:
         """Rows and kinds as of `ShapeWorlds`."""
 
-    def nearest(self, *, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], shapes: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu')]) -> None:
+    def nearest(self, *, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu')] | None = None) -> None:
         """
-        Writes the least signed distances (N,) of N points, infinite where there is no shape,
-        and the shapes that have them, the first of several, -1 where there is none.
+        Writes the signed distances (N,) of N points to the nearest shape and their gradients
+        (N, 3); infinite and zero where there is no shape.
         """
 
 class GridWorlds:
@@ -192,10 +189,11 @@ class GridWorlds:
     def interpolate(self, *, p_WQ: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], values: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')]) -> None:
         """Writes the trilinear interpolants (N,) and their gradients (N, 3)."""
 
-def grid_distances(*, grid: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, occupied_outside: bool, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')]) -> None:
+def grid_distances(*, grid: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, occupied_outside: bool, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu')] | None = None) -> None:
     """
-    Writes the distances (N,) at N points: between the centres of voxels, those of the grid
-    interpolated trilinearly; outside, minus the way to the box, or NaN.
+    Writes the distances (N,) at N points and their gradients (N, 3): between the centers of
+    voxels the trilinear interpolant of the grid; outside, minus the distance to the box, or
+    NaN with a gradient of zero.
     """
 
 def descend(*, times: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, p_WG: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], step: float, length: float, way: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C', device='cpu')]) -> int:

@@ -113,9 +113,9 @@ def test_benchmarks(run, tmp_path):
     ("words", "missing", "extra"),
     [
         (["reconstruct", ".", "--out", "scene"], "torch", "train"),
-        (["measure", "."], "torch", "train"),
-        (["ablate", "."], "torch", "train"),
-        (["fidelity", "."], "torch", "train"),
+        (["scene", "measure", "."], "torch", "train"),
+        (["scene", "ablate", "."], "torch", "train"),
+        (["scene", "fidelity", "."], "torch", "train"),
         (["train", "diffaero", "--out", "trained"], "torch", "train"),
         (["capture", "check", "photographs"], "pycolmap", "photos"),
     ],

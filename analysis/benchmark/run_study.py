@@ -10,7 +10,7 @@ from pathlib import Path
 from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.report import write_report
 from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
-from splatpilot.analysis.benchmark.study import SCENARIO, RolloutSpec, StudyConfig
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
     foreign_code,
@@ -20,6 +20,7 @@ from splatpilot.analysis.benchmark.study_folder import (
     require_test_scenes,
 )
 from splatpilot.analysis.benchmark.tables import Row, format_table, policy_table
+from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario

@@ -27,8 +27,9 @@ import numpy as np
 import yaml
 
 from splatpilot.analysis.benchmark.rollout import ARRAYS, INFEASIBLE, Fault, Rollout
-from splatpilot.analysis.benchmark.study import SCENARIO, RolloutSpec, StudyConfig
+from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.tables import Row
+from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS

@@ -1,50 +1,46 @@
-"""The verbs of the command line, one module each, or one of two that belong together.
+"""The commands, one module each.
 
-A module has `add_to(verbs)`, which adds the verb's parser and sets its default `verb` to the
-function that runs it. That function imports what it needs when it runs: torch and pydrake take
-seconds to load.
+A module's `add_to(verbs)` adds the parser of its command and the function that runs it. That
+function imports what it needs when it runs, as torch and pydrake take seconds to import.
 """
 
 from splatpilot.analysis.commands import (
-    ablate,
     benchmark,
     capture,
     corpus,
     difficulty,
     doctor,
-    faults,
-    fidelity,
     fly,
     hardware,
-    measure,
-    mesh,
-    places,
     reconstruct,
     recover,
     replay,
-    scale,
+    scene,
     train,
     view,
 )
 
 COMMANDS = (
     fly,
-    hardware,
-    faults,
+    view,
     benchmark,
     replay,
     difficulty,
-    view,
-    mesh,
     reconstruct,
-    scale,
-    measure,
-    ablate,
-    fidelity,
     capture,
-    places,
-    corpus,
+    scene,
     train,
     recover,
+    corpus,
+    hardware,
     doctor,
 )
+
+MOVED = {
+    "tour": "reconstruct",
+    "merge": "benchmark --cluster",
+    "places": "scene fetch",
+    **{name: f"scene {name}" for name in ("scale", "measure", "mesh", "ablate", "fidelity")},
+    **{name: f"hardware {name}" for name in ("vehicle", "bridge", "px4", "faults")},
+}
+"""Names of commands that have moved."""

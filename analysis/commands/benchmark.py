@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.benchmark.study import parse_variant, split_policies, sweep
+from splatpilot.analysis.benchmark.variants import parse_variant, split_policies, sweep
 from splatpilot.analysis.commands.options import (
     FailureWithResultError,
     add_json,

@@ -1,6 +1,7 @@
-"""`splatpilot vehicle`, `splatpilot bridge` and `splatpilot px4`."""
+"""`splatpilot hardware`: flights by messages."""
 
 import argparse
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,31 @@ from splatpilot.systems.common.files import require_unused
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
+    hardware = add_verb(
+        verbs,
+        "hardware",
+        None,
+        help="fly vehicles, real or simulated, by messages",
+        description="Flies a real or simulated vehicle by LCM messages or PX4, or tests the "
+        "failsafe by faults.",
+        examples=("hardware vehicle --scenario P02", "hardware bridge --scenario P02"),
+    )
+    actions = hardware.add_subparsers(required=True, metavar="ACTION")
+    _add_hardware(actions)
+    _add_faults(actions)
+
+
+def _add_hardware(verbs: argparse._SubParsersAction) -> None:
     vehicle = add_verb(
         verbs,
         "vehicle",
         _vehicle,
         help="simulate a vehicle that is flown by LCM messages",
         description="Hovers at the scenario's start until commands come, and flies by them, in "
-        "real time: what `splatpilot bridge` flies where there is no real vehicle.",
+        "real time: what `splatpilot hardware bridge` flies where there is no real vehicle.",
         examples=(
-            "vehicle --scenario P02 --policy diffaero",
-            "vehicle --scenario P02 --policy diffaero --seed 3 --patience 60 --out out/vehicle_3",
+            "hardware vehicle --scenario P02 --policy diffaero",
+            "hardware vehicle --scenario P02 --seed 3 --patience 60 --out out/vehicle_3",
         ),
     )
     vehicle.add_argument(
@@ -40,8 +56,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         description="Runs policy, controller and failsafe against a vehicle that sends its state "
         "and what it sees, and takes commands.",
         examples=(
-            "bridge --scenario P02 --policy diffaero",
-            "bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
+            "hardware bridge --scenario P02 --policy diffaero",
+            "hardware bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
         ),
     )
     bridge.add_argument("--log", type=Path, help="write all messages to this file, as lcm-logger")
@@ -53,8 +69,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         description="Stands where the simulated vehicle stands: sends PX4's estimate on to the "
         "bridge, and the bridge's commands on to PX4. Arms nothing unless told to.",
         examples=(
-            "px4 --set vehicle_host=192.168.8.1",
-            "px4 --config px4.yaml --engage",
+            "hardware px4 --set vehicle_host=192.168.8.1",
+            "hardware px4 --config px4.yaml --engage",
         ),
     )
     px4.add_argument("--config", type=Path, metavar="FILE", help="YAML with fields of Px4Config")
@@ -124,3 +140,48 @@ def _config(options: argparse.Namespace):
     given = {"url": options.lcm_url, "patience": options.patience}
     given = {name: value for name, value in given.items() if value is not None}
     return replace(load_config(HardwareConfig(), options.hardware), **given)
+
+
+def _add_faults(verbs: argparse._SubParsersAction) -> None:
+    faults = add_verb(
+        verbs,
+        "faults",
+        _faults,
+        help="fly while messages, clocks and policies fail",
+        description="Flies hundreds of short flights through the bridge while messages are lost, "
+        "late or false, clocks jump or policies fail, and counts which ended safely. Interrupted, "
+        "the same command goes on.",
+        examples=(
+            "hardware faults --set trials=30",
+            "hardware faults --out out/faults_1 --set seed=1",
+        ),
+    )
+    faults.add_argument(
+        "--out", type=Path, default=Path("out/faults"), help="output folder (%(default)s)"
+    )
+    faults.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
+    add_overrides(faults, ("trials=30", "seed=1", "scenario.timeout=20"), _faults_defaults)
+
+
+def _faults_defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.analysis.faults.campaign import FaultsConfig
+
+    return FaultsConfig()
+
+
+def _faults(options: argparse.Namespace) -> None:
+    check_config(options.config)
+    from splatpilot.analysis.faults.campaign import run
+    from splatpilot.systems.common.config import load_config
+
+    config = load_config(_faults_defaults(options), options.config, options.overrides)
+    # Thousands of packets are refused, and policies raise, on purpose.
+    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        run(config=config, out=options.out)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

@@ -1,4 +1,4 @@
-"""The command line. It stands on the top floor because it may reach every other."""
+"""The command line `splatpilot COMMAND ...`."""
 
 import argparse
 import atexit
@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import os
-import platform
 import re
 import shlex
 import signal
@@ -18,52 +17,30 @@ from collections.abc import Collection, Iterator, Sequence
 from types import FrameType
 from typing import Any, NoReturn
 
-from splatpilot.analysis.commands import COMMANDS
+from splatpilot.analysis.commands import COMMANDS, MOVED
 from splatpilot.analysis.commands.options import FailureWithResultError, as_json
 from splatpilot.systems.common.extras import missing_extra
 from splatpilot.systems.common.validation import TYPES, did_you_mean, unknown
 
 
 def raised_by(error: BaseException, packages: Collection[str]) -> str:
-    """
-    The file and line in one of others' `packages` that an exception comes from, if not of ours.
-
-    Args:
-        error: what ended the program.
-        packages: by name, or modules outside of any.
-    """
-    place = ""
+    """Returns the file and line in one of `packages` that raised an exception, if not our code."""
+    raised = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         package = frame.f_globals.get("__name__", "").partition(".")[0]
         if package in packages:
-            place = f"{frame.f_code.co_filename}, line {line}"
+            raised = f"{frame.f_code.co_filename}, line {line}"
         elif package == "splatpilot":
-            place = ""
-    return place
+            raised = ""
+    return raised
 
 
 def write_report(error: BaseException, arguments: Sequence[str]) -> str:
-    """
-    Writes what is needed to find a mistake of this program to a file in the folder for temporary
-    files.
+    """Writes the command and the traceback to a temporary file; returns its path, or the text."""
+    from importlib.metadata import version
 
-    Args:
-        error: what ended the program.
-        arguments: the words after `splatpilot`.
-
-    Returns:
-        The file; or, where none can be written, the report.
-    """
-    from splatpilot.systems.common.provenance import program
-
-    told = [
-        f"splatpilot {shlex.join(arguments)}",
-        *(f"{name} {version}" for name, version in program().items()),
-        f"Python {platform.python_version()} on {platform.platform()}",
-        "",
-        "".join(traceback.format_exception(error)),
-    ]
-    text = "\n".join(told)
+    command = f"splatpilot {version('splatpilot')}: {shlex.join(arguments)}"
+    text = f"{command}\n\n{''.join(traceback.format_exception(error))}"
     try:
         with tempfile.NamedTemporaryFile(
             "w", prefix="splatpilot-", suffix=".txt", delete=False
@@ -75,7 +52,7 @@ def write_report(error: BaseException, arguments: Sequence[str]) -> str:
 
 
 class _PrintVersion(argparse.Action):
-    """Finds the version out only when it is asked for, because that takes as long as the rest."""
+    """Prints the version, which takes as long to find as all else to import."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from splatpilot import __version__
@@ -85,7 +62,7 @@ class _PrintVersion(argparse.Action):
 
 
 class _ImportModule(argparse.Action):
-    """Imports a module before the verb is read, whose help may be of what it registers."""
+    """Imports a module before the command is parsed, whose help may list its entries."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, value: Any, *_: Any
@@ -97,14 +74,17 @@ class _ImportModule(argparse.Action):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Asks, for a word that it does not know, which was meant."""
+    """Parser that suggests similar words for unknown ones."""
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.option_strings or action.choices is None or value in action.choices:
             super()._check_value(action, value)
         else:
             what = str(action.metavar or action.dest).lower()
-            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
+            message = unknown(what, value, action.choices)
+            if value in MOVED and self.prog == "splatpilot":
+                message = f"`splatpilot {value}` is now `splatpilot {MOVED[value]}`"
+            raise argparse.ArgumentError(None, message)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:
@@ -119,7 +99,7 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, args: Any = None, namespace: Any = None
     ) -> Any:
-        # Of a command, here and not in the parser of all commands: this one knows its options.
+        # The parser of the command, not that of all commands, knows the options to suggest.
         options, words = super().parse_known_args(args, namespace)
         if words:
             setting = f"did you mean --set {words[0]}?" if re.match(r"[\w.]+=", words[0]) else ""
@@ -136,7 +116,7 @@ _ENDED = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 13
 
 
 class _EndedError(KeyboardInterrupt):
-    """A signal has come that ends everything."""
+    """A signal that ends the command."""
 
     def __init__(self, number: int):
         super().__init__(number)
@@ -144,13 +124,12 @@ class _EndedError(KeyboardInterrupt):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `splatpilot`, with all verbs."""
+    """Builds the parser of `splatpilot` with all commands."""
     parser = _Parser(
         prog="splatpilot",
         description="Fly drones by camera inside Gaussian-splat worlds.",
-        epilog="exit status: 0 done, 1 an error that one message explains, 2 words that make no "
-        "command, 70 a mistake of the program, which leaves a report, 130 and 143 ended by Ctrl-C "
-        "and SIGTERM",
+        epilog="exit status: 0 done, 1 an error that one message explains, 2 invalid command line, "
+        "70 an internal error, which leaves a report, 130 and 143 ended by Ctrl-C and SIGTERM",
     )
     parser.add_argument(
         "--import",
@@ -170,13 +149,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def run() -> NoReturn:
-    """The command `splatpilot`: `main`, before and after which signals end the process in the same
-    way, but at once."""
+    """Runs `main`; signals before and after it end the process at once, in the same way."""
     heeded = _heeded()
     for number in heeded:
         signal.signal(number, _leave)
-    # Registered first, it is done last: Python then takes modules apart, and answers no signal. To
-    # block them would do for this thread alone.
+    # Registered first, it runs last: Python then unloads modules and must not handle signals.
     atexit.register(_ignore, heeded)
     sys.exit(main())
 
@@ -186,12 +163,10 @@ def main(arguments: list[str] | None = None) -> int:
     Runs `splatpilot COMMAND ...`.
 
     Args:
-        arguments: the words after `splatpilot`; those of the process when None.
+        arguments: the words after `splatpilot`; those of the process if None.
 
     Returns:
-        The exit status: 0; 1 after an error that one line on standard error explains; 70 after a
-        mistake of this program, with a line that says which file has a report of it; 130 and 143
-        after Ctrl-C and SIGTERM.
+        The exit status, see `splatpilot --help`.
     """
     parser = build_parser()
     if "_ARGCOMPLETE" in os.environ:
@@ -215,10 +190,10 @@ def main(arguments: list[str] | None = None) -> int:
                 raise
             print(json.dumps(as_json(result), indent=2))
             return 0
-    except BrokenPipeError:  # who read what is printed has had enough, as `head` does
+    except BrokenPipeError:
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _say("what it prints was not read to its end", 1)
+        return _say("its output was not read to the end", 1)
     except (ValueError, OSError) as error:
         place = _place_of(error)
         return _say(f"{error} ({place})" if place else str(error), 1)
@@ -241,20 +216,17 @@ def main(arguments: list[str] | None = None) -> int:
         kind = type(error).__name__
         if place := _place_of(error):
             return _say(f"{place}: {kind}: {error}; the traceback is in {report}", 1)
-        return _say(f"{verb} met a mistake of the program ({kind}); the report is {report}", 70)
+        return _say(f"internal error in {verb} ({kind}); the report is {report}", 70)
 
 
 def _place_of(error: Exception) -> str:
-    """Where in code of others an exception comes from, if not from ours."""
-    registry = sys.modules.get(
-        "splatpilot.systems.common.registry"
-    )  # else nothing of theirs is there
+    """Returns the file and line in a plugin that raised an exception, if not our code."""
+    registry = sys.modules.get("splatpilot.systems.common.registry")
     return raised_by(error, registry.plugin_packages()) if registry is not None else ""
 
 
 def _heeded() -> list[int]:
-    """The signals that end this process. Whoever started it may have it ignore them, as shells do
-    with what runs behind them."""
+    """Returns the signals that end this process; shells let background processes ignore some."""
     return [number for number in _ENDED if signal.getsignal(number) is not signal.SIG_IGN]
 
 
@@ -264,8 +236,7 @@ def _ignore(numbers: list[int]) -> None:
 
 
 def _imports(frame: FrameType | None) -> bool:
-    """Whether a module is being imported: native ones abort, or say that they cannot be imported,
-    where an exception of others goes through them."""
+    """Returns True while a module is imported: an exception in a native one may abort."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             return True
@@ -274,9 +245,9 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _leave(number: int, frame: FrameType | None) -> NoReturn:
-    """Ends the process at once. What it was writing goes when the next begins in that folder."""
+    """Ends the process at once; the next run in the folder removes its leftovers."""
     message, status = _ENDED[signal.Signals(number)]
-    with contextlib.suppress(RuntimeError, OSError):  # it may be in the midst of printing
+    with contextlib.suppress(RuntimeError, OSError):  # it may be printing
         sys.stdout.flush()
     line = "\n" if _progress_bars() else ""
     os.write(2, f"{line}splatpilot: {message}\n".encode())
@@ -292,18 +263,18 @@ def _say(message: str, status: int) -> int:
 
 
 def _progress_bars() -> list[Any]:
-    """Those of tqdm that are open: they end when somebody lets go of them, which may be later."""
+    """Returns the open progress bars of tqdm."""
     return list(getattr(getattr(sys.modules.get("tqdm"), "tqdm", None), "_instances", ()))
 
 
 def _is_warning(record: logging.LogRecord) -> bool:
-    """A filter in the place of a level, which Drake sets anew when it is imported."""
+    """Filters warnings; Drake resets the level when it is imported."""
     return record.levelno >= logging.WARNING
 
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Within, SIGTERM and Ctrl-C raise `_EndedError`; signals reach the main thread alone."""
+    """Lets SIGTERM and Ctrl-C raise `_EndedError` in the block, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

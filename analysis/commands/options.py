@@ -6,17 +6,12 @@ import math
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import yaml
-
-from splatpilot.analysis.benchmark.study import SCENARIO, Variant, parse_variant
-from splatpilot.diagrams.flight.scenario import benchmark_scenarios, other_scenarios, scenario_file
-from splatpilot.systems.common.config import is_configuration
-from splatpilot.systems.common.field_help import FieldDescription, describe_fields
+from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
+from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
 from splatpilot.systems.common.files import (
     find_data,
     require_corpus,
@@ -44,7 +39,7 @@ class SetField(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         if values == "help":
-            from splatpilot.analysis.commands.options import format_settings
+            from splatpilot.analysis.commands.settings import format_settings  # imports Drake
 
             print(format_settings(self.configuration(namespace)))
             parser.exit()
@@ -394,7 +389,8 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     """
     check_scenario_options(options)
     from splatpilot.diagrams.flight.policies import DEFAULT_SPEED, at_speed
-    from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.diagrams.scenarios import scenario_file
     from splatpilot.diagrams.worlds.world_registry import place_config
     from splatpilot.systems.common.config import load_config
 
@@ -423,50 +419,3 @@ def name_of_flight(options: argparse.Namespace, scenario: "Scenario") -> str:
     variant = None if options.policy is None else parse_variant(options.policy)
     policy = name_of(scenario.policy) if variant is None else variant.label
     return flight_name(Path(place).stem, policy, speed_of(scenario.policy), scenario.seed)
-
-
-def format_settings(config: Any) -> str:
-    """All fields that `--set` takes for a configuration: their names, types, values, and what they
-    are."""
-    width = max(shutil.get_terminal_size().columns - 2, 40)
-    lines = []
-    for name, type_, value, text in _settings(config, ""):
-        lines.append(f"{name}={value}  ({type_})" if value else f"{name}  ({type_})")
-        lines += textwrap.wrap(text, width, initial_indent="    ", subsequent_indent="    ")
-    return "\n".join(lines)
-
-
-def _settings(config: Any, prefix: str) -> Iterator[tuple[str, str, str, str]]:
-    """Name, type, value and text of each field, those of what a field holds behind it."""
-    for field in describe_fields(config):
-        name = prefix + field.name
-        if is_configuration(field.value):
-            yield name, _kinds(field), "", field.text
-            yield from _settings(field.value, f"{name}.")
-        else:
-            yield name, _type_of(config, field), _as_yaml(field.value), field.text
-
-
-def _kinds(field: FieldDescription) -> str:
-    """The tags of what may stand in a field, that of what stands there first."""
-    own = f"!{type(field.value).__name__}"
-    others = field.registry.configs() if field.registry is not None else []
-    tags = [own, *(f"!{config.__name__}" for config in others)]
-    return " or ".join(dict.fromkeys(tags))
-
-
-def _type_of(config: Any, field: FieldDescription) -> str:
-    if field.registry is not None:
-        return f"dictionary of {field.registry.what}s"
-    if dataclasses.is_dataclass(config):
-        types = {each.name: each.type for each in dataclasses.fields(config)}
-        found = types[field.name]
-        return found.__name__ if type(found) is type else str(found)
-    return "number, text or null" if field.value is None else type(field.value).__name__
-
-
-def _as_yaml(value: Any) -> str:
-    """A plain value as `--set` takes it."""
-    plain = value.tolist() if isinstance(value, np.ndarray) else value
-    text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf)
-    return text.removesuffix("...\n").strip()

@@ -27,7 +27,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         "same command goes on.",
         examples=(
             "reconstruct data/hospital --out scenes/hospital",
-            "reconstruct data/office --out scenes/office --set representation=2dgs",
             "reconstruct photos --out scenes/room --set capture.scale.camera_height=1.5",
             "reconstruct warehouse.gltf --up z --out scenes/warehouse",
         ),

@@ -11,7 +11,7 @@ from splatpilot.analysis.commands.options import (
     add_verb,
     find_place,
 )
-from splatpilot.diagrams.flight.scenario import scenario_file
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.systems.common.files import require_unused
 
 

@@ -1,4 +1,4 @@
-"""`splatpilot faults`: many flights with random faults."""
+"""`splatpilot hardware faults`: many flights with random faults."""
 
 import json
 from dataclasses import dataclass, field, replace

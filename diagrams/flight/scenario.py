@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from math import inf
-from pathlib import Path
 
 import numpy as np
 from pydrake.common.schema import Rotation, Transform
@@ -21,7 +20,6 @@ from splatpilot.systems.common.validation import (
     bounded,
     require,
     require_field,
-    unknown,
 )
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
@@ -147,35 +145,3 @@ def _check_simulator(simulator: SimulatorConfig) -> None:
     for name in ("start_time", "target_realtime_rate"):
         value = getattr(simulator, name)
         require(value == 0, f"simulator.{name}", "0", value, "flights start then and do not wait")
-
-
-_FOLDER = Path(__file__).parents[1] / "scenarios"
-
-
-def benchmark_scenarios() -> dict[str, Path]:
-    """Returns the files of the benchmark's scenarios by name."""
-    return _files(_FOLDER)
-
-
-def other_scenarios() -> dict[str, Path]:
-    """Returns the files of the other scenarios of the package by name."""
-    return _files(_FOLDER / "others")
-
-
-def _files(folder: Path) -> dict[str, Path]:
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-
-
-def scenario_file(scenario: str) -> Path:
-    """
-    Returns the file of a scenario, given by its name or as a path.
-
-    Raises:
-        ValueError: for another name.
-    """
-    known = benchmark_scenarios() | other_scenarios()
-    if scenario in known:
-        return known[scenario]
-    if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
-        return Path(scenario)
-    raise ValueError(unknown("scenario", scenario, known, "and others as YAML files"))

@@ -14,7 +14,13 @@ from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
-from splatpilot.systems.common.validation import Config, bounded, require, require_field
+from splatpilot.systems.common.validation import (
+    Config,
+    FieldError,
+    bounded,
+    require,
+    require_field,
+)
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -161,7 +167,10 @@ class VolumeConfig(Config):
     def check(self) -> None:
         area = self.length * self.width
         require(area <= MAX_GROUND, "length * width", f"at most {MAX_GROUND:g} m^2", f"{area:.3g}")
-        grid_shape(self.plan.lower, self.plan.upper, self.voxel_size)
+        try:
+            grid_shape(self.plan.lower, self.plan.upper, self.voxel_size)
+        except ValueError as error:
+            raise FieldError(self, "voxel_size", f"must fit the volume: {error}") from None
 
 
 def require_order(config: object, low: str, high: str) -> None:

@@ -60,8 +60,8 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
     ("Corpora", "Of `splatpilot corpus make`.", [CorpusConfig]),
     (
         "Hardware",
-        "Of `splatpilot bridge` and `vehicle` (`--hardware FILE`), `splatpilot px4` and "
-        "`splatpilot faults`.",
+        "Of `splatpilot hardware`: of `bridge` and `vehicle` (`--hardware FILE`), `px4` and "
+        "`faults`.",
         [HardwareConfig, Px4Config, FaultsConfig],
     ),
 ]

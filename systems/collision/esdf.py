@@ -223,7 +223,7 @@ class Esdf:
             found = "nothing" if array is None else f"{array.dtype} of {array.shape}"
             require(valid, f"{path}: {name}", kind, found)
         version = int(archive["version"])
-        require(version == FORMAT_VERSION, f"{path}: version", FORMAT_VERSION, version)
+        require(version == FORMAT_VERSION, f"{path}: version", str(FORMAT_VERSION), version)
         try:
             return cls(
                 archive["distances"],

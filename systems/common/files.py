@@ -18,8 +18,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from splatpilot.systems.common.config import dump_config, load_config
-
 DATA = "SPLATPILOT_DATA"
 """Environment variable with the folder of captures and meshes."""
 
@@ -147,6 +145,8 @@ def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
         ValueError: if the folder has another configuration, or files without one.
         OSError: if it cannot be written.
     """
+    from splatpilot.systems.common.config import dump_config, load_config  # imports Drake
+
     require_writable_folder(file.parent)
     text = dump_config(config)
     if file.exists() and not overwrite:

@@ -17,7 +17,7 @@ from numpy.polynomial import Polynomial
 from splatpilot.systems.common.validation import Config, bounded, require_field
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 NUM_RADIAL = {"opencv": 6, "fisheye": 4}
 """Largest number of radial coefficients of each model."""
@@ -66,14 +66,14 @@ class Distortion(Config):
         )
         return min(math.tan(widest), math.sqrt(min(_first_root(growth), _first_root(bottom))))
 
-    def project(self, slopes: "NDArray[np.float64]") -> "NDArray[np.float64]":
+    def project(self, slopes: "ArrayLike") -> "NDArray[np.float64]":
         """Projects rays of `slopes` (..., 2) to the image plane (..., 2); NaN beyond `limit`."""
         slopes = np.asarray(slopes, dtype=np.float64)
         return np.where(
             _lengths(slopes)[..., None] < self.limit, self._bent(slopes, self.tangential), np.nan
         )
 
-    def slopes(self, points: "NDArray[np.float64]") -> "NDArray[np.float64]":
+    def slopes(self, points: "ArrayLike") -> "NDArray[np.float64]":
         """Inverts `project`: slopes (..., 2) of rays to `points` (..., 2); NaN without one.
 
         OpenCV's own inverses diverge towards the limit.
@@ -98,7 +98,7 @@ class Distortion(Config):
             rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=2)
             coefficients = np.array([*k[:2], *_padded(tangential, 2), *k[2:]])
             bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
-        return bent.reshape(slopes.shape)
+        return np.asarray(bent, dtype=np.float64).reshape(slopes.shape)
 
     def _radius(self, r: "NDArray[np.float64]") -> "NDArray[np.float64]":
         """Returns r g(r), the image radius without the tangential part."""

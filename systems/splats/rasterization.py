@@ -179,8 +179,10 @@ def _pose_gradient(sums: NDArray[np.float64], X_CW: NDArray[np.float64]) -> NDAr
 
     p_C = R p_W + t, with p_W = d + center; spherical harmonics look from center = -R^-1 t.
     """
+    v_p: NDArray[np.float64] = sums[3]
+    v_direction: NDArray[np.float64] = sums[4]
     R, t = X_CW[:3, :3], X_CW[:3, 3]
-    v_t = sums[3] + np.linalg.solve(R.T, sums[4])
+    v_t = v_p + np.linalg.solve(R.T, v_direction)
     return np.column_stack([sums[:3] - np.outer(v_t, np.linalg.solve(R, t)), v_t])
 
 

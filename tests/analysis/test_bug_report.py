@@ -36,12 +36,9 @@ def test_mistakes_of_the_program_leave_a_report(failing, tmp_path, capsys):
     assert main(["fly"]) == 70
     said = capsys.readouterr().err
     [report] = tmp_path.iterdir()
-    assert said == (
-        f"splatpilot: fly met a mistake of the program (KeyError); the report is {report}\n"
-    )
+    assert said == (f"splatpilot: internal error in fly (KeyError); the report is {report}\n")
     text = report.read_text()
     assert "splatpilot fly" in text and "Traceback" in text and "of our own" in text
-    assert "numpy " in text and "Python " in text
 
 
 def test_mistakes_of_imported_modules_are_theirs(failing, tmp_path, monkeypatch, capsys):
@@ -69,7 +66,7 @@ def test_mistakes_of_imported_modules_are_theirs(failing, tmp_path, monkeypatch,
         (MemoryError(), "needs more memory than there is; make"),
         (OverflowError("too large for C long"), "a number given to fly is too large (too large"),
         (ValueError("first\n  second"), "splatpilot: first second"),
-        (BrokenPipeError(), "was not read to its end"),
+        (BrokenPipeError(), "was not read to the end"),
         (KeyboardInterrupt(), "splatpilot: interrupted"),
     ],
 )

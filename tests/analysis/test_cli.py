@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.analysis import places
+from splatpilot.analysis import scenes
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
@@ -87,14 +87,14 @@ def test_written_scenario_gives_the_same_flight_again(tmp_path):
         ("fly --policy nobody.npz", 1),
         ("fly --scenario P99", 1),
         ("fly --scene nowhere", 1),
-        ("bridge --hardware nowhere.yaml", 1),
+        ("hardware bridge --hardware nowhere.yaml", 1),
         ("benchmark --out study --policies planner,nobody", 1),
         ("benchmark --out study --scenarios P02,nowhere.yaml", 1),
         ("replay nowhere id", 1),
         ("reconstruct nowhere --out scene", 1),
         ("capture check nowhere", 1),
         ("capture render nowhere.gltf --out capture", 1),
-        ("measure nowhere", 1),
+        ("scene measure nowhere", 1),
         ("train nobody --out run", 1),
         ("corpus inspect nowhere --out sheet.png", 1),
     ],
@@ -126,11 +126,11 @@ def test_help_and_what_is_not_there_import_nothing_heavy(words, status, tmp_path
         "train diffaero --out run",
         "recover student_rgb --out run",
         "corpus make --out corpus --worlds 2",
-        "places forest_splat --out scenes",
+        "scene fetch forest_splat --out scenes",
         "reconstruct . --out scene",
-        "ablate . --out study",
-        "fidelity . --out study",
-        "measure .",
+        "scene ablate . --out study",
+        "scene fidelity . --out study",
+        "scene measure .",
         "capture check .",
         "capture render P02 --out capture",
         "benchmark --out study --quick",
@@ -253,7 +253,7 @@ def test_scene_of_another_unit_is_refused(tmp_path, capsys):
     means = generator.uniform(0, 2e4, scene.means.shape).astype(np.float32)
     write_ply(dataclasses.replace(scene, means=means), ply)
     error = fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
-    assert "give it its size with `splatpilot scale`" in error
+    assert "give it its size with `splatpilot scene scale`" in error
 
 
 def test_foreign_scene_is_refused(tmp_path, capsys):
@@ -424,8 +424,8 @@ def test_an_interruption_says_what_is_kept(tmp_path, capsys, monkeypatch):
         with resumable(lambda: "one scene is in scenes; the same command resumes"):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(places, "run", interrupted)
-    assert main(["places", "forest_splat", "--out", str(tmp_path)]) == 130
+    monkeypatch.setattr(scenes, "run", interrupted)
+    assert main(["scene", "fetch", "forest_splat", "--out", str(tmp_path)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "splatpilot: interrupted; one scene is in scenes; the same command resumes"
 

@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 
 from splatpilot.analysis import doctor
-from splatpilot.diagrams.flight.scenario import benchmark_scenarios
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common import extras as opengl
 from splatpilot.systems.common.extras import packages_of_extras
 from splatpilot.systems.messaging import lcm_ports as open_lcm

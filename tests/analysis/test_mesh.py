@@ -1,4 +1,4 @@
-"""`splatpilot mesh`: places as meshes."""
+"""`splatpilot scene mesh`: places as meshes."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_a_place_becomes_a_mesh(kind, world, tmp_path, capsys):
     else:
         (tmp_path / "small.yaml").write_text("world: {length: 9, width: 6}\n")
         words = [str(tmp_path / "small.yaml"), "--seed", "0"]
-    assert main(["mesh", *words, "--out", str(out)]) == 0
+    assert main(["scene", "mesh", *words, "--out", str(out)]) == 0
     mesh = trimesh.load(out, force="mesh")
     assert mesh.is_watertight
     assert f"{len(mesh.faces)} triangles" in capsys.readouterr().out
@@ -59,6 +59,6 @@ def test_what_cannot_be_a_mesh_is_said(words, message, world, tmp_path, capsys, 
     (tmp_path / "capture").mkdir()
     (tmp_path / "there.obj").write_text("mine")
     write_scene_folder(tmp_path / "scene", world, provenance="")
-    assert main(["mesh", *words]) == 1
+    assert main(["scene", "mesh", *words]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "a.obj").exists() and (tmp_path / "there.obj").read_text() == "mine"

@@ -3,7 +3,8 @@ import trimesh
 
 from splatpilot.analysis import scenes
 from splatpilot.analysis.scenes import BENCHMARK_SCENES, RECIPES, Recipe, default_config
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, other_scenarios
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_metadata
 from splatpilot.systems.common.config import load_config
 

@@ -15,7 +15,8 @@ from pydrake.math import RigidTransform
 from splatpilot.analysis import view
 from splatpilot.analysis import view as shown_place
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds import octomap_world
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata, write_scene_metadata
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -80,7 +81,7 @@ def test_scene_with_its_capture(place, of_room):
     np.testing.assert_allclose(poses, truth, atol=1e-9)
     assert len(data["cameras"]["images"]) == len(data["cameras"]["names"]) == 16
     assert data["cameras"]["fov_y"] == pytest.approx(2 * np.degrees(np.arctan(24 / 32)))
-    assert data["scale_command"].startswith(f"splatpilot scale {scene} --out ")
+    assert data["scale_command"].startswith(f"splatpilot scene scale {scene} --out ")
     assert data["size"].startswith("6 x 3 x 2.5 m")
 
 

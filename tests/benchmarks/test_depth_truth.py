@@ -7,7 +7,8 @@ from depth_errors import DepthErrors, depth_errors
 from pydrake.math import RigidTransform
 from true_depth import TrueDepth, frames_along_flight, ghosts_along_flight
 
-from splatpilot.diagrams.flight.scenario import Scenario, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.common.config import load_config

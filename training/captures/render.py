@@ -28,7 +28,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.feasibility import grid_graph
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf

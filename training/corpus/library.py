@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.diagrams.flight.scenario import Scenario, benchmark_scenarios, scenario_file
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
@@ -213,7 +214,7 @@ class LibraryConfig:
     # part.
     kinds: list[str] = field(default_factory=lambda: [*PROCEDURAL, *ROUNDABOUT])
     # Scene folders, each with other obstacles, start and goal every time its turn comes. Of split
-    # train, or validation if held out; each with its fidelity bound (`splatpilot fidelity`).
+    # train, or validation if held out; each with its fidelity bound (`splatpilot scene fidelity`).
     scenes: list[str] = field(default_factory=list)
     # Whether the seeds are those of validation instead of training.
     held_out: bool = False
@@ -269,7 +270,7 @@ def _measured_scene(library: LibraryConfig, scene: str) -> tuple[float, list[str
     if metadata.perturbation_bound is None:
         raise ValueError(
             f"{folder / 'scene.yaml'} does not say how far from the capture its images can be "
-            f"trusted (perturbation_bound); measure it with `splatpilot fidelity {folder}`"
+            f"trusted (perturbation_bound); measure it with `splatpilot scene fidelity {folder}`"
         )
     return metadata.perturbation_bound, metadata.source_digest
 

@@ -95,7 +95,7 @@ class Trainer:
     """Name of the policy, and of its file of weights."""
     spec: Any
     """Architecture of the network, a dataclass, see `PolicyCheckpoint`."""
-    network: torch.nn.Module
+    network: Any  # torch.nn.Module
     generator: torch.Generator
     """Source of all random numbers of the losses."""
     learns_from: str = ""

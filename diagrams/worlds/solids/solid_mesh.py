@@ -135,7 +135,7 @@ def _paint(tile: _Tile, spec: WorldSpec, light: Illumination) -> NDArray[np.uint
     q, n, _ = tile.face.at(at(columns, rows))
     falls = light.irradiance(q, n).astype(np.float32).reshape(coarse[1], coarse[0], 3)
     falls = np.asarray(cv2.resize(falls, (width, height)), dtype=np.float32).reshape(-1, 3)
-    colors = shade(albedo, falls, light.haze, spec.plot.outside(p))
+    colors = shade(albedo, falls, light.haze, spec.plan.outside(p))
     return np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8).reshape(height, width, 3)
 
 

@@ -50,7 +50,7 @@ def draw(spec: WorldSpec, solids: list[Solid], light: Illumination) -> GaussianS
     seen = _is_seen(spec, surfels)
     surfels, albedo, opacity = surfels[seen], np.clip(albedo[seen], 0, 1), opacity[seen]
     irradiance = light.irradiance(surfels.p, surfels.n)
-    colors = shade(albedo, irradiance, light.haze, spec.plot.outside(surfels.p))
+    colors = shade(albedo, irradiance, light.haze, spec.plan.outside(surfels.p))
     return to_gaussians(surfels, colors, opacity)
 
 
@@ -68,7 +68,7 @@ def _patches(
             uv, extent = _spiral(face, material.spacing, rng)
         else:
             uv, extent = _lattice(face, material.spacing, rng)
-        facing = spec.plot.is_faced(*face.at(uv)[:2])
+        facing = spec.plan.is_faced(*face.at(uv)[:2])
         if not facing.any():
             continue
         uv, extent = uv[facing], extent[facing]
@@ -186,7 +186,7 @@ def _ground(
     corner = spec.lower_W[:2] - GROUND_REACH
     uv, extent = [], []
     coarser = 1.0, 2.0, 4.0, 7.0, 12.0
-    rings = ground_rings(spec.plot, [times * spacing for times in coarser], rng)
+    rings = ground_rings(spec.plan, [times * spacing for times in coarser], rng)
     for times, p in zip(coarser, rings, strict=True):
         uv.append(p - corner)
         extent.append(COVERAGE * times * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
@@ -195,7 +195,7 @@ def _ground(
 
 def _is_seen(spec: WorldSpec, surfels: Surfels) -> NDArray[np.bool_]:
     """Whether a patch faces the volume and lies in no other solid."""
-    seen = spec.plot.is_faced(surfels.p, surfels.n)
+    seen = spec.plan.is_faced(surfels.p, surfels.n)
     field = AnalyticDistanceField(
         [solid.shape for solid in spec.solids],
         spec.lower_W - 40.0,

@@ -25,8 +25,6 @@ ROWS = [
 
 
 def test_published_figures_stand_before_our_own():
-    """Of a scenario of others, what they published comes first, and then each policy and speed of
-    the study; its other scenarios are left out."""
     table = external_table(ROWS, CONFIG)
     assert {row["scenario"] for row in table} == {"dodgedrone_medium"}
     *published, slow, fast = table
@@ -42,7 +40,6 @@ def test_published_figures_stand_before_our_own():
 
 
 def test_only_scenarios_as_they_are_are_compared():
-    """A study of other scenarios, or with overrides, has no such table."""
     assert external_table(ROWS, StudyConfig(scenarios=["P01"], policies=["straight"])) == []
     CONFIG_CHANGED = StudyConfig(**(vars(CONFIG) | {"overrides": ["timeout=100"]}))
     assert external_table(ROWS, CONFIG_CHANGED) == []
@@ -50,8 +47,6 @@ def test_only_scenarios_as_they_are_are_compared():
 
 
 def test_one_command_flies_the_challenge(monkeypatch, tmp_path):
-    """`benchmark --dodgedrone` flies all policies through all levels at 2, 3, 5 and 7 m/s, and
-    fewer where fewer are named."""
     studies = []
     monkeypatch.setattr(benchmark, "run", lambda *, config, **_: studies.append(config))
     command = ["benchmark", "--dodgedrone", "--out", str(tmp_path)]
@@ -66,6 +61,5 @@ def test_one_command_flies_the_challenge(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("policy", BENCHMARK_POLICIES)
 def test_all_policies_fly_at_its_speeds(policy):
-    """None refuses a speed of the table."""
     for speed in DODGEDRONE_SPEEDS:
         policy_named(policy, speed)

@@ -24,7 +24,6 @@ def straight_flight(outcome=Outcome.GOAL, clearance=0.5) -> Flight:
 
 
 def test_success_needs_goal_and_clearance():
-    """Arriving with a negative clearance, and any other end, is no success."""
     assert flight_metrics(straight_flight(), 6.0)["success"]
     assert not flight_metrics(straight_flight(clearance=-0.001), 6.0)["success"]
     for outcome in (Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME):
@@ -34,7 +33,6 @@ def test_success_needs_goal_and_clearance():
 
 
 def test_figures_of_a_straight_flight():
-    """Speed, length and excess are those of the line; constant velocity has no jerk."""
     measures = flight_metrics(straight_flight(), shortest=5.0)
     assert measures["path_length_m"] == pytest.approx(6.014)
     assert measures["mean_speed_m_s"] == pytest.approx(2.0)
@@ -43,9 +41,6 @@ def test_figures_of_a_straight_flight():
 
 
 def test_jerk_of_a_sine():
-    """v = A sin(w t) has the root mean square jerk A w² / sqrt 2 over whole periods, and the
-    smoothness that follows from it; the irregular last sample is left out.
-    """
     amplitude, w = 2.0, np.pi / 2
     times = np.append(np.arange(0, 801) * 0.02, 16.013)  # Four periods.
     velocities = np.zeros((802, 3))
@@ -57,9 +52,6 @@ def test_jerk_of_a_sine():
 
 
 def test_shortest_way_goes_round_a_post():
-    """The grid's shortest way past the post is the tangent path round a circle of its radius and
-    the vehicle's, within a voxel, less the goal's radius.
-    """
     post = Cylinder(p_WA=[5.0, 0.0, -2.0], p_WB=[5.0, 0.0, 6.0], radius=0.5)
     exact = AnalyticDistanceField([post], [0.0, -3.0, 0.0], [10.0, 3.0, 4.0])
     field = esdf_from_distance_field(exact, 0.1).conservative()

@@ -52,8 +52,6 @@ def package(tmp_path, monkeypatch):
 
 
 def test_a_study_is_flown_by_one_version_of_the_code_of_others(package, tmp_path, capsys):
-    """Their source, whichever of a package's files it stands in, is part of a study: changed since,
-    it does not fly what is missing, and a replay says so."""
     (tmp_path / "short.yaml").write_text(
         "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
         "timeout: 0.4\n"
@@ -83,5 +81,4 @@ def test_a_study_is_flown_by_one_version_of_the_code_of_others(package, tmp_path
 
 
 def test_our_own_code_is_the_program():
-    """It has its revision already."""
     assert foreign_code([Scenario()]) == {}

@@ -13,9 +13,6 @@ from splatpilot.analysis.commands.main import main
 
 
 def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
-    """From a copy of the folder elsewhere a flight replays to the last bit, and a record that was
-    changed by a millimetre does not agree.
-    """
     config, whole = study
     copy = tmp_path / "elsewhere"
     shutil.copytree(whole, copy)

@@ -17,9 +17,8 @@ RENDER = "got a mesh; render a capture of it with `splatpilot capture render roo
         ("fly --scene room.gltf", RENDER),
         ("fly --scene fast.yaml", "got a scenario; fly it with `splatpilot fly --scenario fast.y"),
         ("view room.gltf", RENDER),
-        ("reconstruct room.gltf --out out", RENDER),
         ("reconstruct scene --out out", "got a scene folder; fly in it with `splatpilot fly --sce"),
-        ("mesh room.gltf --out out", RENDER),
+        ("scene mesh room.gltf --out out", RENDER),
     ],
 )
 def test_another_kind_of_file_is_named_with_what_to_do_with_it(

@@ -11,11 +11,11 @@ SHORT = ["--set", "world.length=10", "--set", "world.width=6"]
     ("words", "there"),
     [
         (["reconstruct", "capture", "--out", "scene"], "scene/views.png"),
-        (["measure", "scene"], "scene/metrics.json"),
+        (["scene", "measure", "scene"], "scene/metrics.json"),
         (["view", "scene", "--out", "mine"], "mine"),
         (["view", "P02", "--seed", "3"], "out/view/P02-003.html"),
-        (["bridge", "--log", "mine", *SHORT], "mine"),
-        (["vehicle", "--out", "mine", *SHORT], "mine"),
+        (["hardware", "bridge", "--log", "mine", *SHORT], "mine"),
+        (["hardware", "vehicle", "--out", "mine", *SHORT], "mine"),
         (["fly", "--graphviz", "mine", *SHORT], "mine"),
         (["corpus", "inspect", "scene", "--out", "mine"], "mine"),
     ],
@@ -31,7 +31,7 @@ def test_what_is_there_stays(words, there, place, monkeypatch, capsys):
         file.write_text("mine")
     before = file.read_bytes()
     assert main(words) == 1
-    said = "is there already; name another, or replace it with --overwrite"
+    said = "is there already; choose another, or replace it with --overwrite"
     assert said in capsys.readouterr().err
     assert file.read_bytes() == before
 
@@ -41,7 +41,7 @@ def test_told_to_it_is_replaced(place, monkeypatch, capsys):
     monkeypatch.chdir(place.folder)
     place.scene("scene")
     for file, words in {
-        "scene/metrics.json": ["measure", "scene"],
+        "scene/metrics.json": ["scene", "measure", "scene"],
         "page.html": ["view", "scene", "--out", "page.html"],
     }.items():
         (place.folder / file).write_text("old")

@@ -183,7 +183,7 @@ def test_a_state_that_freezes_while_images_are_lost_ends_in_no_accident(setpoint
 def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
     settings = ["world.length=12.0", "world.width=6.0", "start_radius=0.05"]
     sets = [word for setting in settings for word in ("--set", f"scenario.{setting}")]
-    words = ["faults", "--set", "trials=2", "--set", "worlds=1", *sets]
+    words = ["hardware", "faults", "--set", "trials=2", "--set", "worlds=1", *sets]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0
     rows = (tmp_path / "whole" / "trials.jsonl").read_text().splitlines(keepends=True)
     assert len(rows) == 2 and all(json.loads(row)["safe"] for row in rows)

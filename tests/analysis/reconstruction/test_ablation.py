@@ -19,12 +19,12 @@ SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=
 
 def ablate(place, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
-    return main(["ablate", *captures, "--out", str(place.folder / "out"), *settings, *words])
+    return main(
+        ["scene", "ablate", *captures, "--out", str(place.folder / "out"), *settings, *words]
+    )
 
 
 def test_ablation_end_to_end(place, capsys, monkeypatch):
-    """Eight arms are made and measured on held-out frames, the paper's table is beside ours, and a
-    second run makes nothing again."""
     assert ablate(place) == 0
     printed = capsys.readouterr().out
     assert "paper    3DGS + depth term" in printed
@@ -60,8 +60,6 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
 
 
 def test_studies_are_not_mixed(place, monkeypatch, capsys):
-    """The folder of a study of other settings, or of other captures, is refused and stays as it is;
-    with --overwrite all arms are made anew."""
 
     def make(capture, scene, config):
         place.scene(f"out/room/{scene.name}")
@@ -124,7 +122,6 @@ def measures(psnr: float, mae: float, share: float) -> SceneMetrics:
 
 
 def test_means_and_spreads():
-    """Over several captures come means with the sample standard deviation, and what depth did."""
     one = {arm.key: measures(30, 1.0, 0.1) for arm in ARMS}
     one["3dgs_depth_term"] = measures(29.75, 0.1, 0.005)
     two = {arm.key: measures(34, 3.0, 0.3) for arm in ARMS}
@@ -159,13 +156,11 @@ def test_means_and_spreads():
     ],
 )
 def test_bad_settings(place, capsys, setting, message):
-    """Without held-out frames or steps there is nothing to compare."""
-    assert main(["ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
+    assert main(["scene", "ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 
 def test_two_captures_of_one_name(place, capsys):
-    """Two captures of one name would overwrite each other; a scene stands for its capture."""
     for other in ("room", str(place.scene("scene"))):
-        assert main(["ablate", "room", other, "--out", str(place.folder / "out")]) == 1
+        assert main(["scene", "ablate", "room", other, "--out", str(place.folder / "out")]) == 1
         assert "two captures are called room" in capsys.readouterr().err

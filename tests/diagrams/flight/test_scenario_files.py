@@ -2,12 +2,8 @@
 
 import pytest
 
-from splatpilot.diagrams.flight.scenario import (
-    Scenario,
-    benchmark_scenarios,
-    other_scenarios,
-    scenario_file,
-)
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
 
 

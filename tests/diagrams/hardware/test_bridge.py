@@ -36,10 +36,12 @@ def test_three_processes_fly(udp_url, tmp_path):
     logger = subprocess.Popen(
         [Path(lcm.LCM_BIN_DIR) / "lcm-logger", "--quiet", f"--lcm-url={udp_url}", log]
     )
-    flies = subprocess.Popen([SPLATPILOT, "vehicle", "--out", tmp_path / "vehicle", *words])
+    flies = subprocess.Popen(
+        [SPLATPILOT, "hardware", "vehicle", f"--out={tmp_path}/vehicle", *words]
+    )
     try:
         ended = subprocess.run(
-            [SPLATPILOT, "bridge", *words], capture_output=True, text=True, timeout=240
+            [SPLATPILOT, "hardware", "bridge", *words], capture_output=True, text=True, timeout=240
         )
         assert flies.wait(60) == 0
     finally:

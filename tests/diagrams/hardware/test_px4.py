@@ -1,4 +1,4 @@
-"""`splatpilot px4`, before anything flies."""
+"""`splatpilot hardware px4`, before anything flies."""
 
 import re
 
@@ -37,7 +37,7 @@ def test_it_counts_how_long_there_is_no_heartbeat(udp_url, capsys, monkeypatch):
     ],
 )
 def test_bad_input_is_an_error_before_anything_is_sent(words, why, capsys):
-    assert main(["px4", *words]) == 1
+    assert main(["hardware", "px4", *words]) == 1
     assert why in capsys.readouterr().err
 
 

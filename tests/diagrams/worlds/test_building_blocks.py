@@ -1,16 +1,13 @@
 """What procedural worlds are put together from."""
 
 import numpy as np
-import pytest
 
 from splatpilot.diagrams.worlds.building_blocks import (
-    check_size,
     hall,
     roof,
     signs_in,
     start_and_goal,
 )
-from splatpilot.diagrams.worlds.indoor import RoomConfig
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 
@@ -50,12 +47,3 @@ def test_start_and_goal_are_at_the_ends_and_at_the_heights_asked_for():
     np.testing.assert_allclose(ends[..., 0], np.tile((1.5, 10.5), (50, 1)))
     assert np.abs(ends[..., 1]).max() < 4 and np.ptp(ends[..., 1]) > 2
     assert ends[..., 2].min() >= 0.5 and ends[..., 2].max() <= 0.7
-
-
-@pytest.mark.parametrize("name", ["length", "width", "height"])
-def test_a_volume_too_small_along_one_axis_is_refused(name):
-    """The least sizes are enough; a centimetre less along any axis is refused with what is."""
-    least = {"length": 6.0, "width": 4.0, "height": 3.0}
-    check_size(RoomConfig(**least), "field", **least)
-    with pytest.raises(ValueError, match=r"a field of .* too small; at least 6 x 4 x 3 m are need"):
-        check_size(RoomConfig(**{**least, name: least[name] - 0.01}), "field", **least)

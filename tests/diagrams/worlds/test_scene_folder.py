@@ -130,7 +130,7 @@ def test_an_environment_is_kept(tmp_path, world):
     np.testing.assert_allclose(back.texels, texels, atol=0.5 / 255 + 1e-6)
     assert metadata.background == pytest.approx(mean_color(sky.background))
     (folder / "environment.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"environment\.png: there is no such file"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*environment\.png"):
         read_scene(folder)
     write_scene_folder(folder, world, provenance="")
     assert read_scene(folder).background == world.background
@@ -184,7 +184,7 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
     folder.mkdir()
     (folder / "photo.jpg").write_bytes(b"x")
     for target in (folder, folder / "photo.jpg"):
-        with pytest.raises(ValueError, match="exists and is no scene"):
+        with pytest.raises(ValueError, match="scene folder must be new, empty or a scene"):
             write_scene_folder(target, world, provenance="")
     assert (folder / "photo.jpg").read_bytes() == b"x"
     empty = tmp_path / "empty"
@@ -211,7 +211,7 @@ def test_missing_file(tmp_path, world, missing):
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     (folder / missing).unlink()
-    with pytest.raises(FileNotFoundError, match=rf"{missing}: does not exist; a scene is"):
+    with pytest.raises(FileNotFoundError, match=rf"No such file: .*{missing}"):
         read_scene(folder)
 
 
@@ -219,25 +219,25 @@ def test_missing_scene(tmp_path):
     """A path with nothing there is refused."""
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_scene(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match="nowhere: does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*nowhere"):
         read_scene_folder(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("metric: true", "metric: false", "scale of this scene is unknown"),
+        ("metric: true", "metric: false", "metric must be true to fly, got false"),
         ("metric: true", "metrik: true", "metrik"),
-        ("format_version: 2", "format_version: 3", "format version 3, this program knows 2"),
-        ("format_version: 2", "format_version: 1", "had no background .*; reconstruct the scene"),
-        ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS is .*three finite numbers"),
-        ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG is .*three finite numbers"),
-        ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS is \[\]"),
+        ("format_version: 2", "format_version: 3", "format_version must be 2, got 3"),
+        ("format_version: 2", "format_version: 1", "format_version must be 2, got 1; reconstruct"),
+        ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS must be three finite numbers, got"),
+        ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG must be in .* got .*nan"),
+        ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS must be .* got \[\]"),
         ("vignetting: 0.0", "vignetting: dark", "dark"),
         ("metric: true", "metric: [", r"line 9: expected"),
-        ("representation: 3dgs", "representation: nerf", "representation is 'nerf', it must be"),
-        ("held_out: []", "held_out: [-1]", r"held_out \[-1\]; neither may be negative"),
-        ("image_width: 0", "perturbation_bound: -0.5", r"perturbation_bound is -0\.5"),
+        ("representation: 3dgs", "representation: nerf", "representation must be .* got nerf"),
+        ("held_out: []", "held_out: [-1]", r"held_out must be .* got \[-1\]"),
+        ("image_width: 0", "perturbation_bound: -0.5", r"perturbation_bound must be .* got -0\.5"),
     ],
 )
 def test_bad_metadata(tmp_path, world, old, new, message):
@@ -280,8 +280,8 @@ def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("world_frame: z up", "world_frame: y up", "world_frame is 'y up', it must be 'z up'"),
-        ("background: [", "background: [7.0, -1.0, 0.5] #", "background is .*0 to 1 is needed"),
+        ("world_frame: z up", "world_frame: y up", "world_frame must be in {z up}, got y up"),
+        ("background: [", "background: [7.0, -1.0, 0.5] #", "background must be in .* got"),
         ("lower_W: [", "lower_W: [-99.0, -99.0, -99.0] #", "files are of different scenes"),
     ],
 )

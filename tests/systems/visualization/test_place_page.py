@@ -58,7 +58,7 @@ def room(**said) -> ShownPlace:
         "height": 2.0,
         "field": esdf_from_occupancy(occupied, unknown, np.zeros(3), 0.1),
         "images": images,
-        "scale_command": "splatpilot scale room --out room-scaled",
+        "scale_command": "splatpilot scene scale room --out room-scaled",
     } | said
     return ShownPlace(name="room", **fields)
 
@@ -111,7 +111,7 @@ def test_ruler_measures_the_room(open_page):
     assert page.run("() => view.ruler.length") == pytest.approx(true, abs=0.03)
     assert page.tab.inner_text("#view-label") == f"{np.linalg.norm(points[1] - points[0]):.2f} m"
     said = page.tab.text_content("#view-result")
-    assert "splatpilot scale room --out room-scaled --between " in said
+    assert "splatpilot scene scale room --out room-scaled --between " in said
     x, y = pixels_of(page, [[7.5, 3.0, 0.0]])[0]
     page.tab.mouse.click(x, y)
     assert "No surface is there" in page.tab.text_content("#view-result")

@@ -33,7 +33,7 @@ def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
 
 
 def test_path_names_the_room_there_is(divided_hall):
-    with pytest.raises(ValueError, match=r"largest clearance .* 9.0 m is asked for"):
+    with pytest.raises(ValueError, match=r"largest clearance .* 9.0 m is required"):
         visiting_path(divided_hall, LOWER_W, UPPER_W, 9.0, 2.0)
 
 

@@ -154,7 +154,7 @@ def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
         load_depth=lambda i: depths[i].depth.astype(np.float32),
     )
     report = check_capture(capture)
-    assert "colour and depth are not registered" in report.mistake
+    assert "color and depth are not registered" in report.mistake
     assert report.color is not None
     assert report.color.focal_length == pytest.approx(110, rel=0.02)
     np.testing.assert_allclose(report.color.p_DC, p_DC[:2], atol=0.015)
@@ -229,7 +229,7 @@ def test_command(tmp_path, write_room, capsys):
     assert "quaternions are w x y z, read as x y z w" in captured.err
     assert captured.out.rstrip().endswith("does not agree")
     assert main(["capture", "check", str(path), "--set", "pairs=0"]) == 1
-    assert "pairs is 0" in capsys.readouterr().err
+    assert "pairs must be in [1, 1000], got 0" in capsys.readouterr().err
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
@@ -239,7 +239,7 @@ def test_command(tmp_path, write_room, capsys):
         ("tartanair/hospital", [], (0.0005, 0.001), ""),
         ("redkitchen", [], (0.002, 0.01), ""),
         ("redkitchen", ["intrinsics=[585, 585, 320, 240]", "p_DC=[0, 0, 0]"], (0.002, 0.01),
-         r"not registered: a colour camera of focal length 52\d px at \(\+0\.0[12]"),
+         r"not registered: a color camera of focal length 52\d px at \(\+0\.0[12]"),
     ],
 )  # fmt: skip
 def test_real_captures(name, overrides, error, mistake):

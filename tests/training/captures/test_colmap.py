@@ -107,7 +107,9 @@ def test_ground_that_cameras_contradict(model, turn):
         return dataclasses.replace(level, points=SfmPoints(p_WQ, np.zeros((500, 3))))
 
     assert camera_height(over_slope(5, 2.0)) == pytest.approx(2.0, rel=0.05)
-    with pytest.raises(ValueError, match=r"castle: what looks .* tilts by (19|20|21) degrees"):
+    with pytest.raises(
+        ValueError, match=r"castle: the most likely ground tilts by (19|20|21) degrees"
+    ):
         camera_height(over_slope(20, 2.0))
 
 
@@ -235,12 +237,12 @@ def test_image_name_that_means_several_is_refused(rig):
             ScaleConfig(between=["00.png", "xx.png"], distance=1),
             "no registered image is called 'xx.png'",
         ),
-        (ScaleConfig(between=["00.png", "00.png"], distance=1), "are the same place"),
+        (ScaleConfig(between=["00.png", "00.png"], distance=1), "are the same point"),
         (ScaleConfig(between=["00.png@900,1", "00.png"], distance=1), "no registered point within"),
         (ScaleConfig(between=["00.png@9", "00.png"], distance=1), "does not end in a pixel"),
-        (ScaleConfig(between=["00.png", "01.png"]), "belong together"),
-        (ScaleConfig(camera_height=1, factor=1), "given 2 times, by scale.factor and scale.cam"),
-        (ScaleConfig(camera_height=-1), "camera_height is -1; more than 0"),
+        (ScaleConfig(between=["00.png", "01.png"]), "scale.between and scale.distance must be two"),
+        (ScaleConfig(camera_height=1, factor=1), "given once, got scale.factor and scale.cam"),
+        (ScaleConfig(camera_height=-1), "camera_height must be in \\[0, inf\\) m, got -1"),
         (ScaleConfig(depth_folder="nothing"), "0 points have a measured depth"),
     ],
 )
@@ -296,16 +298,6 @@ def test_image_name_that_is_no_text(model):
     listed.write_bytes(listed.read_bytes().replace(b"03.png", b"\xb5.png"))
     with pytest.raises(ValueError, match=r"sparse/0: not a readable COLMAP model \(.*utf-8"):
         read_capture(model)
-
-
-def test_image_name_that_no_file_system_takes(model):
-    reconstruction = pycolmap.Reconstruction(model / "sparse" / "0")
-    for image in list(reconstruction.images.values())[:-1]:
-        image.name = "n" * 5000
-    reconstruction.write(model / "sparse" / "0")
-    with pytest.raises(ValueError, match="File name too long") as caught:
-        read_capture(model)
-    assert len(str(caught.value)) < 1000
 
 
 def test_registered_photographs_are_not_registered_again(tmp_path, K, room_views):

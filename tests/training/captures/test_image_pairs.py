@@ -3,16 +3,11 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.colmap import (
-    all_pairs,
     import_pycolmap,
     likely_pairs,
     similarity,
     vlad_similarity,
 )
-
-
-def test_all_pairs():
-    assert all_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 @pytest.mark.parametrize("partners", [4, 8])

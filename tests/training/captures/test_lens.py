@@ -1,29 +1,31 @@
-import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.capture import Lens, common_pinhole, pinhole, polynomial_lens
+from splatpilot.training.captures.capture import (
+    Lens,
+    common_pinhole,
+    fisheye_lens,
+    opencv_lens,
+    pinhole,
+)
 
 K = pinhole(46.0, 46.0, 32.0, 24.0)
 RAYS = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
 
 
-def test_polynomial_of_three_terms_is_opencvs():
-    lens = polynomial_lens(K, 64, 48, [0.1, -0.2, 0.05], [0.01, -0.02])
-    points = np.column_stack([RAYS, np.ones(50)])
-    k1_k2_p1_p2_k3 = np.array([0.1, -0.2, 0.01, -0.02, 0.05])
-    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, k1_k2_p1_p2_k3)
-    np.testing.assert_allclose(lens.pixels(RAYS), expected[:, 0], atol=1e-9)
-
-
-def test_fourth_term_is_that_of_the_eighth_power():
-    lens = polynomial_lens(K, 64, 48, [0.02, -0.01, 0.005, 0.12], [0, 0])
+def test_fourth_radial_term_is_of_the_eighth_power():
+    lens = opencv_lens(K, 64, 48, [0.02, -0.01, 0, 0, 0.005], k4=0.12)
     r2 = (RAYS**2).sum(axis=1, keepdims=True)
     stretch = 1 + 0.02 * r2 - 0.01 * r2**2 + 0.005 * r2**3 + 0.12 * r2**4
     np.testing.assert_allclose(lens.pixels(RAYS), 46 * stretch * RAYS + [32, 24], atol=1e-9)
-    np.testing.assert_allclose(
-        lens.pixels(np.array([[-0.685, -0.511]])), [[-0.93, -0.56]], atol=0.02
-    )
+
+
+def test_fisheye_is_that_of_kannala_and_brandt():
+    lens = fisheye_lens(K, 64, 48, [0.1, -0.02, 0.003, 0.001])
+    r = np.linalg.norm(RAYS, axis=1, keepdims=True)
+    theta = np.arctan(r)
+    k = 1 + 0.1 * theta**2 - 0.02 * theta**4 + 0.003 * theta**6 + 0.001 * theta**8
+    np.testing.assert_allclose(lens.pixels(RAYS), 46 * theta * k / r * RAYS + [32, 24], atol=1e-9)
 
 
 def test_scaled_lens_sees_the_same_in_more_pixels():

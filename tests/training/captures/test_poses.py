@@ -17,10 +17,10 @@ def test_pose_is_read_from_rows(matrix):
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (MATRIX.T, r"here: the last row .* got \[4\.0, 5\.0, 6\.0, 1\.0\]: .* column by column"),
-        (MATRIX + np.eye(4)[3], r"here: the last row of a pose must be 0 0 0 1, .*: copy it again"),
+        (MATRIX.T, r"here: the last row .* got \[4\.0, 5\.0, 6\.0, 1\.0\]; .* column by column"),
+        (MATRIX + np.eye(4)[3], r"here: the last row of a pose must be 0 0 0 1, .*; copy it again"),
         (np.where(MATRIX == 4, np.nan, MATRIX), "here: the pose is not finite"),
-        (2 * MATRIX[:3], "here: no rotation"),
+        (2 * MATRIX[:3], "here: the rotation must be"),
     ],
     ids=["column by column", "another last row", "not finite", "not a rotation"],
 )

@@ -16,7 +16,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.capture_registry import CaptureKind
+from splatpilot.training.captures.capture_registry import CaptureFormat
 
 
 def read(path, config):
@@ -33,7 +33,7 @@ def read(path, config):
     )
 
 
-PAIR = CaptureKind(lambda path: (path / "pair.txt").exists(), read)
+PAIR = CaptureFormat(lambda path: (path / "pair.txt").exists(), read)
 NUMBER = 3
 '''
 
@@ -73,9 +73,9 @@ def test_a_kind_of_another_package(folder, tmp_path):
 def test_a_kind_that_is_not_installed(folder):
     assert read_capture(folder, CaptureConfig(kind="pairs:PAIR")).source == f"pair {folder}"
     for kind, message in (
-        ("pairs:NUMBER", "pairs:NUMBER is no kind of capture"),
+        ("pairs:NUMBER", "pairs:NUMBER is no capture format"),
         ("pairs:NOWHERE", "'pairs:NOWHERE' is not at"),
-        ("kinect", r"no kind of capture 'kinect'; there are tartanair_v1, .*photographs"),
+        ("kinect", r"no capture format 'kinect'; there are tartanair_v1, .*photographs"),
     ):
         with pytest.raises(ValueError, match=message):
             read_capture(folder, CaptureConfig(kind=kind))
@@ -91,7 +91,7 @@ def test_registered_kinds_are_listed(folder):
         match=r"known are TartanAir V1 .*, photographs alone, a ROS bag, a video .*, cubes",
     ):
         read_capture(folder)
-    with pytest.raises(ValueError, match="there is a kind of capture 'tum' already"):
+    with pytest.raises(ValueError, match="there is a capture format 'tum' already"):
         register_capture("tum", lambda path: True, lambda path, config: None)
 
 

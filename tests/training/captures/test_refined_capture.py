@@ -75,7 +75,7 @@ def test_without_depth(tmp_path, config):
     frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
     camera = {"fl_x": 300, "fl_y": 300, "cx": 160, "cy": 120, "w": 320, "h": 240}
     (path / "transforms.json").write_text(json.dumps(camera | {"frames": [frame, frame]}))
-    with pytest.raises(ValueError, match=r"nerfstudio: .* compares depth, and"):
+    with pytest.raises(ValueError, match=r"nerfstudio: .* needs depth"):
         read_capture(path, CaptureConfig(refine_poses=True, cache=config.cache))
     assert not Path(config.cache).exists()
 

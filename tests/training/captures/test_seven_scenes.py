@@ -71,7 +71,7 @@ def test_config_file_in_the_folder(write, config):
     np.testing.assert_array_equal(read_capture(path, config()).K[0], [50, 0, 31])
     for text, message in (
         ("intrinsic: [1]\n", "there is no field intrinsic"),
-        ("intrinsics: [0, 1, 2, 3]\n", r"capture.intrinsics is \[0.0.*must be positive"),
+        ("intrinsics: [0, 1, 2, 3]\n", r".*intrinsics must be of focal lengths > 0, got \[0.0"),
     ):
         (path / "capture.yaml").write_text(text)
         with pytest.raises(ValueError, match=rf"capture\.yaml: {message}"):
@@ -94,28 +94,28 @@ def test_up_of_level_cameras(write, config):
     [
         (lambda p: (p / "frame-000040.pose.txt").write_text("nan " * 4 + "\n" + "0 0 0 1\n" * 3),
          "000040.pose.txt: the pose is not finite"),
-        (lambda p: (p / "frame-000040.pose.txt").unlink(), "000040.pose.txt: the file is missing"),
+        (lambda p: (p / "frame-000040.pose.txt").unlink(), "o such file"),
         (lambda p: (p / "frame-000040.pose.txt").write_text("1 0 0\n"),
-         "000040.pose.txt, line 1: '1 0 0' is no row"),
+         "000040.pose.txt, line 1 must be a row of a 4x4 matrix, got '1 0 0'"),
         (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([2, 1, 1, 1])),
-         "000040.pose.txt: no rotation"),
+         "000040.pose.txt: the rotation must be"),
         (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([1, 1, -1, 1])),
-         "000040.pose.txt: no rotation .*the determinant is -1"),
+         "000040.pose.txt: the rotation must be .*determinant -1"),
         (lambda p: np.savetxt(p / "frame-000040.pose.txt",
                               RigidTransform([900, 0, 0]).GetAsMatrix4()),
          "000040.color.png: its position .* is far from all others"),
         (lambda p: (p / "frame-000040.depth.png").write_bytes(b""),
          "000040.depth.png: the file is empty"),
         (lambda p: (p / "frame-000040.depth.png").unlink(),
-         "000040.depth.png: the file is missing"),
+         "No such file: .*000040.depth.png"),
         (lambda p: (p / "frame-000040.color.png").write_bytes(b"no image"),
          "000040.color.png: not a readable image"),
         (lambda p: (f := p / "frame-000040.color.png").write_bytes(f.read_bytes()[:-500]),
-         "000040.color.png: not a readable image .*cut short"),
+         "000040.color.png: not a readable image .truncated"),
         (lambda p: cv2.imwrite(str(p / "frame-000040.color.png"), np.zeros((24, 32, 3), np.uint8)),
-         "000040.color.png: 32x24 pixels where 64x48 are expected"),
+         "000040.color.png: must be of 64x48 pixels, as the others, got 32x24"),
         (lambda p: cv2.imwrite(str(p / "frame-000040.depth.png"), np.zeros((24, 32), np.uint16)),
-         "000040.depth.png: 32x24 pixels where 64x48 are expected"),
+         "000040.depth.png: must be of 64x48 pixels, as the others, got 32x24"),
     ],
 )  # fmt: skip
 def test_one_bad_frame_is_left_out(write, config, spoil, message):
@@ -134,7 +134,9 @@ def test_too_many_bad_frames(write, config):
     path = write()
     for i in (0, 3, 5):
         (path / f"frame-{10 * i:06d}.depth.png").unlink()
-    with pytest.raises(ValueError, match=r"7 of 10 frames .* 80%.*000000\.depth\.png: the file is"):
+    with pytest.raises(
+        ValueError, match=r"7 of 10 frames .* 80%.*No such file: .*000000\.depth\.png"
+    ):
         read_capture(path, config())
 
 
@@ -145,7 +147,7 @@ def test_pictures_of_depth(write, config, shape):
     capture = read_capture(path, config())
     assert len(capture) == 9 and "frame-000010.color.png" not in capture.frame_names
     [message] = capture.dropped
-    assert re.search(r"000010\.depth\.png: pixels of 8 bits .*; depth is one number", message)
+    assert re.search(r"000010\.depth\.png: depth must be one number per pixel", message)
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.tartanair import (
-    is_tartanair_v1,
-    is_tartanair_v2,
     read_tartanair_v1,
     read_tartanair_v2,
+    recognizes_tartanair_v1,
+    recognizes_tartanair_v2,
 )
 
 
@@ -81,14 +81,14 @@ def test_invalid_depth_is_unknown(tmp_path, write_room):
 def test_missing_part(tmp_path, write_room, part):
     room = write_room(tmp_path / "room")
     (room / part).rename(room / "elsewhere")
-    with pytest.raises(FileNotFoundError, match=rf"{part}: does not exist; a TartanAir V1"):
+    with pytest.raises(FileNotFoundError, match=part):
         read_tartanair_v1(room)
 
 
 def test_missing_folder(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere: does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"No such folder: .*nowhere"):
         read_tartanair_v1(tmp_path / "nowhere")
-    assert not is_tartanair_v1(tmp_path / "nowhere")
+    assert not recognizes_tartanair_v1(tmp_path / "nowhere")
 
 
 def test_empty_image_folder(tmp_path, write_room):
@@ -106,8 +106,8 @@ def test_missing_file_of_a_frame(tmp_path, write_room):
     (room / "depth_left" / "000008_left_depth.npy").unlink()
     capture = read_tartanair_v1(room)
     assert len(capture) == 10 and len(capture.dropped) == 2
-    assert "000003_left.png: the file is missing" in capture.dropped[0]
-    assert "000008_left_depth.npy: the file is missing" in capture.dropped[1]
+    assert "000003_left.png" in capture.dropped[0]
+    assert "000008_left_depth.npy" in capture.dropped[1]
     assert capture.frame_names[3] == "000004_left.png"
     assert capture.X_WCs[3].IsExactlyEqualTo(whole.X_WCs[4])
 
@@ -117,7 +117,7 @@ def test_extra_depth(tmp_path, write_room):
     depth = room / "depth_left" / "000012_left_depth.npy"
     depth.write_bytes((room / "depth_left" / "000011_left_depth.npy").read_bytes())
     capture = read_tartanair_v1(room)
-    assert len(capture) == 12 and "000012_left_depth.npy: there is no image" in capture.dropped[0]
+    assert len(capture) == 12 and "000012_left_depth.npy: has no image" in capture.dropped[0]
 
 
 @pytest.mark.parametrize("change", [lambda lines: lines[:-1], lambda lines: [*lines, lines[0]]])
@@ -139,7 +139,7 @@ def spoilt_line(room, line):
 def test_line_that_is_no_pose(tmp_path, write_room, line):
     room = write_room(tmp_path / "room")
     spoilt_line(room, line)
-    with pytest.raises(ValueError, match=r"pose_left\.txt, line 5: .*is no pose; seven numbers"):
+    with pytest.raises(ValueError, match=r"pose_left\.txt, line 5 must be a pose tx ty tz"):
         read_tartanair_v1(room)
 
 
@@ -147,10 +147,10 @@ def test_line_that_is_no_pose(tmp_path, write_room, line):
     ("line", "message"),
     [
         ("0 0 nan 0 0 0 1", "the pose is not finite"),
-        ("0 0 0 0 0 0 1.1", "the quaternion has the length 1.1, 1 within 0.001"),
-        ("0 0 0 0 0 0 0", "the quaternion has the length 0, 1 within 0.001"),
+        ("0 0 0 0 0 0 1.1", "the quaternion must be 1 +- 0.001, got 1.1"),
+        ("0 0 0 0 0 0 0", "the quaternion must be 1 +- 0.001, got 0"),
         ("0 0 0 nan 0 0 1", "the pose is not finite"),
-        ("3e8 0 0 0 0 0 1", "more than 1e+08 m away"),
+        ("3e8 0 0 0 0 0 1", "must be within 1e+08 m"),
     ],
 )
 def test_absurd_pose(tmp_path, write_room, line, message):
@@ -180,8 +180,13 @@ def test_other_size(tmp_path, write_room):
     cv2.imwrite(str(room / "image_left" / "000000_left.png"), np.zeros((24, 32, 3), np.uint8))
     capture = read_tartanair_v1(room)
     assert (capture.width, capture.height, len(capture)) == (64, 48, 10)
-    assert "000000_left.png: 32x24 pixels where 64x48 are expected" in capture.dropped[0]
-    assert "000001_left_depth.npy: 32x24 pixels where 64x48 are expected" in capture.dropped[1]
+    assert (
+        "000000_left.png: must be of 64x48 pixels, as the others, got 32x24" in capture.dropped[0]
+    )
+    assert (
+        "000001_left_depth.npy: must be of 64x48 pixels, as the others, got 32x24"
+        in capture.dropped[1]
+    )
 
 
 def test_v2(tmp_path, write_room):
@@ -199,7 +204,7 @@ def test_v2(tmp_path, write_room):
         cv2.imwrite(str(v2 / "depth_lcam_front" / f"{i:06d}_lcam_front_depth.png"), packed)
     (v2 / "pose_left.txt").rename(room / "pose_left.txt")
     one, two = read_tartanair_v1(room), read_tartanair_v2(v2)
-    assert is_tartanair_v2(v2) and not is_tartanair_v1(v2) and len(two) == 12
+    assert recognizes_tartanair_v2(v2) and not recognizes_tartanair_v1(v2) and len(two) == 12
     for i in (0, 7):
         np.testing.assert_array_equal(one.frame(i).image, two.frame(i).image)
         np.testing.assert_array_equal(one.frame(i).depth, two.frame(i).depth)

@@ -75,10 +75,10 @@ def test_what_is_no_video(tmp_path):
     with pytest.raises(ValueError, match=r"b\.mp4: 20 frames in 0\.7 s give 2 of 2 a second"):
         read_capture(tmp_path / "b.mp4", config)
     assert list((tmp_path / "cache").iterdir()) == []
-    with pytest.raises(ValueError, match=r"capture\.video_rate is 0"):
+    with pytest.raises(ValueError, match=r"video_rate must be in \(0, 100\] Hz, got 0"):
         read_capture(tmp_path / "b.mp4", CaptureConfig(video_rate=0))
-    with pytest.raises(ValueError, match=r"capture\.partners is -1"):
+    with pytest.raises(ValueError, match=r"partners must be in \[0, inf\), got -1"):
         read_capture(tmp_path / "b.mp4", CaptureConfig(partners=-1))
     (tmp_path / "c.txt").write_text("a text")
-    with pytest.raises(ValueError, match=r"c\.txt: no capture of a known kind.*a video"):
+    with pytest.raises(ValueError, match=r"c\.txt: unknown capture format.*a video"):
         read_capture(tmp_path / "c.txt")

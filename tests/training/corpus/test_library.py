@@ -71,7 +71,7 @@ def test_scenes_without_a_bound_are_refused(tmp_path):
     """A scene whose fidelity nobody measured is named with the command that measures it; a scene
     that is not there, and a file of Gaussians, are named too."""
     scene = write_scene(tmp_path / "attic", None)
-    with pytest.raises(ValueError, match=r"attic/scene.yaml .* `splatpilot fidelity .*attic`"):
+    with pytest.raises(ValueError, match=r"attic/scene.yaml .* scene fidelity .*attic`"):
         LibraryConfig(scenes=[scene]).validate()
     with pytest.raises(FileNotFoundError, match=r"No such file .* expected a scene"):
         LibraryConfig(scenes=["nowhere"]).validate()

@@ -277,20 +277,20 @@ def test_the_config_loads_from_yaml():
 @pytest.mark.parametrize(
     "values, message",
     [
-        ({"length": 0.0}, r"length = 0.0 m must be positive"),
-        ({"width": -16.0}, r"width = -16.0 m must be positive"),
-        ({"height": float("nan")}, r"height = nan m must be positive"),
-        ({"voxel_size": 0.0}, r"voxel_size = 0.0 m must be positive"),
-        ({"radius_max": float("nan")}, r"radius_max = nan m must be positive"),
-        ({"radius_min": -0.1}, r"radius_min = -0.1 m must be positive"),
-        ({"rocks": -1}, r"rocks = -1 must be 0 to 1000"),
-        ({"lean_max": 40.0}, r"lean_max = 40.0 deg must be between 0 and 10"),
-        ({"length": 4.0}, r"length = 4.0 m must be at least 5 m"),
-        ({"width": 2.0}, r"width = 2.0 m must be at least 2.5"),
-        ({"flight_height": 5.5}, r"flight_height = 5.5 m must be between 1 m and .* = 5 m"),
-        ({"radius_min": 0.6}, r"radius_max = 0.45 m must not be below radius_min = 0.6 m"),
-        ({"spacing": 0.8}, r"radius_max = 0.45 m must be below half the spacing 0.8 m"),
-        ({"spacing": 1.9}, r"spacing = 1.9 m leaves gaps of 0.69 m .* use a spacing of at least"),
+        ({"length": 0.0}, r"length must be .* got 0.0"),
+        ({"width": -16.0}, r"width must be .* got -16.0"),
+        ({"height": float("nan")}, r"height must be .* got nan"),
+        ({"voxel_size": 0.0}, r"voxel_size must be .* got 0.0"),
+        ({"radius_max": float("nan")}, r"radius_max must be .* got nan"),
+        ({"radius_min": -0.1}, r"radius_min must be .* got -0.1"),
+        ({"rocks": -1}, r"rocks must be .* got -1"),
+        ({"lean_max": 40.0}, r"lean_max must be .* got 40.0"),
+        ({"length": 4.0}, r"length must be in \[5, .* got 4.0"),
+        ({"width": 2.0}, r"width must be at least 2.5.* got 2.0"),
+        ({"flight_height": 5.5}, r"flight_height must be at most .* = 5 m, got 5.5"),
+        ({"radius_min": 0.6}, r"radius_min must be at most radius_max = 0.45, got 0.6"),
+        ({"spacing": 0.8}, r"spacing must be at least 2.02 m, got 0.8"),
+        ({"spacing": 1.9}, r"spacing must be at least 2.02 m, got 1.9"),
     ],
 )
 def test_a_forest_that_cannot_be_grown_is_refused(values, message):
@@ -303,7 +303,7 @@ def test_the_spacing_the_error_asks_for_is_enough():
     """A spacing rejected with 'at least X' is accepted at X."""
     with pytest.raises(ValueError) as error:
         ForestConfig(spacing=1.9).validate()
-    needed = float(str(error.value).rsplit("at least ", 1)[1].removesuffix(" m"))
+    needed = float(str(error.value).rsplit("at least ", 1)[1].partition(" m")[0])
     ForestConfig(spacing=needed + 0.005).validate()
 
 

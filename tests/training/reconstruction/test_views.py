@@ -34,8 +34,6 @@ def frame(yaw: float, gain: float = 1.0, ground: bool = True) -> CaptureFrame:
 
 
 def test_the_sky_is_learned_and_the_ground_is_not():
-    """Where frames look into the sky, the map has its colour, freed of their gains, and beside
-    that it goes on smoothly; the ground leaves no trace."""
     gains = np.array([1.0, 0.8, 1.2, 1.0])
     frames = [frame(yaw, gain) for yaw, gain in zip(np.pi / 2 * np.arange(4), gains, strict=True)]
     background = learn_background(frames, Photometry(gains, 0.0))
@@ -55,8 +53,6 @@ def test_the_sky_is_learned_and_the_ground_is_not():
 
 
 def test_beyond_the_far_limit_is_infinitely_far():
-    """Depth of 150 m or more counts as the sky does; with nothing so far away the background is
-    black."""
     distant = frame(0.0, ground=False)
     depth = np.where(np.isinf(distant.depth), np.float32(151), distant.depth)
     one = Photometry(np.ones(1), 0.0)

@@ -33,15 +33,12 @@ def noise(seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("difference", "expected"), [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0)])
 def test_psnr_of_a_known_difference(difference, expected):
-    """A difference of d everywhere has a PSNR of -20 log10 d; equal images have infinity."""
     truth = np.zeros((HEIGHT, WIDTH, 3))
     assert psnr_db(truth + difference, truth) == pytest.approx(expected)
     assert psnr_db(truth, truth) == np.inf
 
 
 def test_ssim_of_flat_images():
-    """Images without structure have only SSIM's luminance term, far from the borders; equal images
-    have 1."""
     a, b = np.full((64, 64, 3), 0.4), np.full((64, 64, 3), 0.6)
     luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
     assert ssim(a, b) == pytest.approx(luminance, abs=0.03)
@@ -50,8 +47,6 @@ def test_ssim_of_flat_images():
 
 
 def test_depth_error_counts_pixels_with_true_depth():
-    """Depth errors are means over the pixels whose true depth lies in range; nothing drawn (0) is
-    wrong by the whole depth; without true depth there is no error."""
     truth = np.array([[2.0, 4.0, 0.0, np.inf, 149.0, 200.0]], np.float32)
     depth = np.array([[2.5, 0.0, 9.0, 9.0, 148.0, 9.0]], np.float32)
     assert depth_mae_m(depth, truth) == pytest.approx((0.5 + 4 + 1) / 3)
@@ -64,7 +59,6 @@ def test_depth_error_counts_pixels_with_true_depth():
 
 
 def test_floaters_stand_in_front_by_the_margin_and_cover():
-    """A pixel is a floater beyond max(0.1 m, 10 %) in front, not behind, and no hole is one."""
     cases = [  # true depth, rendered depth, floater
         (0.5, 0.41, False),
         (0.5, 0.39, True),  # 0.1 m below 1 m
@@ -82,7 +76,6 @@ def test_floaters_stand_in_front_by_the_margin_and_cover():
 
 
 def test_holes_are_where_nothing_is_seen_of_something():
-    """A hole is a pixel that has true depth but no depth; beyond range there is nothing to see."""
     truth = np.array([[2.0, 4.0, 3.0, 9.0, 0.0, np.inf]])
     depth = np.array([[2.0, 0.0, 1.0, 9.0, 0.0, 0.0]])
     assert hole_fraction(depth, truth) == pytest.approx(1 / 4)
@@ -103,8 +96,6 @@ def plane(distance: float, opacity: float = 0.99, size: float = 8.0) -> Gaussian
 
 @pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
 def test_a_plane_in_front_is_all_floater(representation):
-    """A plane rendered in its place has no depth error and no floaters; one drawn half a metre in
-    front errs by that and is a floater in every pixel."""
     camera = (K, WIDTH, HEIGHT, RigidTransform())
     truth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
     for distance, error, fraction in ((3.0, 0.0, 0.0), (2.5, 0.5, 1.0)):
@@ -117,15 +108,12 @@ def test_a_plane_in_front_is_all_floater(representation):
 
 @pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
 def test_both_representations_stand_where_the_camera_is_told(representation):
-    """A camera moved towards a plane sees it nearer by that much, whatever the representation."""
     X_WC = RigidTransform([0.3, -0.2, 1.0])
     view = SceneRenderer(plane(3.0), representation).render(K, WIDTH, HEIGHT, X_WC)
     np.testing.assert_allclose(view.depth, 2.0, atol=2e-3)
 
 
 def test_exposure_is_fitted():
-    """An image that is the scene darkened towards the corners and exposed otherwise is matched, and
-    the gain found; what cannot be matched stays the least-squares way off."""
     scene = 0.5 * noise()
     truth = 1.4 * scene * vignette(-0.5, WIDTH, HEIGHT)[..., None]
     image, gain = fit_exposure(scene, truth, -0.5)
@@ -140,7 +128,6 @@ def test_exposure_is_fitted():
 
 
 def test_measures_of_a_view():
-    """A view is compared with its frame, whose exposure and vignetting do not count."""
     color = noise().astype(np.float32)
     exposed = 1.2 * color * vignette(-0.2, WIDTH, HEIGHT)[..., None]
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
@@ -160,8 +147,6 @@ def test_measures_of_a_view():
 
 
 def test_a_translucent_surface_is_a_hole():
-    """A wall of alpha 0.4 that looks right before its background is a hole, as deep as the wall is
-    far, and looks wrong on black; the sky is not what makes black look wrong."""
     gray = (0.5, 0.5, 0.5)
     image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
@@ -204,7 +189,6 @@ def test_masked_pixels_are_not_measured():
 
 
 def test_what_no_camera_saw_is_left_out():
-    """Pixels that are not to be measured have no part in any figure but their share."""
     color = noise().astype(np.float32)
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
     frame = CaptureFrame(np.round(255 * color).astype(np.uint8), depth, RigidTransform(), K)
@@ -267,7 +251,6 @@ def test_without_a_gain_brightness_counts():
 
 
 def test_lpips_is_of_the_exposed_image():
-    """The perceptual distance is asked of the image in the frame's exposure."""
     color = noise().astype(np.float32)
     image = np.round(255 * 1.2 * color).astype(np.uint8)
     depth = np.ones((HEIGHT, WIDTH), np.float32)

@@ -21,8 +21,6 @@ K = np.array([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 
 
 def test_space_before_the_sky_is_free_only_where_a_fitted_frame_measured_it():
-    """Where nothing is rendered, measured infinite depth frees the space before it; unknown depth,
-    what is rendered and frames that were withheld stay as they are."""
     measured = np.full((60, 80), np.inf, dtype=np.float32)
     measured[:, 40:] = 0.0
     capture = Capture(

@@ -1,11 +1,17 @@
-"""Noise of images."""
-
 import math
 
 import numpy as np
 import pytest
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.policies.observations import pool_depth
+from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import (
+    ColorNoise,
+    DepthNoise,
     ObservationNoise,
     expose,
     image_generator,
@@ -13,12 +19,13 @@ from splatpilot.systems.sensing.noise import (
     noisy_depth,
     turned_hue,
 )
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 DEPTH = np.full((200, 200), 4.0, dtype=np.float32)
 
 
 def test_depth_errors_have_the_sizes_asked_for():
-    """Relative and absolute errors add as variances; the mean stays."""
     noise = ObservationNoise(depth_multiplicative=0.03, depth_additive=0.05)
     errors = noisy_depth(DEPTH, noise, image_generator(0, 0), 0.1, 20.0) - 4.0
     sigma = np.hypot(0.03 * 4.0, 0.05)
@@ -27,9 +34,6 @@ def test_depth_errors_have_the_sizes_asked_for():
 
 
 def test_dropout_and_range():
-    """Dropped pixels read infinity at the rate asked for; what leaves the range reads 0 or
-    infinity; what read 0 or infinity stays so.
-    """
     dropped = noisy_depth(DEPTH, ObservationNoise(depth_dropout=0.2), image_generator(1, 0), 0, 20)
     assert np.mean(dropped == np.inf) == pytest.approx(0.2, abs=0.01)
     assert set(np.unique(dropped)) == {4.0, np.inf}
@@ -45,9 +49,6 @@ def test_dropout_and_range():
 
 
 def test_color_noise_and_brightness():
-    """Pixel noise has the size asked for; brightness changes a whole image by one factor, within
-    its limit; results stay within 0 to 255.
-    """
     color = np.full((100, 100, 3), 100, dtype=np.uint8)
     grain = noisy_color(color, ObservationNoise(color_noise=0.04), image_generator(0, 0))
     assert grain.std() == pytest.approx(0.04 * 255, rel=0.05)
@@ -64,8 +65,6 @@ def test_color_noise_and_brightness():
 
 
 def test_hue_and_blur():
-    """Hue turns the whole image's colours by one angle within its limit, and leaves grey and
-    brightness; blur spreads a point as a Gaussian of that width, and leaves its light."""
     red = np.full((4, 4, 3), [120, 60, 60], dtype=np.uint8)
     third = turned_hue(red.astype(float), math.cos(2 * math.pi / 3), math.sin(2 * math.pi / 3))
     np.testing.assert_allclose(third, np.broadcast_to([60, 120, 60], red.shape), atol=1e-9)
@@ -87,8 +86,6 @@ def test_hue_and_blur():
 
 
 def test_exposure():
-    """An error of exposure is a factor of light for the whole image; what is brighter than white
-    stays white."""
     noise = ObservationNoise(exposure_error=1.0)
     grey, error = np.full((4, 4, 3), 100.0), 0.5
     light = (expose(grey, noise, error, np.zeros(grey.shape)) / 255) ** 2.2
@@ -103,7 +100,6 @@ def test_exposure():
 
 
 def test_photons_and_reading():
-    """Of N electrons, sqrt(N + read^2) is the noise: in the dark that of reading alone."""
     noise = ObservationNoise(full_well=400.0, read_noise=6.0)
     photons = np.random.default_rng(0).standard_normal((400, 400, 3))
     for electrons in (100.0, 225.0, 300.0):
@@ -116,7 +112,6 @@ def test_photons_and_reading():
 
 
 def test_noise_is_a_function_of_seed_and_number():
-    """The same seed and image number give the same bits; another of either gives others."""
     noise = ObservationNoise(depth_additive=0.1)
     images = [
         noisy_depth(DEPTH, noise, image_generator(*key), 0.1, 20.0)
@@ -128,7 +123,6 @@ def test_noise_is_a_function_of_seed_and_number():
 
 
 def test_no_noise_changes_nothing():
-    """The default passes images as they are."""
     none = ObservationNoise()
     assert not none.changes_depth
     assert not none.changes_color
@@ -147,16 +141,124 @@ def test_no_noise_changes_nothing():
     ],
 )
 def test_bad_noise_is_named(field, value):
-    """A value out of range names the field."""
-    with pytest.raises(ValueError, match=rf"observation.{field} is {value}"):
+    with pytest.raises(ValueError, match=rf"ObservationNoise.{field} must be .*, got {value}"):
         ObservationNoise(**{field: value}).validate()
 
 
 @pytest.mark.parametrize("rates", [[10.0], [30.0, 10.0], [0.0, 10.0]])
 def test_rates_of_frames_are_a_range(rates):
-    """Rates are two, positive and in order; jitter and losses are of frames with a rate."""
-    with pytest.raises(ValueError, match=r"observation\.frame_rate is \["):
+    with pytest.raises(ValueError, match=r"frame_rate must be .* got \["):
         ObservationNoise(frame_rate=rates).validate()
-    with pytest.raises(ValueError, match=r"noise\.jitter is 0\.1, but images without a rate"):
+    with pytest.raises(ValueError, match=r"jitter must be 0 without frame_rate, got 0\.1"):
         ObservationNoise(jitter=0.1).validate("noise")
     ObservationNoise(frame_rate=[10.0, 10.0], jitter=0.1, frame_dropout=0.5).validate()
+
+
+CAMERA = OnboardCamera(width=80, height=60, min_depth=1.0, max_depth=9.0)
+RATE = 15.0  # [Hz]
+
+
+def seen_at(system, image, *times: float) -> list[np.ndarray]:
+    """What a system makes of an image at those times, one after the other."""
+    context = system.CreateDefaultContext()
+    system.get_input_port().FixValue(context, Value(image))
+    images = []
+    for time in times:
+        context.SetTime(time)
+        images.append(np.array(system.get_output_port().Eval(context).data))
+    return images
+
+
+def test_depth_noise_is_of_its_size_and_within_the_range():
+    image = ImageDepth32F(80, 60)
+    image.mutable_data[:, :40] = 5.0
+    image.mutable_data[:, 40:60] = 1.0
+    image.mutable_data[:, 60:] = 9.0
+    noise = ObservationNoise(depth_multiplicative=0.03, depth_additive=0.2)
+    (seen,) = seen_at(DepthNoise(noise, CAMERA, RATE, seed=7), image, 0.2)
+    middle, near, far = seen[:, :40, 0] - 5, seen[:, 40:60, 0], seen[:, 60:, 0]
+    assert middle.std() == pytest.approx(0.25, rel=0.06)  # four errors of the estimate
+    assert abs(middle.mean()) < 4 * 0.25 / 2400**0.5
+    assert np.mean(near == 0) == pytest.approx(0.5, abs=0.06) and near[near > 0].min() >= 1.0
+    assert np.mean(far == np.inf) == pytest.approx(0.5, abs=0.06)
+    assert far[np.isfinite(far)].max() <= 9.0
+
+
+def test_depth_dropout_is_of_its_rate():
+    image = ImageDepth32F(80, 60)
+    image.mutable_data[...] = 5.0
+    (seen,) = seen_at(
+        DepthNoise(ObservationNoise(depth_dropout=0.1), CAMERA, RATE, seed=7), image, 0.2
+    )
+    assert set(np.unique(seen)) == {5.0, np.inf}
+    assert np.mean(seen == np.inf) == pytest.approx(0.1, abs=0.018)  # four errors of the estimate
+    np.testing.assert_array_equal(pool_depth(seen[..., 0], 15, 20), 5.0)
+
+
+def test_color_noise_is_of_its_size():
+    image = ImageRgba8U(80, 60)
+    image.mutable_data[..., :3] = 90
+    image.mutable_data[..., 3] = np.arange(80)
+    grain = ColorNoise(ObservationNoise(color_noise=0.1), CAMERA, RATE, seed=7)
+    (seen,) = seen_at(grain, image, 0.2)
+    assert seen[..., :3].std() == pytest.approx(25.5, rel=0.05)
+    np.testing.assert_array_equal(seen[..., 3], image.data[..., 3])
+    jitter = ColorNoise(ObservationNoise(brightness_jitter=0.2), CAMERA, RATE, seed=7)
+    shades = [np.unique(a[..., :3]) for a in seen_at(jitter, image, *np.arange(50) / RATE)]
+    assert all(len(shade) == 1 for shade in shades)
+    assert 72 <= min(shades) < 78 and 102 < max(shades) <= 108
+
+
+@pytest.mark.parametrize("system", [DepthNoise, ColorNoise])
+def test_noise_is_that_of_seed_and_image_number(system):
+    noise = ObservationNoise(depth_additive=0.1, color_noise=0.1)
+    image = ImageDepth32F(80, 60) if system is DepthNoise else ImageRgba8U(80, 60)
+    image.mutable_data[...] = 5 if system is DepthNoise else 90
+    times = (3 / RATE, 0.0, 3 / RATE, np.nextafter(3 / RATE, 0), 3.3 / RATE, 4 / RATE)
+    first, start, again, before, near, following = seen_at(
+        system(noise, CAMERA, RATE, seed=7), image, *times
+    )
+    for same in (again, before, near):
+        np.testing.assert_array_equal(first, same)
+    (other,) = seen_at(system(noise, CAMERA, RATE, seed=8), image, 3 / RATE)
+    for different in (start, following, other):
+        assert np.mean(first[..., 0] != different[..., 0]) > 0.9
+
+
+class Falling(LeafSystem):
+    """The state of a vehicle that falls with 2 m/s^2 while it turns about z at 1 rad/s."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort("state", 13, self._calc)
+
+    def _calc(self, context, output) -> None:
+        output.set_value(self.state(context.get_time()))
+
+    @staticmethod
+    def state(time: float) -> np.ndarray:
+        state = hover_state([3 * time, 0.0, 5.0 - time**2], yaw=time)
+        state[3:6] = [3.0, 0.0, -2 * time]
+        return state
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.02, 0.1, 0.133])
+def test_delayed_pose_is_the_pose_then(latency):
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Falling())
+    delayed = builder.AddSystem(DelayedPose(FrameTimes.late(latency), period=0.02))
+    builder.Connect(source.get_output_port(), delayed.GetInputPort("state"))
+    simulator = Simulator(builder.Build())
+    context = delayed.GetMyContextFromRoot(simulator.get_mutable_context())
+    for now in (0.0, 0.01, 0.05, 0.2, 0.513, 1.0 / 3.0 + 0.5):
+        simulator.AdvanceTo(now)
+        X_WB = delayed.GetOutputPort("pose").Eval(context)
+        expected = Falling.state(max(now - latency, 0.0))
+        np.testing.assert_allclose(X_WB.translation(), expected[:3], atol=1.01e-4)
+        q_WB = X_WB.rotation().ToQuaternion().wxyz()
+        np.testing.assert_allclose(q_WB, expected[6:10], atol=2e-5)
+
+
+def test_bad_latency_is_named():
+    with pytest.raises(ValueError, match=r"delays of frames must be .* got -0.1"):
+        DelayedPose(FrameTimes.late(-0.1))
