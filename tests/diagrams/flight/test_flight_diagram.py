@@ -102,13 +102,13 @@ def test_ports_of_another_size_are_named(post_world):
     for policy, message in (
         (
             Policy("waypoint", 4),
-            "'waypoint' of Policy is a vector of 4 and the input 'waypoint' of",
+            r"'waypoint' of .* \(a vector of 3\) must .* of Policy \(a vector of 4\)",
         ),
         (
             Policy("velocity", 1),
-            "'velocity' of Policy is a vector of 1 and the input 'velocity' of",
+            r"input 'velocity' of .* must .* 'velocity' of Policy \(a vector of 1\)",
         ),
-        (Policy("waypoint", 3, goal=2), "and the input 'goal' of Policy is a vector of 2"),
+        (Policy("waypoint", 3, goal=2), r"the input 'goal' of Policy \(a vector of 2\) must"),
     ):
         with pytest.raises(ValueError, match=message):
             flown(Scenario(timeout=1.0), post_world, policy=policy)
@@ -141,12 +141,16 @@ def test_scenarios_out_of_range_are_refused(post_world):
 @pytest.mark.parametrize(
     ("registry", "field", "message"),
     [
-        (SENSORS, {"sensors": {"down": OnboardCamera()}}, "builds the sensor 'down' gave NoneType"),
+        (
+            SENSORS,
+            {"sensors": {"down": OnboardCamera()}},
+            "the sensor 'down' must be a Drake system",
+        ),
         (WORLDS, {}, "what makes ForestConfig gave NoneType; it must return a World"),
     ],
 )
 def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, message):
-    kind = next(iter(registry._kinds.values()))
+    kind = registry.find(registry.registered()[0])
     function = "make" if registry is WORLDS else "build"
     kind = dataclasses.replace(kind, **{function: lambda *_: None})
     monkeypatch.setattr(registry, "kind_of", lambda _: kind)
@@ -161,7 +165,7 @@ def test_what_builds_no_policy_is_named(post_world, monkeypatch):
     kind = dataclasses.replace(POLICIES.kind_of(config), build=lambda *_: None)
     monkeypatch.setattr(POLICIES, "kind_of", lambda _: kind)
     monkeypatch.setattr(POLICIES, "name_of", lambda _: "mine")
-    with pytest.raises(ValueError, match=r"the policy 'mine' gave NoneType; it must return a"):
+    with pytest.raises(ValueError, match="the policy 'mine' must be a Drake system, got NoneType"):
         flown(Scenario(timeout=1.0, policy=config), post_world)
 
 

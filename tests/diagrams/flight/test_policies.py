@@ -92,8 +92,8 @@ def test_types_that_can_be_no_configuration_are_refused():
         rate: float
 
     for config, message in (
-        (BareConfig, r"BareConfig has no method validate\(\); give it one"),
-        (PlainConfig, "PlainConfig is no dataclass; decorate it"),
+        (BareConfig, r"BareConfig has no method validate\(\); derive it"),
+        (PlainConfig, "PlainConfig must be a dataclass, got .*; decorate it"),
         (SetConfig, r"SetConfig makes no YAML \(NotImplementedError: .*'set'.*; give all fields"),
         (OpenConfig, r"OpenConfig makes no YAML \(TypeError: .*'rate'.*; give all fields defaults"),
     ):
