@@ -134,7 +134,8 @@ def _readable(path: Path, what: str) -> Iterator[None]:
         yield
     except Exception as error:  # zipfile, numpy and plyfile raise any type for damaged files.
         raise ValueError(
-            f"{path}: not a readable {what} ({reason_of(error)}); copy it again"
+            f"{path}: not a readable {what} ({reason_of(error)}); it is truncated or damaged, "
+            "copy it again"
         ) from None
 
 

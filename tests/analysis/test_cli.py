@@ -365,7 +365,7 @@ def test_signal_while_something_is_imported(number, status, tmp_path):
 def test_signal_after_the_last_result(number, status):
     """A signal that comes when all is done, but the process is there still, says the same."""
     script = (
-        "import signal; from splatpilot.analysis import cli\n"
+        "import signal; from splatpilot.analysis.commands import main as cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"cli.main = lambda: signal.raise_signal({int(number)})\n"
         "cli.run()"

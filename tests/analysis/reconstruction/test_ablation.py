@@ -56,7 +56,7 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
     # An arm that is missing would be made.
     (place.folder / "out" / "room" / "2dgs_points" / "reconstruct.yaml").unlink()
     assert ablate(place) == 70
-    assert "a mistake of the program (AssertionError)" in capsys.readouterr().err
+    assert "internal error in scene (AssertionError)" in capsys.readouterr().err
 
 
 def test_studies_are_not_mixed(place, monkeypatch, capsys):

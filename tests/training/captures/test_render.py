@@ -85,7 +85,7 @@ def test_a_world_may_be_named_as_in_the_benchmark(tmp_path, monkeypatch, capsys)
     assert "planned" in capsys.readouterr().err
     assert planned == [(load_config(Scenario(), benchmark_scenarios()["P02"]).world, 3)]
     assert main(["capture", "render", "P99", *words]) == 1
-    assert "P99" in capsys.readouterr().err
+    assert "No such file or folder: P99" in capsys.readouterr().err
 
 
 def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
