@@ -36,6 +36,7 @@ class Distortion(Config):
     "fisheye", with a = atan r: (x', y') = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) (x, y) / r.
     """
 
+    # OpenCV's rational model or its fisheye.
     model: str = bounded("opencv", "{opencv, fisheye}")
     # k1, k2, ...: up to six of "opencv", up to four of "fisheye"; the others are zero.
     radial: list[float] = bounded(list, "(-inf, inf)")
