@@ -142,7 +142,7 @@ def test_what_is_drawn_is_where_it_is_hit():
         (OfficeConfig(second_doors=1.5), r"second_doors must be in \[0, 1\], got 1.5"),
         (OverUnderConfig(over=5.5), "over must be at most 5.19 m.* got 5.5"),
         (OverUnderConfig(barriers=30), "length must be at least 80.5 m.* got 36.0"),
-        (InsertedConfig(), "path must be named"),
+        (InsertedConfig(), "path must be a scene folder"),
         (OctomapConfig(path="x", lower=[0.0, 0, 0]), "lower and upper must be given both"),
     ],
 )
