@@ -1,5 +1,3 @@
-"""What procedural worlds are put together from."""
-
 import numpy as np
 
 from splatpilot.diagrams.worlds.building_blocks import (
@@ -20,7 +18,6 @@ def _distance(solids, p_W: np.ndarray) -> np.ndarray:
 
 
 def test_walls_and_roof_enclose_the_volume():
-    """Inside, the nearest wall or roof is as far as the nearest side or top of the volume."""
     p = np.random.default_rng(0).uniform(PLOT.lower, PLOT.upper, (500, 3))
     to_bounds = np.minimum((p - PLOT.lower)[:, :2].min(axis=1), (PLOT.upper - p).min(axis=1))
     solids = [*hall(PLOT, ["brick"], np.random.default_rng(1)), roof(PLOT)]
@@ -28,7 +25,6 @@ def test_walls_and_roof_enclose_the_volume():
 
 
 def test_signs_hang_on_the_inner_faces_of_a_hall():
-    """As many as are asked for on each wall, against its inner face, 2 cm into the volume."""
     walls = hall(PLOT, ["brick"], np.random.default_rng(1))
     signs = signs_in(walls, 3, 1, np.random.default_rng(2))
     middles = np.array([sign.shape.X_WO.translation() for sign in signs])
@@ -41,7 +37,6 @@ def test_signs_hang_on_the_inner_faces_of_a_hall():
 
 
 def test_start_and_goal_are_at_the_ends_and_at_the_heights_asked_for():
-    """Both are 1.5 m from their end of the volume, within its sides, at heights between the two."""
     rng = np.random.default_rng(0)
     ends = np.array([start_and_goal(PLOT, rng, (0.5, 0.7)) for _ in range(50)])  # (50, 2, 3)
     np.testing.assert_allclose(ends[..., 0], np.tile((1.5, 10.5), (50, 1)))

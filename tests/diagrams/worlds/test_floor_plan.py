@@ -1,5 +1,3 @@
-"""The ground plan of a flyable volume."""
-
 import itertools
 
 import numpy as np
@@ -10,7 +8,6 @@ PLOT = FloorPlan.of_size(6.0, 4.0, 3.0)
 
 
 def test_surfaces_face_the_volume_if_they_face_one_of_its_corners():
-    """A surface faces a box if, of its eight corners, one lies before the surface's plane."""
     rng = np.random.default_rng(0)
     p, n = rng.uniform(-8, 12, (2000, 3)), rng.normal(size=(2000, 3))
     corners = np.array(list(itertools.product((0.0, 6.0), (-2.0, 2.0), (0.0, 3.0))))
@@ -20,13 +17,11 @@ def test_surfaces_face_the_volume_if_they_face_one_of_its_corners():
 
 
 def test_the_bounds_of_the_volume_face_it_from_outside_only():
-    """A wall on a bound faces the volume with the side turned to it; its other side does not."""
     wall, inwards = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]])
     assert PLOT.is_faced(wall, inwards).all()
     assert not PLOT.is_faced(wall, -inwards).any()
 
 
 def test_outside_is_the_distance_in_plan():
-    """Inside and above it is 0, beside a wall the way to it, off a corner that to the corner."""
     p = np.array([[3.0, 0.0, 9.0], [3.0, 5.0, 1.0], [-3.0, -6.0, 1.0]])
     np.testing.assert_allclose(PLOT.outside(p), [0, 3, 5])

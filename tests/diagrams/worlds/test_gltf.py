@@ -1,5 +1,3 @@
-"""Worlds as meshes: what Drake's render engine sees of them is where the distances are zero."""
-
 import json
 
 import numpy as np
@@ -76,8 +74,6 @@ def _rendered(path, X_WC) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, spec, X_WC, tmp_path):
-    """Every pixel that Drake renders of the mesh lies, un-projected, on the analytic surfaces, and
-    on average shows the colour that the Gaussians show there."""
     path = tmp_path / "world.gltf"
     write_gltf(spec, path)
     color, depth = _rendered(path, X_WC)
@@ -103,7 +99,6 @@ def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, spec, X_
 
 
 def test_file_is_whole_and_the_same_twice(spec, tmp_path):
-    """One file holds everything, W's z is its y, and writing again gives the same bytes."""
     one, two = tmp_path / "one.gltf", tmp_path / "two.gltf"
     write_gltf(spec, one, texel=0.1)
     write_gltf(spec, two, texel=0.1)
@@ -119,6 +114,5 @@ def test_file_is_whole_and_the_same_twice(spec, tmp_path):
 
 
 def test_a_folder_that_does_not_exist_is_an_error(spec, tmp_path):
-    """Where nothing can be written the error names the folder."""
     with pytest.raises(OSError, match="nowhere"):
         write_gltf(spec, tmp_path / "nowhere" / "world.gltf", texel=0.2)

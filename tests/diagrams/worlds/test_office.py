@@ -1,5 +1,3 @@
-"""Floors of rooms: what divides them, and that every room can be reached."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -29,8 +27,6 @@ def plan(spec: WorldSpec, z: float, step: float = 0.05) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_every_room_has_a_door_that_the_vehicle_passes(seed):
-    """Without furniture, where a vehicle finds room it comes to from anywhere else, at the height
-    of doors; above the doors there are fewer ways, or as many where all reach the ceiling."""
     spec = office_spec(EMPTY, seed)
     free = plan(spec, 1.2) > VEHICLE_RADIUS
     count = np.asarray(label(free)[0]).max()
@@ -39,8 +35,6 @@ def test_every_room_has_a_door_that_the_vehicle_passes(seed):
 
 
 def test_rooms_and_doors_have_the_sizes_asked_for():
-    """Straight lines through the floor meet walls of the thickness of partitions, no nearer to
-    one another than rooms are wide, and nowhere gaps of less than a door."""
     config = replace(EMPTY, second_doors=1.0)
     gaps = []
     for seed in range(3):
@@ -57,7 +51,6 @@ def test_rooms_and_doors_have_the_sizes_asked_for():
 
 
 def test_ends_are_at_both_ends_and_the_way_leads_through_doors():
-    """Start and goal lie in rooms at the two ends; most ways are longer than the straight one."""
     detours = []
     for seed in range(8):
         spec = office_spec(OfficeConfig(), seed)
@@ -71,7 +64,6 @@ def test_ends_are_at_both_ends_and_the_way_leads_through_doors():
 
 
 def test_same_seed_same_floor():
-    """The same seed gives the same bits, another another floor."""
     one, again, other = (plan(office_spec(OfficeConfig(), seed), 1.2) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one, again)
     assert np.abs(one - other).max() > 0.5

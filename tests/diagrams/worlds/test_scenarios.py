@@ -1,5 +1,3 @@
-"""The benchmark's scenarios: feasible, repeatable, seen where they are hit."""
-
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +38,6 @@ def _config(name: str):
 
 
 def test_there_are_seventeen_and_all_are_valid():
-    """P01 to P12 and R13 to R17 load and pass their checks."""
     assert [file.stem for file in FILES] == [
         *(f"P{k:02d}" for k in range(1, 13)),
         *(f"R{k}" for k in range(13, 18)),
@@ -51,8 +48,6 @@ def test_there_are_seventeen_and_all_are_valid():
 
 @pytest.mark.parametrize("file", GENERATED, ids=lambda file: file.stem)
 def test_instances_are_feasible_and_repeatable(file):
-    """Start and goal are clear, a way is proven, the same seed gives the same world and another
-    seed another."""
     config = load_config(Scenario(), file).world
     one, again, other = (make_spec(config, seed) for seed in (3, 3, 4))
     if file.stem != "P08":  # its slits need a finer grid than is worth searching twice
@@ -66,7 +61,6 @@ def test_instances_are_feasible_and_repeatable(file):
 
 
 def test_walls_have_the_sizes_asked_for():
-    """P06's wall is 14 m and full height, P08's slits are 1.4 to 1.0 m, P09's ways are 3.6 m."""
 
     def free_widths(spec: WorldSpec) -> list[float]:
         """Widths in y of the free stretches in the planes through the middles of walls across."""
@@ -92,7 +86,6 @@ def test_walls_have_the_sizes_asked_for():
 
 
 def test_thin_things_are_thin_and_hit():
-    """P11's limbs and wires are 2 to 4 cm thick, and the distance on their axes is minus that."""
     spec = make_spec(_config("P11"), 2)
     thin = [s.shape for s in spec.solids if isinstance(s.shape, Capsule) and s.shape.radius < 0.05]
     assert len(thin) > 60
@@ -103,7 +96,6 @@ def test_thin_things_are_thin_and_hit():
 
 
 def test_a_wire_between_grid_points_closes_the_way():
-    """A net of wires of 2 cm, finer than the vehicle, is seen by the search on a coarse grid."""
     lower, upper = np.array([0.0, -1.5, 0]), np.array([8.0, 1.5, 3])
     ends = np.array([1.5, 0, 1.5]), np.array([6.5, 0, 1.5])
     net = [Capsule([4.0, y, -1], [4.0, y, 4], 0.01) for y in np.arange(-1.3, 1.5, 0.52)]
@@ -112,7 +104,6 @@ def test_a_wire_between_grid_points_closes_the_way():
 
 
 def test_what_is_drawn_is_where_it_is_hit():
-    """In a furnished room Gaussians lie on the surfaces, and rendered depth agrees with them."""
     world = make_world(_config("P10"), 1)
     p = world.gaussians.means.astype(float)
     lower, upper = world.distance_field.lower_W, world.distance_field.upper_W
@@ -151,18 +142,16 @@ def test_what_is_drawn_is_where_it_is_hit():
         (OfficeConfig(second_doors=1.5), r"second_doors must be in \[0, 1\], got 1.5"),
         (OverUnderConfig(over=5.5), "over must be at most 5.19 m.* got 5.5"),
         (OverUnderConfig(barriers=30), "length must be at least 80.5 m.* got 36.0"),
-        (InsertedConfig(), "path must be named"),
+        (InsertedConfig(), "path must be a scene folder"),
         (OctomapConfig(path="x", lower=[0.0, 0, 0]), "lower and upper must be given both"),
     ],
 )
 def test_what_cannot_be_built_is_refused(config, message):
-    """Values without a world are refused by field, value and limit."""
     with pytest.raises(ValueError, match=message):
         config.validate()
 
 
 def test_infeasible_draws_are_redrawn_and_given_up(monkeypatch):
-    """A field so full that nothing flies through is an error after some draws, not a hang."""
     monkeypatch.setattr(feasibility, "TRIES", 2)
     full = ClutterConfig(
         length=8, width=4, height=3, spheres=0, boxes=200, half_min=0.5, half_max=0.7, floating=True
@@ -194,7 +183,6 @@ def hall(tmp_path_factory) -> Path:
 
 
 def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
-    """A scene is looked for in SPLATPILOT_SCENES; one that is not there says how to get it."""
     monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     assert find_scene(SceneConfig(path="hall")) == hall / "hall"
     monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
@@ -203,7 +191,6 @@ def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
 
 
 def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
-    """Drawn ends are free, far apart, the same for the same seed and others for another."""
     monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     config = SceneConfig(path="hall", draw_ends=True)
     worlds = [make_world(config, seed) for seed in (1, 1, 2)]
@@ -216,8 +203,6 @@ def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
 
 
 def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
-    """Three to five solids are put into the scene; what is seen of them is where the distance is
-    zero, start and goal stay free and a way 1.3 vehicles wide is left."""
     monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     before = make_world(SceneConfig(path="hall"), 0)
     world = make_world(InsertedConfig(path="hall"), 0)
@@ -235,7 +220,6 @@ def test_inserted_solids_are_seen_hit_and_leave_gaps(hall, monkeypatch):
 
 
 def test_octomap_is_seen_where_it_is_occupied():
-    """Gaussians stand for the occupied voxels beside free ones, and flights start in free space."""
 
     occupied = np.zeros((12, 12, 12), bool)
     occupied[4:8, 4:8, :] = True

@@ -58,7 +58,6 @@ def world() -> World:
 
 
 def test_round_trip(tmp_path, world):
-    """A written scene reads back as the same world, with its metadata."""
     folder = tmp_path / "scene"
     written = write_scene_folder(
         folder, world, provenance="a test", gains=[1.0, 1.25], vignetting=-0.5
@@ -82,8 +81,6 @@ def test_round_trip(tmp_path, world):
 
 
 def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
-    """What closes a scene is among the Gaussians of its world, not of its `gaussians.ply`; a scene
-    that has lost it is refused."""
     folder, frontier = tmp_path / "scene", box_of_gaussians(step=1.0)
     written = write_scene_folder(folder, world, frontier, provenance="")
     assert written.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
@@ -95,7 +92,6 @@ def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
 
 
 def test_how_it_was_made_is_kept(tmp_path, world):
-    """What is said of a scene's making reads back, and so do bounds that are measured later."""
     folder = tmp_path / "scene"
     written = write_scene_folder(
         folder,
@@ -119,8 +115,6 @@ def test_how_it_was_made_is_kept(tmp_path, world):
 
 
 def test_an_environment_is_kept(tmp_path, world):
-    """What is seen infinitely far away by direction comes back to 8 bits; without its file the
-    scene is refused, and a scene in its place without one has none."""
     folder = tmp_path / "scene"
     texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
     sky = replace(world, background=EnvironmentMap(texels))
@@ -137,7 +131,6 @@ def test_an_environment_is_kept(tmp_path, world):
 
 
 def test_scene_from_before_these_fields(tmp_path, world):
-    """A scene.yaml that lacks the fields of later versions has their defaults."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     later = ("representation", "capture", "held_out", "image_width", "perturb", "pose_perturb")
@@ -152,7 +145,6 @@ def test_scene_from_before_these_fields(tmp_path, world):
 
 
 def test_a_scene_is_replaced_whole(tmp_path, world):
-    """Writing over a scene leaves nothing of the old one."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="first")
     (folder / "metrics.json").write_text("{}")
@@ -164,7 +156,6 @@ def test_a_scene_is_replaced_whole(tmp_path, world):
 
 @pytest.mark.parametrize("failing", ["write_ply", "write_scene_metadata"])
 def test_failed_write_keeps_the_old_scene(tmp_path, world, monkeypatch, failing):
-    """A write that fails at any file leaves the old scene as it was, and nothing beside it."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="first")
 
@@ -179,7 +170,6 @@ def test_failed_write_keeps_the_old_scene(tmp_path, world, monkeypatch, failing)
 
 
 def test_other_folders_are_not_overwritten(tmp_path, world):
-    """A folder with other files, or a file, is refused and left alone."""
     folder = tmp_path / "holiday"
     folder.mkdir()
     (folder / "photo.jpg").write_bytes(b"x")
@@ -193,9 +183,6 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
 
 
 def test_unwritable_place(tmp_path, world):
-    """Parent folders are made; a file or a write-protected folder in their place is named before
-    any work is done.
-    """
     write_scene_folder(tmp_path / "new" / "folder" / "scene", world, provenance="")
     assert read_scene(tmp_path / "new" / "folder" / "scene").name == world.name
     (tmp_path / "file").write_text("")
@@ -207,7 +194,6 @@ def test_unwritable_place(tmp_path, world):
 
 @pytest.mark.parametrize("missing", ["gaussians.ply", "esdf.npz", "scene.yaml"])
 def test_missing_file(tmp_path, world, missing):
-    """A scene without one of its files is refused with the name of the file."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     (folder / missing).unlink()
@@ -216,7 +202,6 @@ def test_missing_file(tmp_path, world, missing):
 
 
 def test_missing_scene(tmp_path):
-    """A path with nothing there is refused."""
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_scene(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match=r"No such file: .*nowhere"):
@@ -241,7 +226,6 @@ def test_missing_scene(tmp_path):
     ],
 )
 def test_bad_metadata(tmp_path, world, old, new, message):
-    """Wrong, unknown and missing entries of scene.yaml are refused with file and reason."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     text = (folder / "scene.yaml").read_text()
@@ -252,7 +236,6 @@ def test_bad_metadata(tmp_path, world, old, new, message):
 
 
 def test_bare_ply(tmp_path):
-    """Gaussians alone become a world whose walls collide and whose inside can be flown."""
     path = tmp_path / "hall.ply"
     write_ply(box_of_gaussians(), path)
     world = read_scene(path)
@@ -268,7 +251,6 @@ def test_bare_ply(tmp_path):
 
 
 def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
-    """A few Gaussians a kilometre away leave the grid as it is."""
     scene = box_of_gaussians()
     stray = GaussianScene.from_colors(
         [[1000, 0, 0]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.9], [[1, 1, 1]]
@@ -286,7 +268,6 @@ def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
     ],
 )
 def test_metadata_is_believed_or_refused(tmp_path, world, old, new, message):
-    """What scene.yaml says and the scene does not bear out is refused."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     file = folder / "scene.yaml"
@@ -298,7 +279,6 @@ def test_metadata_is_believed_or_refused(tmp_path, world, old, new, message):
 
 
 def test_space_beside_a_bare_ply_is_not_flown_through(tmp_path):
-    """In the box around three parallel walls, outside counts as occupied: there is no way round."""
     y, z = (grid.ravel() for grid in np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 8, 0.1)))
     walls = [np.column_stack([np.full(y.size, x), y, z]) for x in (0.0, 3.0, 6.0)]
     means = np.concatenate(walls)

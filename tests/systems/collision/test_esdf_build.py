@@ -108,11 +108,11 @@ def test_what_was_not_observed_is_unknown_unless_occupied():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"threshold": 0.0}, "threshold is 0.0"),
-        ({"threshold": 1.0}, "threshold is 1.0"),
-        ({"observed": np.ones((2, 2, 2), bool)}, r"observed has shape \(2, 2, 2\)"),
-        ({"voxel_size": -0.1}, "voxel size is -0.1"),
-        ({"upper_W": np.full(3, 1e4)}, "Use a larger voxel size or smaller bounds"),
+        ({"threshold": 0.0}, r"threshold must be .* got 0.0"),
+        ({"threshold": 1.0}, r"threshold must be .* got 1.0"),
+        ({"observed": np.ones((2, 2, 2), bool)}, r"shape of observed must be .* got \(2, 2, 2\)"),
+        ({"voxel_size": -0.1}, r"voxel_size must be .* got -0.1"),
+        ({"upper_W": np.full(3, 1e4)}, "use larger voxels"),
     ],
 )
 def test_bad_arguments_are_refused(change, message):

@@ -109,7 +109,7 @@ def test_no_direct_feedthrough_is_hidden():
 
 @pytest.mark.parametrize(("name", "value"), [("radius", -0.1), ("beta", 0.0)])
 def test_bad_parameters_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} is {value}"):
+    with pytest.raises(ValueError, match=f"{name} must be .* got {value}"):
         EsdfCollision(CountingField(), **{name: value})
 
 

@@ -78,11 +78,11 @@ def test_grid_shape_covers_the_box_with_whole_voxels():
 @pytest.mark.parametrize(
     ("upper", "voxel_size", "message"),
     [
-        ([1.0, 0.0, 1.0], 0.1, "empty or not finite"),
-        ([1.0, np.inf, 1.0], 0.1, "empty or not finite"),
-        ([1.0, 1.0, 1.0], 0.0, "voxel size is 0.0"),
-        ([1.0, 1.0, 0.05], 0.1, "fewer than 2 voxels"),
-        ([1e3, 1e3, 1e3], 0.1, f"the limit is {MAX_VOXELS:.3g}".replace("+", r"\+")),
+        ([1.0, 0.0, 1.0], 0.1, "upper_W must be finite and above"),
+        ([1.0, np.inf, 1.0], 0.1, "upper_W must be finite and above"),
+        ([1.0, 1.0, 1.0], 0.0, r"voxel_size must be .* got 0.0"),
+        ([1.0, 1.0, 0.05], 0.1, "at least 2 voxels"),
+        ([1e3, 1e3, 1e3], 0.1, f"at most {MAX_VOXELS:.3g} voxels".replace("+", r"\+")),
     ],
 )
 def test_impossible_grids_are_refused(upper, voxel_size, message):

@@ -150,7 +150,7 @@ def test_rates_of_frames_are_a_range(rates):
     with pytest.raises(ValueError, match=r"frame_rate must be .* got \["):
         ObservationNoise(frame_rate=rates).validate()
     with pytest.raises(ValueError, match=r"jitter must be 0 without frame_rate, got 0\.1"):
-        ObservationNoise(jitter=0.1).validate("noise")
+        ObservationNoise(jitter=0.1).validate()
     ObservationNoise(frame_rate=[10.0, 10.0], jitter=0.1, frame_dropout=0.5).validate()
 
 

@@ -71,7 +71,6 @@ def _digest(world: World) -> str:
 
 
 def test_the_same_seed_gives_the_same_bits_in_another_process():
-    """Two processes that grow one forest agree on every bit of what is seen and what is hit."""
     code = (
         f"import sys; sys.path.insert(0, {str(__file__.rsplit('/', 1)[0])!r})\n"
         "from test_forest import SMALL, _digest, make_world\n"
@@ -82,7 +81,6 @@ def test_the_same_seed_gives_the_same_bits_in_another_process():
 
 
 def test_another_seed_gives_another_forest():
-    """Seeds change where trees stand and where the sun is."""
     a, b = make_world(SMALL, seed=0), make_world(SMALL, seed=1)
     places = np.random.default_rng(0).uniform((0, -3.5, 1), (9, 3.5, 3), (200, 3))
     difference = a.distance_field.distance(places) - b.distance_field.distance(places)
@@ -92,7 +90,6 @@ def test_another_seed_gives_another_forest():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
-    """On the ground axes are at least the spacing apart; radii lie in the range and fill it."""
     config = KINDS[kind]
     for seed in range(4):
         trees = _layout(config, seed)[0].trees
@@ -105,7 +102,6 @@ def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_vehicle_can_fly_from_start_to_goal(kind):
-    """Start and goal have 1 m around them, and level flight connects them past the trunks."""
     config = KINDS[kind]
     spacing = 0.1
     for seed in range(4):
@@ -123,7 +119,6 @@ def test_a_vehicle_can_fly_from_start_to_goal(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gaps_between_trunks_let_the_vehicle_through_at_every_height(kind):
-    """The gap of every two trunks, at every height, is at least what the check promises."""
     config = KINDS[kind]
     assert config.narrowest >= PASSAGE
     trees = _layout(config, seed=1)[0].trees
@@ -135,14 +130,12 @@ def test_gaps_between_trunks_let_the_vehicle_through_at_every_height(kind):
 
 
 def test_everything_seen_in_the_volume_is_there_to_be_hit(world):
-    """Gaussians in the volume lie on analytic surfaces: no leaf hangs in the air."""
     distance = np.abs(world.distance_field.distance(_inside(world)))
     assert distance.max() < 0.07
     assert np.quantile(distance, 0.95) < 0.04
 
 
 def test_leaves_around_the_volume_stay_out_of_it(world):
-    """Crowns, bushes and the far edge end, three standard deviations out, before the volume."""
     scene, field = world.gaussians, world.distance_field
     p = scene.means.astype(float)
     beyond = np.linalg.norm(p - np.clip(p, field.lower_W, field.upper_W), axis=1)
@@ -157,7 +150,6 @@ def test_leaves_around_the_volume_stay_out_of_it(world):
 
 
 def test_every_shape_to_hit_is_seen(world):
-    """Around every trunk, rock and log in the volume there are Gaussians on its surface."""
     p = world.gaussians.means.astype(float)
     field = world.distance_field
     seen = 0
@@ -177,7 +169,6 @@ def test_every_shape_to_hit_is_seen(world):
 
 
 def test_trees_left_out_of_the_field_are_never_the_nearest():
-    """Adding all trees of the belt to the field changes no distance in the volume."""
     layout, field, *_ = _layout(SMALL, seed=3)
     trees = layout.trees
     every = [
@@ -205,8 +196,6 @@ def baked(world) -> BakedScene:
 
 @pytest.mark.parametrize("p_WC, yaw, pitch", VIEWS)
 def test_rendered_depth_is_the_distance_to_what_is_hit(world, baked, p_WC, yaw, pitch):
-    """Depth of the splats agrees with rays marched through the analytic field to a few cm, and
-    wherever a ray hits something in the volume the picture is opaque."""
     width, height = 160, 120
     K = np.array([[80.0, 0, 80], [0, 80, 60], [0, 0, 1]])
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
@@ -244,7 +233,6 @@ def _march(world, K, width, height, R_WC, p_WC):
 
 
 def test_start_and_goal_face_each_other_with_room_around(world):
-    """Start and goal are near the two short ends, at the flight height, 1 m from everything."""
     np.testing.assert_allclose(world.p_WS, (1.5, 0, 1.8))
     np.testing.assert_allclose(world.p_WG, (34.5, 0, 1.8))
     ends = np.stack([world.p_WS, world.p_WG])
@@ -252,7 +240,6 @@ def test_start_and_goal_face_each_other_with_room_around(world):
 
 
 def test_the_grid_for_planning_agrees_with_the_truth(world):
-    """The grid's distance at flight height is the analytic one to a fraction of a voxel."""
     p = np.random.default_rng(0).uniform((0.5, -7.5, 1), (35.5, 7.5, 3), (2000, 3))
     error = world.esdf.distance(p) - world.distance_field.distance(p)
     assert np.abs(error).max() < ForestConfig().voxel_size / 2
@@ -260,14 +247,12 @@ def test_the_grid_for_planning_agrees_with_the_truth(world):
 
 
 def test_a_forest_without_rocks_and_logs_grows():
-    """Zero rocks and logs leave trunks and ground alone."""
     config = ForestConfig(**{**vars(SMALL), "rocks": 0, "logs": 0})
     kinds = [type(shape) for shape in _shapes(make_world(config, seed=0))]
     assert Sphere not in kinds and kinds.count(Capsule) == len(kinds) - 1
 
 
 def test_the_config_loads_from_yaml():
-    """Fields given in YAML replace the defaults; a misspelt one is an error."""
     config = yaml_load_typed(schema=ForestConfig, data="{spacing: 5.0, rocks: 0}")
     assert config == ForestConfig(spacing=5.0, rocks=0)
     with pytest.raises(RuntimeError, match="spacin"):
@@ -294,13 +279,11 @@ def test_the_config_loads_from_yaml():
     ],
 )
 def test_a_forest_that_cannot_be_grown_is_refused(values, message):
-    """Each bad value ends with what is wrong, its limit and the remedy."""
     with pytest.raises(ValueError, match=message):
         make_world(ForestConfig(**values), seed=0)
 
 
 def test_the_spacing_the_error_asks_for_is_enough():
-    """A spacing rejected with 'at least X' is accepted at X."""
     with pytest.raises(ValueError) as error:
         ForestConfig(spacing=1.9).validate()
     needed = float(str(error.value).rsplit("at least ", 1)[1].partition(" m")[0])
@@ -308,6 +291,5 @@ def test_the_spacing_the_error_asks_for_is_enough():
 
 
 def test_a_negative_seed_is_refused():
-    """Seeds count from 0."""
     with pytest.raises(ValueError, match=r"seed must be .*, got -1"):
         make_world(SMALL, seed=-1)

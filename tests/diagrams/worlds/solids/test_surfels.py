@@ -1,5 +1,3 @@
-"""Gaussians of solids: they end where the solids end."""
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,8 +42,6 @@ SHAPES = {
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_outlines_are_those_of_the_solid(kind):
-    """From all around, the area in which there is depth is the solid's own: nothing hangs over its
-    edges by more than 12 mm, 2 mm of a wire, nor is it smaller by that."""
     shape, material = SHAPES[kind]
     bounds = np.full(3, -9.0), np.full(3, 9.0)
     spec = WorldSpec(kind, *bounds, [Solid(shape, material)], *bounds, light=lambda _: _Even())
