@@ -98,7 +98,7 @@ def depth_size(file: Path) -> tuple[int, int]:
 
 def read_image(file: Path) -> NDArray[np.uint8]:
     """Returns an image as (H, W, 3) red, green, blue."""
-    # The pixels as they are stored: poses and intrinsics belong to them, not to the rotated picture.
+    # The pixels as stored: poses and intrinsics belong to them, not to the rotated picture.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     return cv2.cvtColor(_decode(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
 
@@ -354,9 +354,7 @@ def open_frames(
         ValueError: if fewer than two frames, or less than four fifths of them, can be used.
     """
     messages = list(dropped)
-    valid = _usable_frames(frames, messages, registered=not (depth_camera or stretch_depth))
-    if stretch_depth:
-        valid = _keep_same_view(valid, messages)
+    valid = _usable_frames(frames, messages, not (depth_camera or stretch_depth), stretch_depth)
     if valid:
         outliers = set(outlier_frames(np.array([f.X_FB.translation() for f in valid])).tolist())
         for i in sorted(outliers):
@@ -468,13 +466,14 @@ def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) ->
 
 
 def _usable_frames(
-    frames: Sequence[FrameFiles], messages: list[str], registered: bool
+    frames: Sequence[FrameFiles], messages: list[str], registered: bool, same_view: bool
 ) -> list[_Frame]:
     """Returns the frames whose files are complete, in the most frequent sizes of images and depth.
 
     Args:
         messages: to which those about other frames are appended.
         registered: whether depth must have the size of its image.
+        same_view: whether it must have the aspect ratio of its image.
     """
     complete = []
     for frame in frames:
@@ -489,10 +488,16 @@ def _usable_frames(
     kept = []
     for frame in complete:
         files, expected = frame.files, frame.size if registered else usual_depth
+        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
         if files.lens is None and usual is not None and frame.size != usual:
             messages.append(_size_message(files.image, frame.size, usual))
         elif files.depth and frame.depth_size and expected and frame.depth_size != expected:
             messages.append(_size_message(files.depth, frame.depth_size, expected))
+        elif same_view and abs(w * height - h * width) > _SAME_SHAPE * w * height:
+            messages.append(
+                f"{files.depth}: {w}x{h} pixels of depth do not show what {width}x{height} pixels "
+                "of an image do; width and height must have one ratio"
+            )
         else:
             kept.append(frame)
     return kept
@@ -506,21 +511,6 @@ def _inspect(frame: FrameFiles) -> _Frame:
         raise ValueError(_size_message(frame.mask, found, size))
     found = depth_size(frame.depth) if frame.depth is not None else None
     return _Frame(frame, size, found, mode in _ALPHA, frame.X_FB())
-
-
-def _keep_same_view(frames: Sequence[_Frame], messages: list[str]) -> list[_Frame]:
-    """Leaves out frames whose depth has another aspect ratio than their image."""
-    kept = []
-    for frame in frames:
-        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
-        if abs(w * height - h * width) > _SAME_SHAPE * w * height:
-            messages.append(
-                f"{frame.files.depth}: {w}x{h} pixels of depth do not show what {width}x{height} "
-                "pixels of an image do; width and height must have one ratio"
-            )
-        else:
-            kept.append(frame)
-    return kept
 
 
 def _size_message(file: Path, size: tuple[int, int], expected: tuple[int, int]) -> str:
