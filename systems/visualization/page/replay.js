@@ -1,7 +1,7 @@
 // A flight, or several through one world, in a Meshcat page: vehicle, trail, plans, what the camera
 // saw, speed and clearance, all at the time of one slider.
 //
-// Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches colour and depth.
+// Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches color and depth.
 "use strict";
 
 class Replay {
@@ -45,7 +45,7 @@ class Replay {
     }
     this.picture = addElement(panel, "canvas", {width: 648, height: 486, id: "replay-picture"});
     this.depthButton = addElement(panel, "button", {
-      textContent: "colour / depth (d)", id: "replay-depth", onclick: () => this.switchDepth()});
+      textContent: "color / depth (d)", id: "replay-depth", onclick: () => this.switchDepth()});
     this.plot = addElement(panel, "canvas", {width: 648, height: 300, id: "replay-plot"});
     this.plot.onclick = (event) =>
       this.seek(event.offsetX / this.plot.clientWidth * this.duration);

@@ -120,7 +120,7 @@ def test_ports_of_another_size_are_named(post_world):
             self.DeclareVectorOutputPort("waypoint", 3, lambda _, y: None)
             self.camera = OnboardCamera()
 
-    with pytest.raises(ValueError, match=r"is no vector and the input 'color_image' of Painter"):
+    with pytest.raises(ValueError, match=r"'color_image' of SplatCamera \(not a vector\)"):
         flown(Scenario(timeout=1.0), post_world, policy=Painter())
 
 

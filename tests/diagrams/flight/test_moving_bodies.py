@@ -90,7 +90,7 @@ def test_the_camera_of_a_flight_sees_the_ball_come(post_world):
         color = diagram.GetOutputPort("color_image").Eval(root).data.astype(int)
         depths.append(depth[120, 160])
         red.append((color[..., 0] > color[..., 1] + 150).sum())
-    # The camera sits 0.1 m before the vehicle's centre, at x = 1.
+    # The camera sits 0.1 m before the vehicle's center, at x = 1.
     np.testing.assert_allclose(depths, [2.4, 1.9, 1.4], atol=0.08)
     assert red[0] < red[1] < red[2]
 

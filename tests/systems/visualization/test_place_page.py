@@ -21,7 +21,7 @@ SHADES = ((40, 40, 200), (40, 200, 40), (200, 40, 40))  # of the images, blue fi
 
 
 def disks(step: float = 0.08) -> GaussianScene:
-    """Walls, floor and ceiling of the room, in waves of grey, as flat disks."""
+    """Walls, floor and ceiling of the room, in waves of gray, as flat disks."""
     means, quats = [], []
     turns = [(0.5**0.5, 0, 0.5**0.5, 0), (0.5**0.5, 0.5**0.5, 0, 0), (1, 0, 0, 0)]
     for axis in range(3):

@@ -78,7 +78,7 @@ def test_unwritable_video_is_an_error(recorder_after_one_second, tmp_path):
         recorder_after_one_second.save(tmp_path / "nowhere" / "video.mp4", max_depth=20.0)
 
 
-def test_depth_colours_fade_with_distance():
+def test_depth_colors_fade_with_distance():
     picture = colorize_depth(np.array([[0.0, 0.5, 2.0, 8.0, 65.535]]), max_depth=20.0)
     brightness = picture[0].astype(int).sum(axis=1)
     assert brightness[0] == brightness[4] == 0

@@ -65,7 +65,7 @@ def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
     assert len(fan) == 3 * 11 * 2
 
 
-def test_fan_is_ribbons_along_the_plans_in_the_colours_of_their_costs():
+def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():
     generator = np.random.default_rng(0)
     waypoints_B = np.cumsum(generator.uniform(-0.1, 0.4, (4, 10, 3)), axis=1)
     X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1, 2, 3])
@@ -150,7 +150,7 @@ def test_goal_is_a_ball_at_its_place(meshcat):
     assert matrix[12:15] == [3.0, -1.0, 2.0]
 
 
-def test_distance_slice_is_coloured_by_distance(meshcat):
+def test_distance_slice_is_colored_by_distance(meshcat):
     field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
     draw_distance_slice(meshcat, "/splatpilot/slice", field, height=1.0)
     drawing = drawn(meshcat, "/splatpilot/slice")
