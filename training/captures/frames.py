@@ -98,7 +98,8 @@ def depth_size(file: Path) -> tuple[int, int]:
 
 def read_image(file: Path) -> NDArray[np.uint8]:
     """Returns an image as (H, W, 3) red, green, blue."""
-    # The pixels as stored: poses and intrinsics belong to them, not to the rotated picture.
+    # The pixels as stored: poses and intrinsics belong to them, not to the rotated
+    # picture.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     return cv2.cvtColor(_decode(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
 

@@ -123,7 +123,7 @@ def test_records(tmp_path):
         ),
         ("a.spz", spz(4, 9)[:16], "SPZ is not readable"),
         ("a.spz", spz(4, 9), "the section must be of 81 bytes, got 0"),
-        ("a.spz", gzip.compress(b"something else entirely", mtime=0), "gzip of something that is not SPZ"),
+        ("a.spz", gzip.compress(b"something else entirely", mtime=0), "gzip of something"),
         (
             "a.spz",
             gzip.compress(spz(0, 9), mtime=0),
