@@ -13,11 +13,13 @@ fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
 
 test: lint
-	.venv/bin/python -m pytest
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile
 
 lint: .venv/installed
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/python lint/words.py
+	.venv/bin/codespell
 	.venv/bin/clang-format --dry-run --Werror $(NATIVE)
 	.venv/bin/pyright
 
